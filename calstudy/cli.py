@@ -1,0 +1,114 @@
+"""The command line: ``calstudy run | plan | data``.
+
+Only light modules are imported here, so that ``calstudy --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from calstudy import __version__
+from calstudy.errors import ExperimentError, InputError
+
+app = typer.Typer(
+    help="Simulation and validation studies of 21 cm interferometer calibration.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+data_app = typer.Typer(help="Catalogues that are downloaded once.", no_args_is_help=True)
+app.add_typer(data_app, name="data")
+
+EXIT_INPUT = 2
+
+File = Annotated[Path, typer.Argument(help="The experiment file (YAML).", show_default=False)]
+Scale = Annotated[str | None, typer.Option(help="Apply a named set of overrides of the file, such as 'small'.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set calibration.basis.buffer='200 ns'."),
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
+Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster instead.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"calstudy {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show it.")] = False,
+) -> None:
+    del version
+
+
+@app.command()
+def run(
+    file: File,
+    scale: Scale = None,
+    overrides: Set = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Run an experiment: simulate, corrupt, calibrate, measure power spectra, draw figures.
+
+    Products that are in the store already are not made again; an interrupted run is resumed by the same command.
+    """
+    from calstudy.experiment.files import load
+    from calstudy.plans import choose_workers, show_result
+    from calstudy.runs import run as run_experiment
+
+    console = Console(soft_wrap=True, highlight=False)
+    experiment = load(file, scale, overrides or ())
+    count = choose_workers(experiment, workers)
+    show_result(run_experiment(experiment, count, scheduler, console), console)
+
+
+@app.command()
+def plan(file: File, scale: Scale = None, overrides: Set = None, workers: Workers = None) -> None:
+    """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
+    from calstudy.experiment.files import load
+    from calstudy.plans import choose_workers, show_plan
+
+    experiment = load(file, scale, overrides or ())
+    show_plan(experiment, choose_workers(experiment, workers), Console(highlight=False))
+
+
+@data_app.command()
+def fetch(
+    name: Annotated[str, typer.Argument(help="What to fetch: gleam.")],
+    directory: Annotated[Path | None, typer.Option(help="Where to put it; by default the user's data folder.")] = None,
+) -> None:
+    """Download a catalogue, check it, and keep it for later runs."""
+    from calstudy.sky.gleam import fetch_gleam
+
+    if name != "gleam":
+        raise InputError(f"calstudy data fetch {name}: not a catalogue that can be fetched (allowed: gleam)")
+    path = fetch_gleam(directory)
+    typer.echo(f"{path}")
+
+
+def main() -> None:
+    """Run the command line; a user's mistake ends with sentences on standard error and exit status 2."""
+    logging.getLogger().addHandler(logging.NullHandler())
+    try:
+        app()
+    except ExperimentError as error:
+        for sentence in error.faults:
+            typer.echo(f"calstudy: {sentence}", err=True)
+        sys.exit(EXIT_INPUT)
+    except InputError as error:
+        typer.echo(f"calstudy: {error}", err=True)
+        sys.exit(EXIT_INPUT)
+    except KeyboardInterrupt:
+        typer.echo("calstudy: interrupted; finished products are kept, the same command resumes", err=True)
+        sys.exit(130)

@@ -1,0 +1,65 @@
+"""How strong the components of a measurement are, relative to one another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calstudy.errors import InputError
+
+if TYPE_CHECKING:
+    from calstudy.corrupt.settings import CorruptionSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Levels:
+    """Amplitudes of the components, in Jy.
+
+    Attributes
+    ----------
+    foreground_rms, eor_rms
+        rms of the visibilities as simulated, over baselines other than autocorrelations, times and channels.
+    eor_factor
+        What the EoR visibilities are multiplied by.
+    noise_std
+        Standard deviation of the complex noise per baseline, channel, integration and realization.
+    """
+
+    foreground_rms: float
+    eor_rms: float
+    eor_factor: float
+    noise_std: float
+
+
+def rms(visibilities: np.ndarray) -> float:
+    """Return sqrt(mean |V|^2) over all samples."""
+    return float(np.sqrt(np.mean(visibilities.real**2 + visibilities.imag**2)))
+
+
+def set_levels(foreground_rms: float, eor_rms: float, settings: CorruptionSettings) -> Levels:
+    """Scale the EoR to `eor_level` below the foregrounds and the noise to its reference (design §4).
+
+    The level is an amplitude ratio: rms of scaled EoR / rms of foregrounds = 10^(level / 20).
+
+    Raises
+    ------
+    InputError
+        If a component that must be scaled, or scaled to, is zero.
+    """
+    if eor_rms <= 0:
+        raise InputError("sky.eor: its visibilities are all zero")
+    factor = 1.0
+    if settings.eor_level is not None:
+        if foreground_rms <= 0:
+            raise InputError("corruption.eor_level: the foregrounds it refers to are all zero")
+        factor = 10 ** (settings.eor_level / 20) * foreground_rms / eor_rms
+    noise = settings.noise
+    if noise.kind == "none":
+        std = 0.0
+    elif noise.kind == "times-eor":
+        std = noise.factor * factor * eor_rms
+    else:
+        std = noise.factor * foreground_rms
+    return Levels(foreground_rms=foreground_rms, eor_rms=eor_rms, eor_factor=factor, noise_std=std)

@@ -1,0 +1,196 @@
+"""Run the tasks of an experiment that are not done yet, as a dask graph, on this machine or on a cluster."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from calstudy.errors import InputError
+from calstudy.perform import Order, perform
+from calstudy.resources import cores
+from calstudy.store import Product, Store
+from calstudy.tasks import Task, unique
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Which tasks of a run must be made, and which products are there already.
+
+    Attributes
+    ----------
+    todo
+        Tasks to make, every one after its inputs.
+    ready
+        Products that the run needs and that are intact.
+    damaged
+        Tasks whose product was there, but not as it was written; they are in `todo`.
+    """
+
+    todo: tuple[Task, ...]
+    ready: dict[str, Product]
+    damaged: tuple[Task, ...]
+
+
+def schedule(targets: Iterable[Task], store: Store) -> Schedule:
+    """Find out what must be made: the targets and what they need, as far as it is not in the store, intact."""
+    todo: dict[str, Task] = {}
+    ready: dict[str, Product] = {}
+    damaged: list[Task] = []
+
+    def visit(task: Task) -> None:
+        if task.key in todo or task.key in ready:
+            return
+        product = store.verify(task.stage, task.key)
+        if product is not None:
+            ready[task.key] = product
+            return
+        if store.exists(task.stage, task.key):
+            damaged.append(task)
+        for needed in task.inputs.values():
+            visit(needed)
+        todo[task.key] = task
+
+    for task in targets:
+        visit(task)
+    return Schedule(tuple(todo.values()), ready, tuple(damaged))
+
+
+@contextmanager
+def _local_client(workers: int) -> Iterator[Client]:
+    """Start workers on this machine: threads of this process if there is one, else processes that share the cores."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    threads = str(max(1, cores() // workers))
+    environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TF_NUM_INTRAOP_THREADS"), threads)
+    environment |= {"TF_CPP_MIN_LOG_LEVEL": "3", "TF_ENABLE_ONEDNN_OPTS": "0"}
+    settings = {
+        "distributed.nanny.pre-spawn-environ": environment,
+        "distributed.admin.tick.limit": "10 m",
+        "distributed.worker.memory.terminate": False,
+        "distributed.comm.timeouts.connect": "60 s",
+        "distributed.scheduler.allowed-failures": 2,
+    }
+    with (
+        dask.config.set(settings),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=workers > 1,
+            memory_limit=0,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
+    if scheduler is None:
+        with _local_client(workers) as client:
+            yield client
+        return
+    from distributed import Client
+
+    try:
+        client = Client(scheduler, timeout="20 s")
+    except (OSError, ValueError) as error:
+        raise InputError(f"--scheduler {scheduler}: cannot connect ({error})") from None
+    with client:
+        yield client
+
+
+def _submit(tasks: Sequence[Task], store: Store, client: Client) -> dict[Future, Task]:
+    futures: dict[str, Future] = {}
+    for priority, task in enumerate(tasks):
+        needed = [futures[item.key] for item in task.inputs.values() if item.key in futures]
+        futures[task.key] = client.submit(
+            _perform_after,
+            Order.of(task, store),
+            needed,
+            key=f"{task.stage}-{task.key}",
+            priority=-priority,
+            pure=False,
+        )
+    return {futures[task.key]: task for task in tasks}
+
+
+def _perform_after(order: Order, needed: list[Product]) -> Product:
+    """Make a product once those it needs (which dask passes, and so waits for) are made."""
+    del needed
+    return perform(order)
+
+
+def execute(
+    tasks: Sequence[Task],
+    store: Store,
+    workers: int,
+    scheduler: str | None = None,
+    done: Callable[[Task, Product], None] = lambda task, product: None,
+) -> dict[str, Product]:
+    """Make the products of `tasks`, which are in an order that respects their inputs.
+
+    Parameters
+    ----------
+    tasks
+        From `schedule`.
+    store
+        Where they go; on a file system that all workers share.
+    workers
+        Worker processes to start on this machine; with one, the work is done in this process.
+    scheduler
+        Address of a running dask scheduler to use instead.
+    done
+        Called after each product.
+
+    Returns
+    -------
+    dict
+        The products by key.
+
+    Raises
+    ------
+    InputError
+        If the scheduler cannot be reached, a worker dies repeatedly, or a stage refuses its input.
+    """
+    from distributed import KilledWorker, as_completed
+
+    products: dict[str, Product] = {}
+    if not tasks:
+        return products
+    with _client(workers, scheduler) as client:
+        futures = _submit(tasks, store, client)
+        for future in as_completed(futures):
+            task = futures[future]
+            try:
+                product = future.result()
+            except KilledWorker:
+                raise InputError(
+                    f"{task.stage} ({task.label}): its worker process died repeatedly, most likely for want of memory; "
+                    "use fewer --workers, or smaller chunks, and run again: finished products are kept"
+                ) from None
+            products[task.key] = product
+            done(task, product)
+    return products
+
+
+def drop_temporary(tasks: Iterable[Task], store: Store) -> None:
+    """Remove the temporary products whose consumers have all been made."""
+    tasks = unique(tasks)
+    consumers: dict[str, list[Task]] = {}
+    for task in tasks:
+        for needed in task.inputs.values():
+            consumers.setdefault(needed.key, []).append(task)
+    for task in tasks:
+        if task.temporary and all(store.find(user.stage, user.key) for user in consumers.get(task.key, [])):
+            store.discard(task.stage, task.key)

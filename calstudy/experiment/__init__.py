@@ -1,0 +1,1 @@
+"""Experiment files: their schema, how they are read, and how their faults are told."""

@@ -1,0 +1,182 @@
+"""Read experiment files: YAML, scales and overrides, validation, and the files that they name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from calstudy.errors import ExperimentError, InputError
+from calstudy.experiment.messages import nearest, sentences
+from calstudy.experiment.model import Experiment
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML that refuses duplicate keys and reads 1e-9 as a number (as YAML 1.2 does)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        keys: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.MarkedYAMLError(problem=f"key {key!r} is not a text", problem_mark=key_node.start_mark)
+            if key in keys:
+                raise yaml.MarkedYAMLError(problem=f"key {key!r} appears twice", problem_mark=key_node.start_mark)
+            keys.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
+    list("-+0123456789."),
+)
+
+
+def parse_yaml(text: str, origin: str) -> Any:
+    """Parse YAML text; raises InputError with one sentence (origin, line, problem) if it is not valid."""
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        line = f" line {error.problem_mark.line + 1}:" if error.problem_mark else ""
+        raise InputError(f"{origin}:{line} {error.problem or 'not valid YAML'}") from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(f"{origin}: not valid YAML ({str(error).splitlines()[0]})") from None
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Read a YAML file that must hold a block of keys; raises InputError if it cannot."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    data = parse_yaml(text, str(path))
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: must hold a block of keys such as 'name: quickstart', holds {type(data).__name__}")
+    return data
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Split ``path=value`` as given to --set; the value is read as YAML."""
+    path, equals, value = text.partition("=")
+    if not equals or not path.strip():
+        raise InputError(f"--set {text}: write a dotted path and a value, such as --set instrument.times.count=8")
+    return path.strip(), parse_yaml(value, f"--set {text}")
+
+
+def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """Return a copy of `data` with the field at the dotted path set to `value`."""
+    result = deepcopy(dict(data))
+    block = result
+    *parents, last = path.split(".")
+    for step in parents:
+        inner = block.get(step)
+        if isinstance(inner, str):
+            inner = {"name" if step == "solver" else "kind": inner}
+        elif inner is None:
+            inner = {}
+        elif not isinstance(inner, dict):
+            raise InputError(f"{path}: cannot be set, for {step!r} is {inner!r} and not a block of keys")
+        block[step] = inner
+        block = inner
+    block[last] = value
+    return result
+
+
+def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
+    """Return `data` with the overrides of the named scale applied; raises InputError if the file has no such scale."""
+    result = dict(data)
+    if scale is None:
+        return result
+    scales = data.get("scales") or {}
+    if not isinstance(scales, dict) or not isinstance(scales.get(scale), dict):
+        names = list(scales) if isinstance(scales, dict) else []
+        listed = f"the file has: {', '.join(names)}" if names else "the file has no scales"
+        raise InputError(f"--scale {scale}: not a scale of this experiment{nearest(scale, names)} ({listed})")
+    for path, value in scales[scale].items():
+        result = override(result, path, value)
+    return result
+
+
+def _input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, BaseModel, str]]:
+    """Yield (dotted path, block, field) of every input file that the experiment names."""
+    for field in type(section).model_fields:
+        value, path = getattr(section, field), f"{prefix}{field}"
+        if isinstance(value, BaseModel) and field != "outputs":
+            yield from _input_files(value, f"{path}.")
+        elif isinstance(value, Path):
+            yield path, section, field
+
+
+def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> Experiment:
+    """Make the paths of input files absolute, relative ones from `base`, and check that they can be read."""
+    faults, resolved = [], data
+    for path, section, field in _input_files(experiment):
+        target = getattr(section, field)
+        file = target.expanduser() if target.expanduser().is_absolute() else (base / target)
+        resolved = override(resolved, path, str(file.resolve()))
+        if not file.is_file():
+            faults.append(f"{path} = {str(target)!r}: no such file (looked for {file})")
+    if faults:
+        raise ExperimentError(faults)
+    return Experiment.model_validate(resolved)
+
+
+def validate(data: Mapping[str, Any], base: Path) -> Experiment:
+    """Validate the content of an experiment file.
+
+    Parameters
+    ----------
+    data
+        Plain dictionaries, lists, strings and numbers.
+    base
+        Folder from which relative paths of input files are taken.
+
+    Raises
+    ------
+    ExperimentError
+        With one sentence per fault: the field's dotted path, the value, what is allowed.
+    """
+    plain = dict(data)
+    try:
+        experiment = Experiment.model_validate(plain)
+    except ValidationError as error:
+        raise ExperimentError(sentences(error, Experiment, plain)) from None
+    return _resolve_files(plain, experiment, base)
+
+
+def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Experiment:
+    """Read and validate an experiment file.
+
+    Parameters
+    ----------
+    path
+        The YAML file.
+    scale
+        Name of a set of overrides in the file's `scales`.
+    overrides
+        ``path=value`` texts, applied after the scale.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or an override cannot be applied.
+    ExperimentError
+        If fields are unknown, missing, or hold values that are not allowed.
+    """
+    data = apply_scale(read_mapping(path), scale)
+    for text in overrides:
+        data = override(data, *parse_override(text))
+    return validate(data, path.resolve().parent)
+
+
+def dump(experiment: Experiment) -> str:
+    """Return the resolved experiment as YAML that `load` reads back to the same experiment."""
+    return yaml.safe_dump(experiment.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)

@@ -1,0 +1,142 @@
+"""Turn pydantic's errors into sentences that name the field's dotted path, the value, and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+import types
+from typing import Annotated, Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+KINDS = {
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+    "string_type": "a text",
+    "path_type": "a path",
+    "tuple_type": "a list",
+    "dict_type": "a block of keys",
+    "model_type": "a block of keys",
+    "model_attributes_type": "a block of keys",
+    "finite_number": "a finite number",
+    "int_parsing": "a whole number",
+}
+BOUNDS = {
+    "greater_than": "greater than {gt:g}{unit}",
+    "greater_than_equal": "at least {ge:g}{unit}",
+    "less_than": "less than {lt:g}{unit}",
+    "less_than_equal": "at most {le:g}{unit}",
+}
+
+
+def nearest(word: object, allowed: list[str]) -> str:
+    """Return ``", did you mean 'x'?"`` for the closest allowed word, or an empty string if none is close."""
+    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.6) if isinstance(word, str) else []
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def _members(annotation: Any) -> list[Any]:
+    """Unpack Annotated and unions into the plain types they allow."""
+    if get_origin(annotation) is Annotated:
+        return _members(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return [member for argument in get_args(annotation) for member in _members(argument)]
+    return [annotation]
+
+
+def _tags(model: type[BaseModel]) -> list[str]:
+    """Return the values by which a block of a choice is selected: those of its `kind` or `name` literal."""
+    for key in ("kind", "name"):
+        if key in model.model_fields:
+            return [str(tag) for tag in get_args(model.model_fields[key].annotation)]
+    return []
+
+
+def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
+    """Follow a pydantic location; return the dotted path as written in the file, and the block that holds its end.
+
+    Pydantic puts the tag of a chosen block into the location, where the file has no key for it.
+    """
+    path: list[str] = []
+    members: list[Any] = [root]
+    holder: type[BaseModel] | None = None
+    for step in location:
+        models = [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
+        if len(models) > 1:
+            members = [model for model in models if step in _tags(model)]
+            continue
+        holder = models[0] if models else None
+        path.append(str(step))
+        if holder is not None:
+            field = holder.model_fields.get(str(step))
+            members = _members(field.annotation) if field else []
+        else:
+            members = _members(get_args(members[0])[1]) if members and get_origin(members[0]) is dict else []
+    return ".".join(path), holder
+
+
+def _written(data: Any, path: str) -> str:
+    """Return how the value at the dotted path reads in the file."""
+    for step in path.split("."):
+        if isinstance(data, dict) and step in data:
+            data = data[step]
+        elif isinstance(data, list | tuple) and step.isdigit() and int(step) < len(data):
+            data = data[int(step)]
+        else:
+            return ""
+    return f" = {data!r}" if not isinstance(data, dict | list) else ""
+
+
+def _unit(holder: type[BaseModel] | None, field: int | str) -> str:
+    """Return the unit in which a field's bounds are, with a space before it, or an empty string."""
+    info = holder.model_fields.get(str(field)) if holder else None
+    extra = info.json_schema_extra if info else None
+    return f" {extra['unit']}" if isinstance(extra, dict) else ""
+
+
+def _sentence(root: type[BaseModel], error: Any, data: Any) -> str:
+    kind, context = error["type"], error.get("ctx", {})
+    path, holder = _locate(root, error["loc"])
+    if kind == "fault":
+        path = ".".join(part for part in (path, context["path"]) if part)
+        return f"{path}: {context['sentence']}"
+    if kind == "quantity":
+        return f"{path}: {context['value']} {context['reason']}"
+    if kind == "extra_forbidden":
+        keys = sorted(holder.model_fields) if holder else []
+        return f"{path}: unknown key{nearest(str(error['loc'][-1]), keys)} (allowed: {', '.join(keys)})"
+    if kind == "missing":
+        return f"{path}: missing, and it has no default"
+    start = f"{path}{_written(data, path)}:"
+    if kind == "union_tag_invalid":
+        tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
+        return f"{path}: {context['tag']!r} is not a choice{nearest(context['tag'], tags)} (allowed: {', '.join(tags)})"
+    if kind == "literal_error":
+        allowed = [word.strip(" '") for word in context["expected"].replace(" or ", ", ").split(",")]
+        return f"{start} not a choice{nearest(error['input'], allowed)} (allowed: {', '.join(allowed)})"
+    if kind in BOUNDS:
+        return f"{start} must be {BOUNDS[kind].format(unit=_unit(holder, error['loc'][-1]), **context)}"
+    if kind in KINDS:
+        return f"{start} must be {KINDS[kind]}"
+    if kind == "string_pattern_mismatch":
+        return f"{start} must match {context['pattern']}"
+    if kind in ("too_short", "too_long"):
+        bound = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
+        return f"{path}: must have {bound} item(s), has {context['actual_length']}"
+    return f"{start} {error['msg']}"
+
+
+def sentences(error: ValidationError, root: type[BaseModel], data: Any) -> list[str]:
+    """Return one sentence per fault that pydantic found in `data`, in the file's own terms.
+
+    Parameters
+    ----------
+    error
+        What validating `data` against `root` raised.
+    root
+        The model of the whole file.
+    data
+        The file's content as plain dictionaries and lists.
+    """
+    return list(dict.fromkeys(_sentence(root, item, data) for item in error.errors()))

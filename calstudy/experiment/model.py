@@ -1,0 +1,123 @@
+"""What one experiment file says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.corrupt.settings import CorruptionSettings
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.power.settings import PowerSettings
+from calstudy.schema import Section, fault
+from calstudy.simulate.settings import SimulationSettings
+from calstudy.sky.settings import SkySettings
+
+Component = Literal["foregrounds", "eor", "noise"]
+FigureName = Literal["layout", "wedge", "spherical"]
+FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
+    "layout": (),
+    "wedge": ("uncorrupted", "uncalibrated", "residual", "eor", "noise"),
+    "spherical": ("eor",),
+}
+"""Names of the variants that each figure cannot do without."""
+
+
+class Variant(Section):
+    """One version of the data that is carried to a power spectrum."""
+
+    components: Annotated[tuple[Component, ...], Field(strict=False, min_length=1)] = Field(
+        description="What is added up before the gains."
+    )
+    gains: bool = Field(False, description="Multiply by the corrupting gains.")
+    calibrate: bool = Field(False, description="Calibrate, and use the residual R.")
+
+    @model_validator(mode="after")
+    def _components_are_unique(self) -> Variant:
+        if len(set(self.components)) != len(self.components):
+            raise fault("components", f"names a component twice: {', '.join(self.components)}")
+        return self
+
+
+def _paper_variants() -> dict[str, Variant]:
+    everything: tuple[Component, ...] = ("foregrounds", "eor", "noise")
+    return {
+        "uncorrupted": Variant(components=everything),
+        "uncalibrated": Variant(components=everything, gains=True),
+        "residual": Variant(components=everything, gains=True, calibrate=True),
+        "residual_without_eor": Variant(components=("foregrounds", "noise"), gains=True, calibrate=True),
+        "eor": Variant(components=("eor",)),
+        "noise": Variant(components=("noise",)),
+    }
+
+
+class Outputs(Section):
+    """What is drawn, and where products and run folders go."""
+
+    figures: Annotated[tuple[FigureName, ...], Field(strict=False)] = ("layout", "wedge", "spherical")
+    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all experiments.")
+    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
+
+
+class Experiment(Section):
+    """One study: an instrument, a sky, what corrupts the data, the calibration under test, and what is measured."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", description="Names the run folder.")
+    description: str = ""
+    instrument: InstrumentSettings = InstrumentSettings()
+    sky: SkySettings = SkySettings()
+    simulation: SimulationSettings = SimulationSettings()
+    corruption: CorruptionSettings = CorruptionSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+    power: PowerSettings = PowerSettings()
+    variants: dict[str, Variant] = Field(
+        default_factory=_paper_variants, min_length=1, description="By default the six of the paper's figures."
+    )
+    outputs: Outputs = Outputs()
+    scales: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
+    )
+
+    @model_validator(mode="after")
+    def _variants_have_their_components(self) -> Experiment:
+        for name, variant in self.variants.items():
+            if "noise" in variant.components and self.corruption.noise.kind == "none":
+                raise fault(f"variants.{name}.components", "asks for noise, but corruption.noise is 'none'")
+            if "foregrounds" in variant.components and self.sky.foregrounds.kind == "none":
+                raise fault(f"variants.{name}.components", "asks for foregrounds, but sky.foregrounds is 'none'")
+        if not any(variant.components == ("eor",) for variant in self.variants.values()):
+            raise fault("variants", "needs one with components [eor] alone: its power is the sample variance of errors")
+        return self
+
+    @model_validator(mode="after")
+    def _figures_have_their_variants(self) -> Experiment:
+        for figure in self.outputs.figures:
+            missing = [name for name in FIGURE_VARIANTS[figure] if name not in self.variants]
+            if missing:
+                raise fault("outputs.figures", f"asks for {figure!r}, which needs the variant(s) {', '.join(missing)}")
+        return self
+
+    @model_validator(mode="after")
+    def _levels_have_their_reference(self) -> Experiment:
+        if self.sky.foregrounds.kind == "none":
+            if self.corruption.eor_level is not None:
+                raise fault(
+                    "corruption.eor_level", "is relative to foregrounds, but sky.foregrounds is 'none': use null"
+                )
+            if self.corruption.noise.kind == "times-foregrounds":
+                raise fault("corruption.noise", "is relative to foregrounds, but sky.foregrounds is 'none'")
+        return self
+
+    @model_validator(mode="after")
+    def _channels_hold_the_basis(self) -> Experiment:
+        basis, channels = self.calibration.basis, self.instrument.channels
+        nyquist = 0.5 / channels.width
+        if basis.min_delay + basis.buffer >= nyquist:
+            raise fault(
+                "calibration.basis.buffer",
+                f"with min_delay makes a half-width of {1e9 * (basis.min_delay + basis.buffer):.0f} ns, which must "
+                f"stay below the {1e9 * nyquist:.0f} ns that channels of {channels.width / 1e3:g} kHz resolve",
+            )
+        return self

@@ -1,0 +1,104 @@
+"""Make one product: the unit of work that is sent to a worker."""
+
+from __future__ import annotations
+
+import errno
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from calstudy import __version__
+from calstudy.errors import InputError
+from calstudy.resources import Usage
+from calstudy.stages.registry import STAGES, Job
+from calstudy.store import Product, Store
+from calstudy.tasks import Task
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """A task without the graph behind it: what a worker must know to make its product."""
+
+    stage: str
+    key: str
+    label: str
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, tuple[str, str]]
+    store: Path
+
+    @classmethod
+    def of(cls, task: Task, store: Store) -> Order:
+        """Return the order for `task`."""
+        return cls(
+            stage=task.stage,
+            key=task.key,
+            label=task.label,
+            settings=task.settings,
+            inputs={name: (needed.stage, needed.key) for name, needed in task.inputs.items()},
+            store=store.root,
+        )
+
+
+def _verified_inputs(order: Order, store: Store) -> dict[str, Path]:
+    products = {name: store.verify(*address) for name, address in order.inputs.items()}
+    damaged = [f"{order.inputs[name][0]}/{order.inputs[name][1]}" for name, found in products.items() if found is None]
+    if damaged:
+        raise InputError(
+            f"{order.stage} ({order.label}): its input {damaged[0]} was removed or damaged while the run was going on; "
+            "run again to rebuild it"
+        )
+    return {name: product.path for name, product in products.items() if product is not None}
+
+
+def perform(order: Order) -> Product:
+    """Make the ordered product, or return it if another run has made it meanwhile.
+
+    Raises
+    ------
+    InputError
+        If an input vanished or was damaged, the stage refuses its input, or the store is full.
+    """
+    store = Store(order.store)
+    try:
+        with store.lock(order.stage, order.key):
+            existing = store.verify(order.stage, order.key)
+            return existing if existing is not None else _make(order, store)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+            raise InputError(
+                f"outputs.store = {str(store.root)!r}: {order.stage} ({order.label}) could not be written "
+                f"({error.strerror}); make room or choose another folder with --set outputs.store=DIR, and run again: "
+                "finished products are kept"
+            ) from None
+        raise
+
+
+def _make(order: Order, store: Store) -> Product:
+    inputs = _verified_inputs(order, store)
+    started = datetime.now(UTC)
+    logging.captureWarnings(True)
+    with store.building(order.stage, order.key) as folder:
+        with Usage() as usage:
+            stage = STAGES[order.stage]
+            notes = stage.load()(Job(settings=order.settings, inputs=inputs, output=folder))
+        record = {
+            "stage": order.stage,
+            "stage_version": stage.version,
+            "key": order.key,
+            "label": order.label,
+            "settings": order.settings,
+            "inputs": order.inputs,
+            "notes": notes,
+            "calstudy": __version__,
+            "started": started.isoformat(timespec="seconds"),
+            "seconds": round(usage.seconds, 3),
+            "cpu_seconds": round(usage.cpu_seconds, 3),
+            "peak_memory_bytes": usage.peak_memory,
+        }
+        logger.info("%s (%s): %.1f s", order.stage, order.label, usage.seconds)
+        return store.seal(folder, record)

@@ -1,0 +1,104 @@
+"""Show what a run would do, and what it did, as tables."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from calstudy.estimates import LIBRARIES_MEMORY, Cost, estimate
+from calstudy.execution import schedule
+from calstudy.experiment.model import Experiment
+from calstudy.progress import duration
+from calstudy.resources import cores, free_memory
+from calstudy.runs import Run, run_folder
+from calstudy.store import Store
+from calstudy.tasks import Graph, Task
+
+
+def choose_workers(experiment: Experiment, wanted: int | None) -> int:
+    """Return the number of worker processes: what is wanted, or one per core as far as the free memory goes."""
+    if wanted is not None:
+        return wanted
+    largest = max(estimate(task).memory for task in Graph(experiment).tasks)
+    return max(1, min(cores(), int(free_memory() // largest)))
+
+
+def _by_stage(tasks: Sequence[Task]) -> dict[str, list[Task]]:
+    groups: dict[str, list[Task]] = defaultdict(list)
+    for task in tasks:
+        groups[task.stage].append(task)
+    return groups
+
+
+def _gigabytes(count: float) -> str:
+    return f"{count / 1e9:.2f} GB" if count >= 1e7 else f"{count / 1e6:.1f} MB"
+
+
+def show_plan(experiment: Experiment, workers: int, console: Console) -> None:
+    """Print the stages of an experiment, what is in the store, and what the rest will take."""
+    graph, store = Graph(experiment), Store(experiment.outputs.store)
+    plan = schedule(graph.targets, store)
+    todo = {task.key for task in plan.todo}
+    table = Table(title=f"{experiment.name}: plan for {workers} worker(s)", title_justify="left")
+    for heading, justify in (("stage", "left"), ("products", "right"), ("to make", "right"), ("cpu time", "right")):
+        table.add_column(heading, justify=justify)
+    table.add_column("memory each", justify="right")
+    table.add_column("disk", justify="right")
+    for stage, tasks in _by_stage(graph.tasks).items():
+        costs = [estimate(task) for task in tasks if task.key in todo]
+        table.add_row(
+            stage,
+            str(len(tasks)),
+            str(len(costs)),
+            duration(sum(cost.seconds for cost in costs)) if costs else "-",
+            _gigabytes(max(cost.memory for cost in costs)) if costs else "-",
+            _gigabytes(sum(cost.disk for cost in costs)) if costs else "-",
+        )
+    console.print(table)
+    for task in plan.damaged:
+        console.print(f"damaged, will be made again: {task.stage} ({task.label})", markup=False)
+    _total([estimate(task) for task in plan.todo], plan.todo, workers, console)
+    for note in graph.footnotes:
+        console.print(f"stand-in: {note}", markup=False)
+    console.print(f"store: {store.root}\nrun folder: {run_folder(experiment)}", markup=False, soft_wrap=True)
+
+
+def _total(costs: list[Cost], tasks: Sequence[Task], workers: int, console: Console) -> None:
+    if not costs:
+        console.print("everything is in the store: a run only writes its folder")
+        return
+    kept = sum(cost.disk for cost, task in zip(costs, tasks, strict=True) if not task.temporary)
+    memory = LIBRARIES_MEMORY + workers * max(cost.memory for cost in costs)
+    console.print(
+        f"in all: about {duration(sum(cost.seconds for cost in costs) / workers)}, "
+        f"up to {_gigabytes(memory)} of memory ({_gigabytes(free_memory())} free), "
+        f"{_gigabytes(sum(cost.disk for cost in costs))} of disk while running, {_gigabytes(kept)} kept"
+    )
+
+
+def show_result(result: Run, console: Console) -> None:
+    """Print what a run made, what it warns of, and where its results are."""
+    made = {task.key for task in result.made}
+    table = Table(title="products", title_justify="left")
+    table.add_column("stage")
+    for heading in ("made", "from store", "cpu time", "peak memory"):
+        table.add_column(heading, justify="right")
+    for stage, tasks in _by_stage(result.tasks).items():
+        records = [result.products[task.key].record for task in tasks if task.key in made]
+        stored = sum(task.key in result.products and task.key not in made for task in tasks)
+        table.add_row(
+            stage,
+            str(len(records)),
+            str(stored),
+            duration(sum(record["cpu_seconds"] for record in records)) if records else "-",
+            _gigabytes(max(record["peak_memory_bytes"] for record in records)) if records else "-",
+        )
+    console.print(table)
+    for warning in result.warnings:
+        console.print(f"warning: {warning}", markup=False)
+    for figure in sorted((result.folder / "figures").glob("*.png")):
+        console.print(f"figure: {figure}", markup=False)
+    console.print(f"tables: {result.folder / 'tables'}\nmanifest: {result.folder / 'manifest.json'}", markup=False)

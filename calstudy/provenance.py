@@ -1,0 +1,79 @@
+"""Where results come from: versions, commit, machine, seeds."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from calstudy import __version__
+from calstudy.resources import cores
+
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "astropy",
+    "pyuvdata",
+    "pyuvsim",
+    "pyradiosky",
+    "hera_pspec",
+    "tensorflow",
+    "fftvis",
+    "healpy",
+    "dask",
+    "mwa_pb",
+    "matplotlib",
+)
+
+
+def package_versions() -> dict[str, str | None]:
+    """Return the versions of the packages that results depend on; None for one that is not installed."""
+    versions: dict[str, str | None] = {"calstudy": __version__}
+    for name in PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = None
+    return versions
+
+
+def git_commit() -> str | None:
+    """Return the commit of the checkout that calstudy runs from, with ``-dirty`` if it was changed, or None."""
+    checkout = Path(__file__).resolve().parents[1]
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(checkout), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")) != checkout:
+            return None
+        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def machine() -> dict[str, Any]:
+    """Return the processor count, memory, system and Python of this machine."""
+    return {
+        "cores": cores(),
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+    }
+
+
+def seeds(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return every seed in nested settings, by its dotted path."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in ("seed", "seeds"):
+            found[f"{prefix}{key}"] = value
+        elif isinstance(value, Mapping) and key != "scales":
+            found |= seeds(value, f"{prefix}{key}.")
+    return found

@@ -1,0 +1,188 @@
+"""Runs: make what an experiment asks for, and leave a folder that says what was made and from what."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from rich.console import Console
+
+from calstudy.errors import InputError
+from calstudy.estimates import estimate
+from calstudy.execution import drop_temporary, execute, schedule
+from calstudy.experiment.files import dump
+from calstudy.experiment.model import Experiment
+from calstudy.progress import report
+from calstudy.provenance import git_commit, machine, package_versions, seeds
+from calstudy.store import Product, Store, digest_json
+from calstudy.tasks import Graph, Task
+
+logger = logging.getLogger(__name__)
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder
+        Holds the resolved experiment, the manifest, the log, figures and tables.
+    products
+        By key.
+    made
+        Tasks whose products this run made; the others were in the store.
+    tasks
+        All tasks of the experiment whose products the run made or looked at.
+    """
+
+    folder: Path
+    products: dict[str, Product]
+    made: tuple[Task, ...]
+    tasks: tuple[Task, ...]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the stages warn of, once each."""
+        found = [text for product in self.products.values() for text in product.record["notes"].get("warnings", [])]
+        return list(dict.fromkeys(found))
+
+
+def run_folder(experiment: Experiment) -> Path:
+    """Return the folder of this experiment's runs: its name and a digest of all that it says.
+
+    The same experiment has the same folder; a changed one never overwrites it.
+    """
+    content = experiment.model_dump(mode="json", exclude={"outputs": {"store", "runs"}, "scales": True})
+    return experiment.outputs.runs.expanduser().resolve() / f"{experiment.name}-{digest_json(content)[:8]}"
+
+
+def _open_folder(folder: Path) -> None:
+    known = {"figures", "tables", MANIFEST, "experiment.yaml", "run.log"}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        strangers = sorted(path.name for path in folder.iterdir() if path.name not in known)
+        (folder / "run.log").touch()
+    except OSError as error:
+        raise InputError(f"outputs.runs = {str(folder.parent)!r}: cannot be written ({error.strerror})") from None
+    if strangers:
+        raise InputError(
+            f"outputs.runs: {folder} holds {strangers[0]!r}, which no run wrote; move it or choose another folder"
+        )
+
+
+@contextmanager
+def _log_to(path: Path) -> Iterator[None]:
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root, package = logging.getLogger(), logging.getLogger("calstudy")
+    level = package.level
+    root.addHandler(handler)
+    package.setLevel(logging.INFO)
+    logging.captureWarnings(True)
+    try:
+        yield
+    finally:
+        logging.captureWarnings(False)
+        package.setLevel(level)
+        root.removeHandler(handler)
+        handler.close()
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a text file so that it is there whole or not at all."""
+    partial = path.with_name(f".{path.name}-{uuid4().hex}")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def _publish(products: list[Product], folder: Path) -> None:
+    """Copy the files of products into a folder of the run, each whole or not at all."""
+    folder.mkdir(exist_ok=True)
+    for product in products:
+        for name in product.record["files"]:
+            partial = folder / f".{name}-{uuid4().hex}"
+            shutil.copyfile(product.path / name, partial)
+            partial.replace(folder / name)
+
+
+def _manifest(experiment: Experiment, graph: Graph, products: dict[str, Product], made: set[str]) -> dict[str, Any]:
+    entries = []
+    for task in graph.tasks:
+        if task.key in products:
+            record = products[task.key].record
+            fields = (
+                "stage",
+                "label",
+                "key",
+                "notes",
+                "seconds",
+                "cpu_seconds",
+                "peak_memory_bytes",
+                "started",
+                "inputs",
+            )
+            entries.append({**{field: record[field] for field in fields}, "made_by_this_run": task.key in made})
+    return {
+        "name": experiment.name,
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "stand_ins": list(graph.footnotes),
+        "seeds": seeds(experiment.model_dump(mode="json")),
+        "git_commit": git_commit(),
+        "versions": package_versions(),
+        "machine": machine(),
+        "products": entries,
+    }
+
+
+def run(experiment: Experiment, workers: int, scheduler: str | None, console: Console) -> Run:
+    """Make the figures and spectra of an experiment, reusing every product that is in the store.
+
+    Parameters
+    ----------
+    experiment
+        Validated.
+    workers
+        Worker processes on this machine.
+    scheduler
+        Address of a running dask scheduler to use instead, or None.
+    console
+        Where progress is written.
+
+    Raises
+    ------
+    InputError
+        If the store or the run folder cannot be written, or a stage refuses its input.
+    """
+    graph, store, folder = Graph(experiment), Store(experiment.outputs.store), run_folder(experiment)
+    store.prepare()
+    _open_folder(folder)
+    with _log_to(folder / "run.log"):
+        plan = schedule(graph.targets, store)
+        for task in plan.damaged:
+            message = f"{task.stage} ({task.label}): the product in the store is damaged, and is made again"
+            logger.warning(message)
+            console.print(message, markup=False)
+        costs = {task.key: estimate(task).seconds for task in plan.todo}
+        with report(plan.todo, costs, console) as done:
+            products = execute(plan.todo, store, workers, scheduler, done)
+        products |= plan.ready
+        drop_temporary(graph.targets, store)
+        for task in graph.tasks:
+            if task.key not in products and (found := store.find(task.stage, task.key)) is not None:
+                products[task.key] = found
+        _publish([products[task.key] for task in graph.figures], folder / "figures")
+        _publish([products[graph.spectra.key]], folder / "tables")
+        _write(folder / "experiment.yaml", dump(experiment))
+        made = {task.key for task in plan.todo}
+        _write(folder / MANIFEST, json.dumps(_manifest(experiment, graph, products, made), indent=1))
+    return Run(folder, products, plan.todo, tuple(graph.tasks))

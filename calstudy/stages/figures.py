@@ -1,0 +1,60 @@
+"""Stage `figure`: from spectra and layouts to pictures, with the arrays that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from pydantic import TypeAdapter
+
+from calstudy.figures.layouts import LayoutPanel, draw_layouts
+from calstudy.figures.save import figure_arrays, save_figure
+from calstudy.figures.spherical import SphericalColumn, draw_spherical
+from calstudy.figures.wedge import WedgePanels, draw_wedge
+from calstudy.instrument.layouts import make_layout
+from calstudy.instrument.settings import Layout
+from calstudy.power.spherical import SphericalSpectrum
+from calstudy.power.tables import load_spectrum
+from calstudy.power.wedge import WedgeSpectrum
+from calstudy.stages.registry import Job
+
+SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eor", "noise")
+
+
+def _layout(job: Job) -> tuple[Figure, Any]:
+    layout = make_layout(TypeAdapter(Layout).validate_python(job.settings["layout"]))
+    panel = LayoutPanel(title=layout.name, numbers=layout.numbers, enu=layout.enu)
+    return draw_layouts([panel], stand_ins=job.settings["notes"]), panel
+
+
+def _wedge(job: Job) -> tuple[Figure, Any]:
+    folder = job.inputs["spectra"]
+    names = [name for name in SERIES if name != "residual_without_eor"]
+    panels = WedgePanels(**{name: load_spectrum(folder / f"{name}.wedge.h5", WedgeSpectrum) for name in names})
+    return draw_wedge(panels, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"]), panels
+
+
+def _column(folder: Path, title: str, modes: str) -> SphericalColumn:
+    found = {name: folder / f"{name}.{modes}.h5" for name in SERIES}
+    spectra = {name: load_spectrum(path, SphericalSpectrum) for name, path in found.items() if path.exists()}
+    return SphericalColumn(title=title, **spectra)
+
+
+def _spherical(job: Job) -> tuple[Figure, Any]:
+    folder = job.inputs["spectra"]
+    excised = f"outside wedge + {1e9 * job.settings['wedge_buffer']:.0f} ns"
+    columns = [_column(folder, "all modes", "all-modes"), _column(folder, excised, "outside-wedge")]
+    return draw_spherical(columns, stand_ins=job.settings["notes"]), {"all_modes": columns[0], "excised": columns[1]}
+
+
+FIGURES = {"layout": _layout, "wedge": _wedge, "spherical": _spherical}
+
+
+def draw(job: Job) -> Mapping[str, Any]:
+    """Write one figure as png and pdf, and its arrays as npz."""
+    name = job.settings["figure"]
+    figure, shown = FIGURES[name](job)
+    save_figure(figure, figure_arrays(shown), job.output, name)
+    return {}

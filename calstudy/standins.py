@@ -1,0 +1,42 @@
+"""What an experiment uses in place of the paper's own ingredients, to be told wherever its results are shown."""
+
+from __future__ import annotations
+
+from calstudy.experiment.model import Experiment
+
+PAPER_CHANNELS, PAPER_TIMES, PAPER_ANTENNAS, PAPER_NSIDE = 384, 56, 36, 256
+
+
+def _sky(experiment: Experiment) -> str | None:
+    foregrounds = experiment.sky.foregrounds
+    if foregrounds.kind == "g4jy-and-counts":
+        return "sky: G4Jy bright sources + synthetic faint ones from counts, not GLEAM"
+    if foregrounds.kind == "file":
+        return f"sky: {foregrounds.path.name}, not GLEAM"
+    return None
+
+
+def _beam(experiment: Experiment) -> str | None:
+    kind = experiment.instrument.beam.kind
+    return None if kind == "mwa-embedded-element" else f"beam: {kind}, not the MWA embedded element"
+
+
+def _scale(experiment: Experiment) -> str | None:
+    instrument = experiment.instrument
+    reductions = []
+    if instrument.channels.count < PAPER_CHANNELS:
+        reductions.append(f"{instrument.channels.count} of {PAPER_CHANNELS} channels")
+    if instrument.times.count < PAPER_TIMES:
+        reductions.append(f"{instrument.times.count} of {PAPER_TIMES} integrations")
+    if getattr(instrument.layout, "count", None) is not None and instrument.layout.count < PAPER_ANTENNAS:
+        reductions.append(f"{instrument.layout.count} of {PAPER_ANTENNAS} antennas")
+    if experiment.sky.eor.nside < PAPER_NSIDE:
+        reductions.append(f"EoR nside {experiment.sky.eor.nside} of {PAPER_NSIDE}")
+    if getattr(experiment.sky.foregrounds, "count", None) is not None:
+        reductions.append(f"the {experiment.sky.foregrounds.count} brightest sources")
+    return f"reduced scale: {', '.join(reductions)}" if reductions else None
+
+
+def footnotes(experiment: Experiment) -> tuple[str, ...]:
+    """Return one short sentence per stand-in of the experiment, empty if all is as in the paper."""
+    return tuple(note for note in (_sky(experiment), _beam(experiment), _scale(experiment)) if note)

@@ -1,0 +1,137 @@
+"""Experiment files: what is read is what was written, and every fault is told in the file's own terms."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from calstudy.errors import ExperimentError, InputError
+from calstudy.experiment.files import apply_scale, dump, load, override, parse_override, parse_yaml, validate
+from calstudy.experiment.model import Experiment
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+HERE = Path(__file__).parent
+
+
+def faults_of(text: str) -> list[str]:
+    with pytest.raises(ExperimentError) as caught:
+        validate(yaml.safe_load(text), HERE)
+    return caught.value.faults
+
+
+@pytest.mark.parametrize("path", sorted(EXPERIMENTS.rglob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_experiments_are_valid_at_every_scale(path):
+    experiment = load(path)
+    for scale in experiment.scales:
+        assert load(path, scale).name == experiment.name
+
+
+def test_the_defaults_are_the_papers_numbers():
+    experiment = Experiment(name="defaults")
+    channels, times = experiment.instrument.channels, experiment.instrument.times
+    assert (channels.count, channels.width, channels.first) == (384, 80e3, 167.075e6)
+    assert (times.count, times.integration, times.start_lst) == (56, 2.0, 1.8)
+    assert experiment.sky.eor.amplitude == 12482.356
+    assert experiment.corruption.eor_level == -40
+    assert experiment.corruption.noise.factor == 10
+    assert experiment.corruption.gains.sigma == 0.1
+    assert experiment.power.wedge_buffer == 1e-7
+
+
+@pytest.mark.parametrize("path", sorted(EXPERIMENTS.rglob("*.yaml")), ids=lambda path: path.stem)
+def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
+    resolved = tmp_path / "resolved.yaml"
+    experiment = load(path)
+    resolved.write_text(dump(experiment))
+    assert load(resolved) == experiment
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{name: a, calibratoin: {}}", "calibratoin: unknown key, did you mean 'calibration'?"),
+        ("{name: a, calibration: {basis: {bufer: 1 ns}}}", "calibration.basis.bufer: unknown key, did you mean 'buffer'?"),
+        ("{name: a, instrument: {channels: {first: 167}}}", "instrument.channels.first: 167 has no unit"),
+        (
+            "{name: a, instrument: {channels: {width: -80 kHz}}}",
+            "instrument.channels.width = '-80 kHz': must be greater than 0 Hz",
+        ),
+        ("{name: a, instrument: {layout: hexa}}", "instrument.layout: 'hexa' is not a choice, did you mean 'hex'?"),
+        ("{name: a, instrument: {layout: {kind: hex, side: '3'}}}", "instrument.layout.side = '3': must be a whole number"),
+        ("{name: a, instrument: {times: {count: 2.5}}}", "instrument.times.count = 2.5: must be a whole number"),
+        ("{name: a, instrument: {polarizations: []}}", "instrument.polarizations: must have at least 1 item(s), has 0"),
+        ("{name: a, sky: {eor: {nside: 100}}}", "sky.eor.nside = 100: not a choice (allowed: 16, 32, 64, 128, 256)"),
+        ("{name: a, sky: 3}", "sky = 3: must be a block of keys"),
+        ("{name: a, variants: {v: {components: [fog]}}}", "variants.v.components.0 = 'fog': not a choice"),
+        ("{name: a, variants: {v: {components: [noise]}}}", "variants: needs one with components [eor] alone"),
+        ("{name: a, corruption: {noise: none}}", "asks for noise, but corruption.noise is 'none'"),
+        ("{name: a, corruption: {gains: {sigma: .nan}}}", "corruption.gains.sigma = nan: must be a finite number"),
+        ("{name: a, sky: {foregrounds: {kind: file, path: no.skyh5}}}", "sky.foregrounds.path = 'no.skyh5': no such file"),
+        ("{name: a, sky: {foregrounds: file}}", "sky.foregrounds.path: missing, and it has no default"),
+        ("{}", "name: missing, and it has no default"),
+        ("{name: a b}", "name = 'a b': must match"),
+        (
+            "{name: a, calibration: {basis: {buffer: 10 us}}}",
+            "calibration.basis.buffer: with min_delay makes a half-width of 10100 ns",
+        ),
+    ],
+)
+def test_a_fault_names_path_value_and_what_is_allowed(text, told):
+    assert any(sentence.startswith(told) or told in sentence for sentence in faults_of(text)), faults_of(text)
+
+
+def test_all_faults_are_told_at_once():
+    told = faults_of("{name: a, bogus: 1, sky: {eor: {nside: 3}}, power: {taper: square}}")
+    assert [sentence.split()[0].rstrip(":") for sentence in told] == ["sky.eor.nside", "power.taper", "bogus"]
+
+
+def test_overrides_reach_into_blocks_written_as_a_word():
+    data = override({"instrument": {"beam": "airy"}}, "instrument.beam.diameter", "5 m")
+    assert data == {"instrument": {"beam": {"kind": "airy", "diameter": "5 m"}}}
+    assert override({}, "a.b", 1) == {"a": {"b": 1}}
+
+
+def test_overrides_leave_the_original_alone():
+    data = {"a": {"b": 1}}
+    override(data, "a.b", 2)
+    assert data == {"a": {"b": 1}}
+
+
+def test_override_values_are_yaml():
+    assert parse_override("a.b=[1, 2]") == ("a.b", [1, 2])
+    assert parse_override("a=1e-9") == ("a", 1e-9)
+    assert parse_override("a=80 kHz") == ("a", "80 kHz")
+    with pytest.raises(InputError, match="write a dotted path and a value"):
+        parse_override("a.b")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a: 1\na: 2", "line 2: key 'a' appears twice"),
+        ("a: [1", "line 1"),
+        ("a: !!python/object:os.system {}", "could not determine a constructor"),
+        ("1: 2", "key 1 is not a text"),
+    ],
+)
+def test_broken_yaml_is_one_sentence_with_the_line(text, told):
+    with pytest.raises(InputError, match="file.yaml") as caught:
+        parse_yaml(text, "file.yaml")
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_scale_lists_those_there_are():
+    with pytest.raises(InputError, match="the file has: small"):
+        apply_scale({"scales": {"small": {"a": 1}}}, "smal")
+
+
+def test_unreadable_files_are_told(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        load(tmp_path / "none.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="not a text file"):
+        load(tmp_path / "binary.yaml")
+    (tmp_path / "list.yaml").write_text("[1, 2]")
+    with pytest.raises(InputError, match="must hold a block of keys"):
+        load(tmp_path / "list.yaml")
