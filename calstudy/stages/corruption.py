@@ -40,7 +40,21 @@ def measure_levels(job: Job) -> Mapping[str, Any]:
     )
     levels = asdict(set_levels(measured["foregrounds"], measured["eor"], settings))
     write_json(job.output / "levels.json", levels)
-    return {"levels_jy": levels}
+    return {"levels_jy": levels, "warnings": _floor_warnings(job)}
+
+
+def _floor_warnings(job: Job) -> list[str]:
+    """Warn if the simulated foregrounds leak more beyond the horizon than the EoR that is put on them."""
+    if "foregrounds" not in job.inputs or job.settings["eor_level"] is None:
+        return []
+    floors = read_json(job.inputs["foregrounds"] / "quality.json")["delay_floor"]
+    level = CorruptionSettings.model_validate({"eor_level": job.settings["eor_level"]}).eor_level
+    return [
+        f"the simulated foregrounds have a delay floor of {floor['worst_db']} dB beyond the horizon "
+        f"({taper} taper), above the EoR at {level:g} dB"
+        for taper, floor in floors.items()
+        if floor["worst_db"] > level
+    ]
 
 
 def corrupt(job: Job) -> Mapping[str, Any]:

@@ -36,7 +36,7 @@ def read_visibilities(path: Path) -> UVData:
 
 def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:
     """Write UVH5; `single` stores complex64, whose rounding (6e-8) is far below any noise that a study adds."""
-    uvd.write_uvh5(path, data_write_dtype=np.complex64 if single else np.complex128)
+    uvd.write_uvh5(path, data_write_dtype=np.dtype(np.complex64 if single else np.complex128))
 
 
 def read_json(path: Path) -> Any:

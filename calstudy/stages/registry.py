@@ -45,8 +45,8 @@ class Stage:
 
 
 STAGES: Mapping[str, Stage] = {
-    "simulate-chunk": Stage("simulation", "simulate_chunk", 1),
-    "simulate": Stage("simulation", "assemble", 1),
+    "simulate-chunk": Stage("simulation", "simulate_chunk_product", 1),
+    "simulate": Stage("simulation", "assemble_product", 1),
     "gains": Stage("corruption", "draw_gains", 1),
     "levels": Stage("corruption", "measure_levels", 1),
     "corrupt": Stage("corruption", "corrupt", 1),

@@ -1,0 +1,134 @@
+"""Stages `simulate-chunk` and `simulate`: from skies and beam to visibilities."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from calstudy.instrument.beams import make_beam
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.simulate.chunks import Chunk, assemble, check_interpolation, plan_chunks, simulate_chunk
+from calstudy.simulate.engine import make_engine
+from calstudy.simulate.floor import DelayFloor, delay_floor
+from calstudy.simulate.nodes import integration_times
+from calstudy.simulate.settings import SimulationSettings
+from calstudy.sky.eor import EorField
+from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.sky.settings import Eor, Foregrounds
+from calstudy.stages.files import read_visibilities, write_json, write_visibilities
+from calstudy.stages.registry import Job
+from calstudy.visibilities import baseline_vectors, from_cube, to_cube
+
+if TYPE_CHECKING:
+    from pyradiosky import SkyModel
+    from pyuvdata import UVData
+
+SPEED_OF_LIGHT = 299792458.0
+SMOOTH_SPECTRA = ("flat", "spectral_index")
+# Width of the main lobe of each taper, in units of 1 / bandwidth: what the floor must start beyond.
+MAIN_LOBES = {"blackman-harris": 4, "dolph-chebyshev": 6}
+CHECKED = 2
+"""Integrations, and channels, at which interpolated visibilities are compared with directly simulated ones."""
+
+
+class _Scene:
+    """The instrument and the sky of one simulation, made from the settings of a job when they are asked for."""
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        self._sky_settings = settings["sky"]
+        self.is_eor = settings["component"] == "eor"
+        self.instrument = InstrumentSettings.model_validate(settings["instrument"])
+        self.simulation = SimulationSettings.model_validate(settings["simulation"])
+        self.template = make_template(self.instrument)
+        self.beam = make_beam(self.instrument.beam, self.instrument.channels)
+        self.engine = make_engine(self.simulation)
+
+    @cached_property
+    def _field(self) -> EorField:
+        return EorField(Eor.model_validate(self._sky_settings), self.template.freq_array)
+
+    @cached_property
+    def _foregrounds(self) -> SkyModel:
+        settings = TypeAdapter(Foregrounds).validate_python(self._sky_settings)
+        return make_foregrounds(settings, self.template.freq_array).sky
+
+    @property
+    def smooth(self) -> bool:
+        """Whether sky and beam vary smoothly from channel to channel, so that frequency nodes suffice."""
+        interpolation = getattr(self.instrument.beam, "interpolation", "chebyshev")
+        return not self.is_eor and interpolation == "chebyshev" and self._foregrounds.spectral_type in SMOOTH_SPECTRA
+
+    @cached_property
+    def chunks(self) -> list[Chunk]:
+        """The pieces of the simulation; there may be fewer than asked for."""
+        return plan_chunks(self.template, self.simulation, self.smooth)
+
+    def sky(self, channels: slice | np.ndarray) -> SkyModel:
+        """Return the sky, of the EoR only the given channels."""
+        return self._field.sky(channels) if self.is_eor else self._foregrounds
+
+
+def simulate_chunk_product(job: Job) -> Mapping[str, Any]:
+    """Write a block of frequency nodes at all integrations to chunk.uvh5; a piece beyond the nodes stays empty."""
+    scene = _Scene(job.settings)
+    if job.settings["index"] >= len(scene.chunks):
+        return {"empty": True}
+    chunk = scene.chunks[job.settings["index"]]
+    sky = scene.sky(chunk.channels if scene.is_eor else slice(None))
+    cube = simulate_chunk(scene.engine, sky, scene.beam, scene.template, chunk)
+    frame = subset_template(scene.template, integration_times(scene.template), chunk.frequencies)
+    write_visibilities(from_cube(frame, cube), job.output / "chunk.uvh5")
+    return {"frequencies": len(chunk.frequencies), "components": int(sky.Ncomponents)}
+
+
+def assemble_product(job: Job) -> Mapping[str, Any]:
+    """Write the visibilities at all channels to visibilities.uvh5, and what they are worth to quality.json."""
+    scene = _Scene(job.settings)
+    cubes = [to_cube(read_visibilities(job.inputs[f"chunk{n:03d}"] / "chunk.uvh5")) for n in range(len(scene.chunks))]
+    data = from_cube(scene.template, assemble(scene.chunks, cubes))
+    quality: dict[str, Any] = {"interpolation": _check(scene, to_cube(data))}
+    if not scene.is_eor:
+        quality["delay_floor"] = _floors(data)
+    write_visibilities(data, job.output / "visibilities.uvh5")
+    write_json(job.output / "quality.json", quality)
+    return quality
+
+
+def _check(scene: _Scene, cube: np.ndarray) -> dict[str, Any] | None:
+    grid = scene.chunks[0].grid
+    if grid.at_integrations and grid.at_channels:
+        return None
+    # Of the EoR, whose channels are independent, only the last block is drawn again.
+    channels = slice(-CHECKED, None) if scene.is_eor else slice(None)
+    indices = np.arange(scene.template.Nfreqs)[channels]
+    sky = scene.sky(indices)
+    return asdict(
+        check_interpolation(scene.engine, sky, scene.beam, scene.template, cube, grid, channels=channels, count=CHECKED)
+    )
+
+
+def _floors(data: UVData) -> dict[str, Any]:
+    """Measure the delay floor with both tapers, where the band leaves delays beyond the horizon for them."""
+    width = float(np.diff(data.freq_array).mean())
+    horizon = float(np.linalg.norm(baseline_vectors(data), axis=1).max()) / SPEED_OF_LIGHT
+    floors = {}
+    for taper, lobe in MAIN_LOBES.items():
+        buffer = max(100e-9, lobe / (width * data.Nfreqs))
+        if horizon + buffer + 1 / (width * data.Nfreqs) < 0.5 / width:
+            floors[taper] = _as_json(delay_floor(data, buffer=buffer, taper=taper))
+    return floors
+
+
+def _as_json(floor: DelayFloor) -> dict[str, Any]:
+    """Return the floor with lists for arrays, and null for bins without baselines."""
+    rounded = {
+        name: [None if np.isnan(value) else round(float(value), 2) for value in getattr(floor, name)]
+        for name in ("edges", "rms_db", "max_db")
+    }
+    return {**rounded, "buffer_s": floor.buffer, "worst_db": round(floor.worst_db, 2)}

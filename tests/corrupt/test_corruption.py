@@ -1,0 +1,116 @@
+"""Corruption: levels, noise and gains are what the paper says."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calstudy.corrupt.gains import draw_reflection_gains, make_gains, per_channel_gains, reflection_gain
+from calstudy.corrupt.levels import rms, set_levels
+from calstudy.corrupt.measure import corrupt_by_gains
+from calstudy.corrupt.noise import thermal_noise
+from calstudy.corrupt.settings import CorruptionSettings, FileGains, ReflectionGains, UnityGains
+from calstudy.errors import InputError
+from calstudy.gains import gains_for, make_uvcal
+from calstudy.visibilities import antenna_indices, from_cube, to_cube
+
+
+def complex_normal(rng, shape):
+    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+
+def test_noise_has_the_asked_variance_in_both_parts_and_is_white():
+    noise = thermal_noise((200, 500), std=3.0, seed=1)
+    # 1e5 samples: relative error of a variance is sqrt(2 / 1e5) = 0.45 %.
+    assert np.var(noise.real) == pytest.approx(4.5, rel=0.02)
+    assert np.var(noise.imag) == pytest.approx(4.5, rel=0.02)
+    assert abs(np.mean(noise[:, 1:] * noise[:, :-1].conj())) < 4 * 9 / np.sqrt(noise.size)
+    assert abs(np.mean(noise.real * noise.imag)) < 4 * 4.5 / np.sqrt(noise.size)
+
+
+def test_noise_depends_on_its_seed_only():
+    assert np.array_equal(thermal_noise((4, 5), 1.0, 7), thermal_noise((4, 5), 1.0, 7))
+    assert abs(np.vdot(thermal_noise((100, 100), 1.0, 7), thermal_noise((100, 100), 1.0, 8))) / 1e4 < 0.05
+
+
+def test_per_channel_gains_scatter_about_unity_by_sigma_in_each_part():
+    gains = per_channel_gains(100, 1000, sigma=0.1, seed=5)
+    assert np.mean(gains) == pytest.approx(1, abs=2e-3)
+    assert np.std(gains.real) == pytest.approx(0.1, rel=0.01)
+    assert np.std(gains.imag) == pytest.approx(0.1, rel=0.01)
+    assert abs(np.mean((gains[:, 1:] - 1) * (gains[:, :-1] - 1).conj())) < 4 * 0.02 / np.sqrt(1e5)
+
+
+@given(r=st.floats(0, 0.3), tau=st.floats(-2e-6, 2e-6), phi=st.floats(-3, 3))
+def test_a_reflection_gain_is_the_sum_of_its_echoes(r, tau, phi):
+    nu = 167e6 + 80e3 * np.arange(20)
+    echo = -r * np.exp(-1j * (2 * np.pi * nu * tau + phi))
+    assert reflection_gain(nu, r, tau, phi) == pytest.approx(sum(echo**n for n in range(40)), abs=1e-12)
+
+
+def test_reflections_peak_at_their_delay_with_their_amplitude():
+    nu = 167e6 + 80e3 * np.arange(384)
+    gains = draw_reflection_gains(2000, nu, ReflectionGains(kind="reflection", seed=3))
+    spectrum = np.abs(np.fft.fft(gains - gains.mean(axis=1, keepdims=True), axis=1)) / nu.size
+    delay = np.abs(np.fft.fftfreq(nu.size, 80e3))[spectrum.argmax(axis=1)]
+    assert np.mean(delay) == pytest.approx(1200e-9, abs=20e-9)
+    # The mean of r over 2000 antennas is known to 0.01 / sqrt(2000); scalloping loses up to 36 % of a peak.
+    assert 0.007 < spectrum.max(axis=1).mean() < 0.0105
+
+
+def test_a_reflection_that_does_not_decay_is_refused():
+    with pytest.raises(InputError, match=r"corruption\.gains\.amplitude = 0\.9"):
+        draw_reflection_gains(100, np.ones(3), ReflectionGains(kind="reflection", amplitude=0.9))
+
+
+def test_levels_put_the_eor_40_db_below_in_amplitude_and_the_noise_10_times_above():
+    levels = set_levels(foreground_rms=50.0, eor_rms=2.0, settings=CorruptionSettings())
+    assert levels.eor_factor * 2.0 == pytest.approx(50.0 * 1e-4)
+    assert levels.noise_std == pytest.approx(10 * 50.0 * 1e-4)
+
+
+def test_noise_may_follow_the_foregrounds_and_the_eor_keep_absolute_units():
+    settings = CorruptionSettings.model_validate({"eor_level": None, "noise": "times-foregrounds"})
+    levels = set_levels(50.0, 2.0, settings)
+    assert (levels.eor_factor, levels.noise_std) == (1.0, 5.0)
+
+
+def test_a_level_relative_to_nothing_is_refused():
+    with pytest.raises(InputError, match="eor_level"):
+        set_levels(0.0, 2.0, CorruptionSettings())
+    with pytest.raises(InputError, match="all zero"):
+        set_levels(1.0, 0.0, CorruptionSettings())
+
+
+def test_rms_is_over_complex_samples():
+    assert rms(np.array([3.0, 4.0j])) == pytest.approx(np.sqrt(12.5))
+
+
+def test_corruption_multiplies_by_g_a_and_conjugate_g_b(template, rng):
+    cube = complex_normal(rng, (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols))
+    gains = complex_normal(rng, (template.Nants_telescope, template.Nfreqs, 1, template.Npols))
+    data = corrupt_by_gains(from_cube(template, cube), make_uvcal(template, gains))
+    a, b = antenna_indices(template).T
+    expected = gains[a, :, 0] * gains[b, :, 0].conj() * cube
+    assert to_cube(data) == pytest.approx(expected, rel=1e-13)
+    assert data.vis_units == template.vis_units
+
+
+def test_gains_read_from_a_file_are_those_written(template, rng, tmp_path):
+    gains = complex_normal(rng, (template.Nants_telescope, template.Nfreqs, 1, template.Npols))
+    make_uvcal(template, gains).write_calh5(tmp_path / "g.calh5")
+    back = make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template)
+    assert np.array_equal(gains_for(back, template), gains)
+
+
+def test_gains_of_other_channels_or_antennas_are_refused(template, tmp_path):
+    unity = make_gains(UnityGains(kind="unity"), template)
+    shifted = unity.copy()
+    shifted.freq_array = shifted.freq_array + 5e6
+    with pytest.raises(InputError, match="no channel at 167"):
+        gains_for(shifted, template)
+    with pytest.raises(InputError, match=r"no solution for antenna\(s\) 6"):
+        gains_for(unity.select(antenna_nums=list(range(6)), inplace=False), template)
+    (tmp_path / "noise.calh5").write_bytes(b"no gains")
+    with pytest.raises(InputError, match=r"corruption\.gains\.path"):
+        make_gains(FileGains(kind="file", path=tmp_path / "noise.calh5"), template)

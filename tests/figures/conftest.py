@@ -1,0 +1,161 @@
+"""Small data with the dynamic range of the study: foregrounds 1e15, EoR 3e7, noise 6e7 mK² h⁻³ Mpc³."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from calstudy.figures.baselines import BaselineSpectra, draw_baselines
+from calstudy.figures.comparison import Visibilities, VisibilityComparison, compare_visibilities
+from calstudy.figures.data import draw_data
+from calstudy.figures.domains import in_two_domains
+from calstudy.figures.gains import compare_gains, draw_gains
+from calstudy.figures.layouts import LayoutPanel, draw_layouts
+from calstudy.figures.model import draw_model
+from calstudy.figures.reflections import draw_reflections
+from calstudy.figures.runtime import draw_runtime, summarize_runtime
+from calstudy.figures.spherical import SphericalColumn, draw_spherical
+from calstudy.figures.spherical_comparison import draw_spherical_comparison
+from calstudy.figures.wedge import WedgePanels, draw_wedge
+from calstudy.power.delay import delays
+from calstudy.power.spherical import SphericalSpectrum
+from calstudy.power.wedge import WedgeSpectrum
+
+FREQUENCY = 167.075e6 + 80e3 * np.arange(64)
+
+
+@pytest.fixture
+def make_wedge_spectrum() -> Callable[..., WedgeSpectrum]:
+    """Return a maker of wedge spectra: power (Nb, Nd), bin edges (Nb, 2) in m."""
+
+    def make(power: np.ndarray, bin_edges: np.ndarray, delay: np.ndarray) -> WedgeSpectrum:
+        length = bin_edges.mean(axis=1)
+        return WedgeSpectrum(
+            baseline_length=length,
+            bin_edges=bin_edges,
+            k_perp=5.55e-4 * length,
+            delay=delay,
+            k_parallel=5.4e5 * delay,
+            power=power.astype(complex),
+            n_pairs=np.ones(length.size, dtype=int),
+            horizon_delay=length / 299792458.0,
+        )
+
+    return make
+
+
+@pytest.fixture
+def wedge_panels(make_wedge_spectrum) -> WedgePanels:
+    rng = np.random.default_rng(11)
+    lower = 4.0 * np.concatenate([[2, 3], np.arange(6, 40, 3)])
+    edges, delay = np.column_stack([lower, lower + 4]), np.arange(60) / 30.72e6
+    shape = (lower.size, delay.size)
+    inside = delay <= edges.mean(axis=1)[:, None] / 299792458.0
+    foregrounds = np.where(inside, 1e15, 1e4) * rng.exponential(size=shape)
+    eor, noise = 3e7 * rng.exponential(size=shape), 6e7 * rng.normal(size=shape)
+    leaked = 1e12 * rng.exponential(size=shape)
+    powers = (foregrounds + eor + noise, foregrounds + leaked, ~inside * (eor + noise), eor, noise)
+    return WedgePanels(*(make_wedge_spectrum(power, edges, delay) for power in powers))
+
+
+@pytest.fixture
+def make_spherical_spectrum() -> Callable[..., SphericalSpectrum]:
+    """Return a maker of spherical spectra in bins of 0.04 h/Mpc: power (Nk,), errors (Nk,) or numbers."""
+
+    def make(power: np.ndarray, noise_error: np.ndarray | float, sample_error: np.ndarray | float) -> SphericalSpectrum:
+        edges = 0.04 * np.arange(power.size + 1)
+        ones = np.ones(power.size)
+        return SphericalSpectrum(
+            k=(edges[1:] + edges[:-1]) / 2,
+            bin_edges=edges,
+            power=power + 1e3j,
+            n_modes=ones.astype(int),
+            noise_modes=ones,
+            sample_modes=ones,
+            noise_error=noise_error * ones,
+            sample_error=sample_error * ones,
+            wedge_excluded=True,
+        )
+
+    return make
+
+
+@pytest.fixture
+def make_column(make_spherical_spectrum) -> Callable[..., SphericalColumn]:
+    """Return a maker of whole columns; the first bins, where everything is excised, are empty."""
+
+    def make(seed: int, empty: int = 0, n_bins: int = 40) -> SphericalColumn:
+        rng = np.random.default_rng(seed)
+        k = 0.04 * (np.arange(n_bins) + 0.5)
+        eor, noise = np.full(n_bins, 3e7), 2e6 * rng.normal(size=(3, n_bins))
+        for array in (eor, noise):
+            array[..., :empty] = np.nan
+        foregrounds = 1e15 * np.exp(-k / 0.02)
+        sample, thermal = 3e6 * np.sqrt(0.04 / k), 2e6
+        return SphericalColumn(
+            title=f"seed {seed}",
+            eor=make_spherical_spectrum(eor, 0.0, sample),
+            uncorrupted=make_spherical_spectrum(foregrounds + eor + noise[0], thermal, sample),
+            uncalibrated=make_spherical_spectrum(1e12 + foregrounds + eor, thermal, sample),
+            residual=make_spherical_spectrum(eor + noise[1], thermal, sample),
+            residual_without_eor=make_spherical_spectrum(noise[2], thermal, 0.0),
+            noise=make_spherical_spectrum(noise[0], thermal, 0.0),
+        )
+
+    return make
+
+
+@pytest.fixture
+def visibility_comparison() -> VisibilityComparison:
+    rng = np.random.default_rng(12)
+    foregrounds = 30 * np.exp(-2j * np.pi * FREQUENCY * 100e-9)
+    noise = 0.02 * (rng.normal(size=64) + 1j * rng.normal(size=64))
+    visibilities = Visibilities(foregrounds + noise, foregrounds, noise)
+    return compare_visibilities((0, 1), 54.9, FREQUENCY, visibilities)
+
+
+@pytest.fixture
+def baseline_spectra() -> list[BaselineSpectra]:
+    delay = delays(64, 80e3)
+    noise = np.full(64, 2e4)
+    made = []
+    for partner, length in enumerate((14.0, 54.9, 101.0, 170.0), start=1):
+        inside = np.abs(delay) < length / 299792458.0
+        data = np.where(inside, 1e8, 3e6)
+        made.append(BaselineSpectra((0, partner), length, delay, data, 0.99 * data, noise * (1 - 0.5 * inside), noise))
+    return made
+
+
+@pytest.fixture
+def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra) -> Callable[..., dict[str, Figure]]:
+    """Return a function that draws every kind of figure with the given stand-ins."""
+    rng = np.random.default_rng(13)
+    arrays = [LayoutPanel(f"array {n}", np.arange(n), 40 * rng.normal(size=(n, 3)), (0, 1)) for n in (9, 36)]
+    gains = 1 + 0.1 * (rng.normal(size=(2, 2, 64)) + 1j * rng.normal(size=(2, 2, 64)))
+    excised = make_column(2, empty=1)
+    seconds = np.array([[10.0], [40.0], [160.0]]) * np.exp(0.1 * rng.normal(size=(3, 50)))
+    steps = [summarize_runtime(label, np.array([8, 16, 32]), seconds / speed) for label, speed in (("A", 1), ("B", 30))]
+
+    def draw(stand_ins: tuple[str, ...] = ()) -> dict[str, Figure]:
+        note = {"stand_ins": stand_ins}
+        return {
+            "layouts": draw_layouts(arrays, **note),
+            "layout": draw_layouts(arrays[:1], **note),
+            "wedge": draw_wedge(wedge_panels, **note),
+            "spherical": draw_spherical([make_column(1), excised], **note),
+            "spherical one column": draw_spherical([excised], **note),
+            "spherical comparison": draw_spherical_comparison(excised, make_column(3, empty=1), **note),
+            "gains": draw_gains(compare_gains((0, 1), FREQUENCY, *gains), **note),
+            "model": draw_model(visibility_comparison, **note),
+            "data": draw_data(visibility_comparison, **note),
+            "baselines": draw_baselines(baseline_spectra, **note),
+            "three baselines": draw_baselines(baseline_spectra[:3], **note),
+            "baseline": draw_baselines(baseline_spectra[:1], **note),
+            "reflections": draw_reflections(in_two_domains(FREQUENCY, gains[0]), **note),
+            "runtime": draw_runtime(steps, "number of antennas", r"N_\mathrm{ant}", **note),
+        }
+
+    return draw

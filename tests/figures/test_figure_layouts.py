@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calstudy.figures.layouts import LayoutPanel, draw_layouts
+
+
+@pytest.fixture
+def panels():
+    rng = np.random.default_rng(21)
+    return [
+        LayoutPanel("left", np.arange(36), 50 * rng.normal(size=(36, 3)), (0, 1)),
+        LayoutPanel("right", 100 + np.arange(7), 1000 + 14 * rng.normal(size=(7, 2))),
+    ]
+
+
+def test_antennas_are_at_their_positions_with_their_numbers(panels):
+    for axes, panel in zip(draw_layouts(panels).axes, panels, strict=True):
+        positions = np.concatenate([line.get_xydata() for line in axes.get_lines()])
+        expected = panel.enu[:, :2]
+        np.testing.assert_allclose(np.sort(positions, axis=0), np.sort(expected, axis=0))
+        for number, text in zip(panel.numbers, axes.texts, strict=True):
+            assert text.get_text() == str(number)
+            np.testing.assert_allclose(text.xy, expected[panel.numbers == number][0])
+
+
+def test_highlighted_antennas_are_filled(panels):
+    plain, special = draw_layouts(panels).axes[0].get_lines()
+    np.testing.assert_allclose(special.get_xydata(), panels[0].enu[:2, :2])
+    assert special.get_markerfacecolor() != plain.get_markerfacecolor()
+
+
+def test_a_metre_is_as_long_east_as_north(panels):
+    figure = draw_layouts(panels)
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        origin, east, north = axes.transData.transform([(0, 0), (10, 0), (0, 10)])
+        assert east[0] - origin[0] == pytest.approx(north[1] - origin[1], rel=1e-6)
+        low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+        positions = np.concatenate([line.get_xydata() for line in axes.get_lines()])
+        assert (positions > low).all() and (positions < high).all()
+
+
+def test_circles_do_not_overlap():
+    spacing = 14.0
+    hexagon = np.array([(x + y / 2, y * np.sqrt(3) / 2) for x in range(-3, 4) for y in range(-3, 4) if abs(x + y) <= 3])
+    figure = draw_layouts([LayoutPanel("hex", np.arange(37), spacing * hexagon)] * 2)
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    (origin, neighbour) = axes.transData.transform([(0, 0), (spacing, 0)]) * 72 / figure.dpi
+    assert axes.get_lines()[0].get_markersize() <= neighbour[0] - origin[0]
+
+
+def test_large_arrays_have_no_numbers():
+    rng = np.random.default_rng(22)
+    axes = draw_layouts([LayoutPanel("128", np.arange(128), 300 * rng.normal(size=(128, 3)))]).axes[0]
+    assert len(axes.texts) == 0
+
+
+def test_bad_input_is_refused(panels):
+    with pytest.raises(ValueError, match="1 or 2 panels, not 3"):
+        draw_layouts(panels + panels[:1])
+    with pytest.raises(ValueError, match="'x': 3 antenna numbers for 2 positions"):
+        draw_layouts([LayoutPanel("x", np.arange(3), np.zeros((2, 3)))])

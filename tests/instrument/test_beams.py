@@ -1,0 +1,227 @@
+"""Beams against closed forms, measured widths of the MWA tile, and an independent array factor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pyuvdata import BeamInterface, UVBeam
+from pyuvdata.analytic_beam import ShortDipoleBeam
+from scipy.constants import speed_of_light
+from scipy.signal.windows import blackmanharris
+from scipy.special import j1
+
+from calstudy.errors import InputError
+from calstudy.instrument import settings as section
+from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, integrate_power, make_beam
+
+CHANNELS = 167.075e6 + 80e3 * np.arange(384)
+BAND = np.array([167.075e6, 182e6, 197.715e6])
+
+
+@pytest.fixture(scope="module")
+def embedded():
+    return make_beam(section.MwaEmbeddedBeam())
+
+
+def power(beam, azimuth, zenith_angle, frequencies, feed=0):
+    """Power beam along one azimuth, shape (Nfreqs, Nza), from whichever object `Beam.at` gives."""
+    jones = BeamInterface(beam.at(frequencies), beam_type="efield").compute_response(
+        az_array=np.full(len(zenith_angle), azimuth),
+        za_array=zenith_angle,
+        freq_array=frequencies,
+        interpolation_function="az_za_simple",
+    )
+    return (np.abs(jones[:, feed]) ** 2).sum(axis=0)
+
+
+def half_width(values, zenith_angle):
+    """Zenith angle at half power."""
+    beyond = int(np.argmax(values < 0.5))
+    return np.interp(0.5, values[[beyond, beyond - 1]], zenith_angle[[beyond, beyond - 1]])
+
+
+def test_solid_angles_of_a_short_dipole():
+    """∫(1 − sin²θ cos²φ) dΩ = 4π/3 and ∫(...)² dΩ = 16π/15 over the hemisphere."""
+    beam = make_beam(section.DipoleBeam(kind="short-dipole"))
+    for polarization in ("xx", "yy"):
+        omega_p, omega_pp = beam.solid_angles(BAND, polarization)
+        np.testing.assert_allclose(omega_p, 4 * np.pi / 3, rtol=1e-7)
+        np.testing.assert_allclose(omega_pp, 16 * np.pi / 15, rtol=1e-7)
+
+
+def test_solid_angles_of_a_narrow_gaussian():
+    """exp(−θ²/s²) has Ω_p = πs²(1 − s²/6 + ...), from sin θ = θ − θ³/6, and half of s² for the square."""
+    beam = make_beam(section.GaussianBeam(kind="gaussian", fwhm_deg=6.0, reference_frequency="182 MHz"))
+    omega_p, omega_pp = beam.solid_angles(BAND, "xx")
+    squared = (np.deg2rad(3.0) ** 2 / np.log(2)) * (182e6 / BAND) ** 2
+    np.testing.assert_allclose(omega_p, np.pi * squared * (1 - squared / 6), rtol=1e-5)
+    np.testing.assert_allclose(omega_pp, np.pi * squared / 2 * (1 - squared / 12), rtol=1e-5)
+
+
+def test_gaussian_width_is_the_power_fwhm_and_shrinks_with_frequency():
+    beam = make_beam(section.GaussianBeam(kind="gaussian", fwhm_deg=20.0, reference_frequency="160 MHz"))
+    frequencies = np.array([160e6, 200e6])
+    values = power(beam, 0.3, np.deg2rad([10.0, 8.0]), frequencies)
+    assert values[0, 0] == pytest.approx(0.5)
+    assert values[1, 1] == pytest.approx(0.5)
+
+
+def test_airy_beam():
+    beam = make_beam(section.AiryBeam(kind="airy", diameter="6 m"))
+    angle = np.deg2rad(np.array([3.0, 12.0, 30.0]))
+    argument = np.pi * 6.0 * np.sin(angle) * 182e6 / speed_of_light
+    values = power(beam, 1.0, angle, np.array([182e6]))
+    np.testing.assert_allclose(values[0], (2 * j1(argument) / argument) ** 2, rtol=1e-9)
+
+
+def test_ideal_tile_is_a_dipole_times_a_sum_over_its_sixteen_dipoles_and_their_images():
+    beam = make_beam(section.MwaAnalyticBeam(kind="mwa-analytic"))
+    generator = np.random.default_rng(7)
+    azimuth, zenith_angle = generator.uniform(0, 2 * np.pi, 50), generator.uniform(0, np.pi / 2, 50)
+    frequency = 180e6
+    direction = np.array(
+        [np.sin(zenith_angle) * np.cos(azimuth), np.sin(zenith_angle) * np.sin(azimuth), np.cos(zenith_angle)]
+    )
+    place = np.array([(1.1 * i, 1.1 * j, 0.278 * up) for i in range(4) for j in range(4) for up in (1, -1)])
+    sign = np.tile([1, -1], 16)
+    wave = 2j * np.pi * frequency / speed_of_light
+    response = (sign * np.exp(wave * (place @ direction).T)).sum(axis=1)
+    zenith = (sign * np.exp(wave * place[:, 2])).sum()
+    dipole = ShortDipoleBeam().efield_eval(az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency]))
+    tile = beam.at(np.array([frequency])).efield_eval(
+        az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency])
+    )
+    np.testing.assert_allclose(np.abs(tile), np.abs(dipole * response / zenith), atol=1e-12)
+
+
+def test_x_is_the_east_west_dipole(embedded):
+    """A dipole is blind along its axis: far from zenith, feed x sees less to the east than to the north."""
+    angle = np.deg2rad(np.arange(70.0, 86.0))
+    for beam in (embedded, make_beam(section.DipoleBeam(kind="short-dipole"))):
+        east, north = (power(beam, azimuth, angle, BAND[1:2])[0].sum() for azimuth in (0, np.pi / 2))
+        assert east < 0.5 * north
+        east, north = (power(beam, azimuth, angle, BAND[1:2], feed=1)[0].sum() for azimuth in (0, np.pi / 2))
+        assert north < 0.5 * east
+
+
+# Half widths at half maximum of the embedded element beam at its own tabulated frequencies, towards east and north.
+@pytest.mark.parametrize(
+    ("megahertz", "east", "north"), [(166.4, 10.15, 10.45), (186.88, 9.07, 9.53), (197.12, 8.63, 9.22)]
+)
+def test_width_of_the_embedded_element_beam(embedded, megahertz, east, north):
+    angle = np.deg2rad(np.arange(0, 20, 0.1))
+    for azimuth, expected in ((0, east), (np.pi / 2, north)):
+        values = power(embedded, azimuth, angle, np.array([megahertz * 1e6]))[0]
+        assert np.rad2deg(half_width(values, angle)) == pytest.approx(expected, abs=0.02)
+
+
+def test_ideal_and_embedded_tile_have_nearly_the_same_width(embedded):
+    angle = np.deg2rad(np.arange(0, 20, 0.1))
+    ideal = make_beam(section.MwaAnalyticBeam(kind="mwa-analytic"))
+    for azimuth in (0, np.pi / 2):
+        widths = [np.rad2deg(half_width(power(beam, azimuth, angle, BAND[1:2])[0], angle)) for beam in (embedded, ideal)]
+        assert widths[0] == pytest.approx(widths[1], abs=0.25)
+
+
+def test_embedded_element_beam_peaks_at_zenith_with_one(embedded):
+    beam = embedded.at(BAND)
+    values = (np.abs(beam.data_array) ** 2).sum(axis=0)
+    np.testing.assert_allclose(values[:, :, 0], 1.0, rtol=1e-12)
+    assert values.max() <= 1 + 1e-12
+    assert beam.data_normalization == "peak"
+    assert beam.mount_type == "fixed"
+    assert embedded.stand_in is None
+
+
+def test_solid_angles_of_the_embedded_element_beam(embedded):
+    omega_p, omega_pp = embedded.solid_angles(np.array([166.4e6, 197.12e6]), "xx")
+    np.testing.assert_allclose(omega_p, [0.156, 0.119], rtol=0.01)
+    assert (omega_pp < omega_p / 2 * 1.05).all()
+
+
+def test_smooth_fit_follows_the_table_to_its_scatter(embedded):
+    """2.4e-5 rms is the table's own scatter: an order-8 fit must leave no more than a few times that anywhere."""
+    assert embedded.fit_error < 4e-4
+
+
+def test_smooth_fit_is_smooth_where_tabulated_steps_are_not(embedded):
+    """Delay transform of the power beam: the fit has nothing at the 781 ns of the table's 1.28 MHz; others have."""
+    taper = blackmanharris(len(CHANNELS), sym=False)
+    delays = np.abs(np.fft.fftfreq(len(CHANNELS), 80e3))
+
+    def beyond_wedge(beam, low, high):
+        table = beam.at(CHANNELS)
+        values = (np.abs(table.data_array[:, 0, :, ::15, ::45]) ** 2).sum(axis=0)
+        spectrum = np.abs(np.fft.fft(values * taper[:, None, None], axis=0)) / taper.sum()
+        return np.sqrt(np.mean(spectrum[(delays > low) & (delays < high)] ** 2))
+
+    point_to_point = {
+        kind: make_beam(section.MwaEmbeddedBeam(interpolation=kind)) for kind in ("cubic", "nearest")
+    }
+    assert beyond_wedge(embedded, 200e-9, 400e-9) < 1e-6
+    assert beyond_wedge(embedded, 200e-9, 400e-9) < 0.1 * beyond_wedge(point_to_point["cubic"], 200e-9, 400e-9)
+    assert beyond_wedge(embedded, 700e-9, 860e-9) < 1e-7
+    assert beyond_wedge(point_to_point["nearest"], 700e-9, 860e-9) > 1e-5
+
+
+@pytest.mark.parametrize("interpolation", ["cubic", "linear", "nearest"])
+def test_point_to_point_interpolation_passes_through_the_table(interpolation):
+    beam = make_beam(section.MwaEmbeddedBeam(interpolation=interpolation))
+    assert beam.fit_error < 1e-12
+
+
+def test_beam_does_not_depend_on_which_frequencies_are_asked_for_together(embedded):
+    together = embedded.at(BAND).data_array[:, :, 1]
+    alone = embedded.at(BAND[1:2]).data_array[:, :, 0]
+    np.testing.assert_allclose(alone, together, atol=1e-14)
+
+
+def test_fewer_channels_keep_the_same_beam(embedded):
+    few = make_beam(section.MwaEmbeddedBeam(), section.Channels(first="180 MHz", count=48))
+    np.testing.assert_allclose(
+        few.at(np.array([182e6])).data_array, embedded.at(np.array([182e6])).data_array, atol=4e-5
+    )
+
+
+def test_frequencies_outside_the_band_are_refused(embedded):
+    with pytest.raises(InputError, match="outside the band"):
+        embedded.at(np.array([150e6]))
+    with pytest.raises(InputError, match="not within"):
+        make_beam(section.MwaEmbeddedBeam(), section.Channels(first="310 MHz"))
+
+
+def test_beamfits_round_trip(tmp_path, embedded):
+    path = tmp_path / "beam.beamfits"
+    frequencies = np.arange(166e6, 199.5e6, 1e6)
+    embedded.at(frequencies).write_beamfits(path)
+    beam = make_beam(section.FileBeam(kind="beamfits", path=path))
+    np.testing.assert_allclose(beam.at(BAND).data_array, embedded.at(BAND).data_array, atol=1e-7)
+    assert "beam.beamfits" in beam.stand_in
+    np.testing.assert_allclose(beam.solid_angles(BAND, "yy"), embedded.solid_angles(BAND, "yy"), rtol=1e-6)
+
+
+def test_unusable_beam_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="there is no file"):
+        make_beam(section.MwaEmbeddedBeam(path=tmp_path / "none.h5"))
+    wrong = tmp_path / "wrong.h5"
+    wrong.write_text("not a beam")
+    with pytest.raises(InputError, match="cannot be read"):
+        make_beam(section.MwaEmbeddedBeam(path=wrong))
+    with pytest.raises(InputError, match="cannot be read"):
+        make_beam(section.FileBeam(kind="beamfits", path=wrong))
+    with pytest.raises(InputError, match="there is no file"):
+        make_beam(section.FileBeam(kind="beamfits", path=tmp_path / "none.fits"))
+
+
+def test_power_beam_files_are_refused(tmp_path):
+    dipole = ShortDipoleBeam().to_uvbeam(
+        freq_array=BAND, beam_type="power", axis1_array=AZIMUTHS, axis2_array=ZENITH_ANGLES[::10]
+    )
+    assert isinstance(dipole, UVBeam)
+    dipole.write_beamfits(tmp_path / "power.beamfits")
+    with pytest.raises(InputError, match="power beam"):
+        make_beam(section.FileBeam(kind="beamfits", path=tmp_path / "power.beamfits"))
+
+
+def test_integral_of_an_isotropic_beam_is_the_hemisphere():
+    assert integrate_power(np.ones((91, 12)), np.deg2rad(np.arange(91.0))) == pytest.approx((2 * np.pi, 2 * np.pi))

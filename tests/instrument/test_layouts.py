@@ -1,0 +1,154 @@
+"""Layouts against published facts about the array, and grouping against invariances."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from calstudy.errors import InputError
+from calstudy.instrument import settings as section
+from calstudy.instrument.layouts import GOLOMB_MARKS, make_layout, redundant_groups
+
+
+def vectors_of(layout):
+    first, second = np.triu_indices(len(layout.numbers), 1)
+    return layout.enu[second] - layout.enu[first]
+
+
+# Lengths and groups measured on the observatory's metafits of 2016 to 2018.
+@pytest.mark.parametrize(
+    ("kind", "shortest", "longest", "groups", "singletons", "largest"),
+    [
+        ("mwa-compact-minredundant", 7.72, 176.15, 614, 598, 2),
+        ("mwa-compact-hex-east", 13.97, 84.00, 63, 3, 28),
+        ("mwa-compact-hex-south", 13.96, 84.01, 63, 3, 28),
+    ],
+)
+def test_mwa_subarrays_have_the_known_baselines(kind, shortest, longest, groups, singletons, largest):
+    vectors = vectors_of(make_layout(section.MwaLayout(kind=kind)))
+    length = np.linalg.norm(vectors, axis=1)
+    assert len(vectors) == 630
+    assert length.min() == pytest.approx(shortest, abs=0.006)
+    assert length.max() == pytest.approx(longest, abs=0.006)
+    size = np.bincount(redundant_groups(vectors, 1.0).index)
+    assert (len(size), (size == 1).sum(), size.max()) == (groups, singletons, largest)
+
+
+def test_known_tile_positions():
+    """Two tiles of each part against their surveyed offsets from the array centre (observatory metafits, to 1 mm)."""
+    layout = make_layout(section.MwaLayout(kind="mwa-compact"))
+    place = dict(zip(layout.names, layout.enu, strict=True))
+    assert place["Tile011"][:2] == pytest.approx([-149.785, 265.814], abs=1e-3)
+    assert place["Tile012"][:2] == pytest.approx([-95.365, 270.188], abs=1e-3)
+    assert place["HexE01"][:2] == pytest.approx([86.373, 284.121], abs=1e-3)
+    assert place["HexS36"][:2] == pytest.approx([32.013, 85.713], abs=1e-3)
+
+
+def test_subarrays_are_parts_of_the_whole_array():
+    whole = make_layout(section.MwaLayout(kind="mwa-compact"))
+    assert len(whole.numbers) == 128
+    assert whole.enu[:, 2].mean() == pytest.approx(0, abs=1e-9)
+    assert np.abs(whole.enu[:, 2]).max() < 4
+    for kind in ("mwa-compact-minredundant", "mwa-compact-hex-east", "mwa-compact-hex-south"):
+        part = make_layout(section.MwaLayout(kind=kind))
+        np.testing.assert_array_equal(part.enu, whole.enu[part.numbers])
+        assert part.names == tuple(whole.names[number] for number in part.numbers)
+
+
+def test_hexagon_is_redundant_and_complete():
+    layout = make_layout(section.HexLayout(kind="hex", side=4, spacing="14 m"))
+    assert len(layout.numbers) == 37
+    groups = redundant_groups(vectors_of(layout), 0.01)
+    # A hexagon of side n has as many distinct separations as the half of the hexagon of side 2n - 1 without its centre.
+    assert groups.index.max() + 1 == (3 * 7 * 6 + 1 - 1) // 2
+    assert np.linalg.norm(vectors_of(layout), axis=1).min() == pytest.approx(14.0)
+
+
+def test_longest_baseline_of_a_rectangular_array_is_the_one_asked_for():
+    for count in (9, 16, 20, 64, 67):
+        layout = make_layout(
+            section.RectangularLayout(kind="rectangular", count=count, spacing="2 m", max_baseline="100 m")
+        )
+        length = np.linalg.norm(vectors_of(layout), axis=1)
+        assert length.max() == pytest.approx(100.0)
+        assert length.min() == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("count", GOLOMB_MARKS)
+def test_golomb_rulers_have_no_repeated_distance(count):
+    marks = GOLOMB_MARKS[count]
+    assert len(marks) == count
+    distances = [second - first for first, second in itertools.combinations(marks, 2)]
+    assert len(set(distances)) == len(distances)
+
+
+def test_linear_array_groups_by_separation():
+    layout = make_layout(section.LinearLayout(kind="linear", count=10, spacing="14 m"))
+    size = np.bincount(redundant_groups(vectors_of(layout), 0.1).index)
+    assert sorted(size) == list(range(1, 10))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_grouping_ignores_the_direction_and_order_of_baselines(seed):
+    generator = np.random.default_rng(seed)
+    vectors = vectors_of(make_layout(section.HexLayout(kind="hex", side=2)))
+    reference = redundant_groups(vectors, 0.1)
+    flipped = generator.integers(0, 2, len(vectors)).astype(bool)
+    order = generator.permutation(len(vectors))
+    groups = redundant_groups((np.where(flipped, -1, 1)[:, None] * vectors)[order], 0.1)
+    together = reference.index[order][:, None] == reference.index[order]
+    np.testing.assert_array_equal(groups.index[:, None] == groups.index, together)
+    oriented = np.where(groups.conjugated, -1, 1)[:, None] * (np.where(flipped, -1, 1)[:, None] * vectors)[order]
+    apart = np.linalg.norm(oriented[:, None] - oriented, axis=-1)
+    assert apart[together].max() < 0.1
+
+
+def test_groups_are_numbered_by_their_first_baseline():
+    vectors = np.array([[14.0, 0, 0], [0, 7.0, 0], [-14.0, 0, 0], [0, 7.0, 0.01]])
+    groups = redundant_groups(vectors, 0.1)
+    assert groups.index.tolist() == [0, 1, 0, 1]
+    assert groups.conjugated.tolist() == [False, False, True, False]
+
+
+def test_csv_layout(tmp_path):
+    path = tmp_path / "array.csv"
+    path.write_text("name,number,east_m,north_m,up_m\na,7,0,0,0\nb,3,10,2.5,-1\n")
+    layout = make_layout(section.CsvLayout(kind="csv", path=path))
+    assert layout.names == ("a", "b")
+    assert layout.numbers.tolist() == [7, 3]
+    np.testing.assert_array_equal(layout.enu, [[0, 0, 0], [10, 2.5, -1]])
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("east_m,north_m\n0,0\n1,1\n", "up_m"),
+        ("east_m,north_m,up_m\n0,0,0\n1,x,0\n", "not a number"),
+        ("east_m,north_m,up_m\n0,0,0\n", "two rows"),
+        ("number,east_m,north_m,up_m\n1,0,0,0\n1,1,0,0\n", "unique"),
+        ("east_m,north_m,up_m\n0,0,0\n1,nan,0\n", "finite"),
+    ],
+)
+def test_bad_csv_is_one_sentence(tmp_path, text, complaint):
+    path = tmp_path / "array.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=complaint):
+        make_layout(section.CsvLayout(kind="csv", path=path))
+
+
+def test_missing_csv(tmp_path):
+    with pytest.raises(InputError, match="there is no file"):
+        make_layout(section.CsvLayout(kind="csv", path=tmp_path / "none.csv"))
+
+
+def test_impossible_layouts_are_refused():
+    with pytest.raises(ValidationError, match="more than the 36 antennas"):
+        section.MwaLayout(kind="mwa-compact-hex-east", count=37)
+    with pytest.raises(ValidationError, match="must exceed the length of a row"):
+        section.RectangularLayout(kind="rectangular", spacing="20 m", max_baseline="100 m")

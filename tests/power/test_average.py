@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy import constants
+from astropy import units as u
+from astropy.coordinates import AltAz, SkyCoord
+from astropy.time import Time
+
+from calstudy.instrument.settings import GolombLayout, MwaLayout
+from calstudy.power.average import fringe_stop_and_average
+from calstudy.visibilities import baseline_vectors, from_cube, to_cube
+
+
+def drifting_source(template, position):
+    """Visibilities exp(2 pi i nu b.s / c) of a source of 1 Jy at `position`, without a beam."""
+    vectors = baseline_vectors(template)
+    times = np.unique(template.time_array)
+    horizontal = position.transform_to(
+        AltAz(obstime=Time(times, format="jd"), location=template.telescope.location)
+    )
+    east = np.cos(horizontal.alt) * np.sin(horizontal.az)
+    north = np.cos(horizontal.alt) * np.cos(horizontal.az)
+    directions = np.stack([east, north, np.sin(horizontal.alt)], axis=1).value
+    delays = directions @ vectors.T / constants.c.value
+    return from_cube(template, np.exp(2j * np.pi * delays[..., None, None] * template.freq_array[:, None]))
+
+
+@pytest.fixture(scope="module")
+def run(observe):
+    return observe(GolombLayout(kind="golomb", count=5), n_channels=8, n_times=12)
+
+
+def zenith(template):
+    middle = Time((template.time_array.min() + template.time_array.max()) / 2, format="jd")
+    location = template.telescope.location
+    return SkyCoord(alt=90 * u.deg, az=0 * u.deg, frame=AltAz(obstime=middle, location=location)).icrs
+
+
+def test_a_source_at_the_zenith_keeps_its_flux_and_has_no_phase(run):
+    averaged = fringe_stop_and_average(drifting_source(run, zenith(run)))
+    assert averaged.Ntimes == 1
+    np.testing.assert_allclose(averaged.data_array, 1.0, atol=2e-3)
+
+
+def test_a_long_drift_needs_the_fringe_stop(observe):
+    template = observe(GolombLayout(kind="golomb", count=8, spacing="60 m"), n_channels=8, n_times=40)
+    uvd = drifting_source(template, zenith(template))
+    longest = np.argmax(np.linalg.norm(baseline_vectors(template), axis=1))
+    assert np.abs(to_cube(uvd).mean(axis=0))[longest].max() < 0.9
+    assert np.abs(to_cube(fringe_stop_and_average(uvd)))[0, longest].min() > 0.999
+
+
+def test_noise_averages_down_and_the_input_is_untouched(run, white):
+    uvd = white(run, np.random.default_rng(3))
+    before = uvd.copy()
+    averaged = fringe_stop_and_average(uvd)
+    assert uvd == before
+    assert averaged.data_array.std() == pytest.approx(1 / np.sqrt(12), rel=0.15)
+    assert averaged.integration_time == pytest.approx(24.0)
+    assert averaged.data_array.dtype == np.complex128
+
+
+def test_flags_and_nsamples_weigh(run, white):
+    uvd = white(run, np.random.default_rng(4))
+    clean = fringe_stop_and_average(uvd)
+    bad = uvd.copy()
+    bad.data_array[: 3 * run.Nbls] = 1e6
+    bad.flag_array[: 3 * run.Nbls] = True
+    flagged = fringe_stop_and_average(bad)
+    assert np.abs(flagged.data_array).max() < 5
+    assert not flagged.flag_array.any()
+    bad.flag_array[:] = True
+    assert fringe_stop_and_average(bad).flag_array.all()
+    weighted = uvd.copy()
+    weighted.nsample_array[run.Nbls :] = 1e-6
+    only_first = fringe_stop_and_average(weighted).data_array
+    np.testing.assert_allclose(np.abs(only_first), np.abs(uvd.data_array[: run.Nbls]), rtol=1e-3)
+    assert not np.allclose(np.abs(clean.data_array), np.abs(only_first), rtol=0.1)
+
+
+def test_baselines_keep_their_order(observe, white):
+    template = observe(MwaLayout(kind="mwa-compact-hex-east", count=6), n_channels=8, n_times=3)
+    averaged = fringe_stop_and_average(white(template, np.random.default_rng(5)))
+    np.testing.assert_array_equal(averaged.baseline_array, template.baseline_array[: template.Nbls])
+
+
+def test_one_integration_stays_one(observe, white):
+    uvd = white(observe(GolombLayout(kind="golomb", count=4), n_channels=8), np.random.default_rng(6))
+    averaged = fringe_stop_and_average(uvd)
+    np.testing.assert_allclose(np.abs(averaged.data_array), np.abs(uvd.data_array), rtol=1e-9)

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calstudy.power import delay as d
+
+
+@given(
+    n=st.integers(2, 40),
+    taper=st.sampled_from(sorted(d.TAPERS)),
+    first=st.floats(1e8, 2e8),
+    seed=st.integers(0, 100),
+)
+def test_transform_is_the_sum_of_the_paper(n, taper, first, seed):
+    rng = np.random.default_rng(seed)
+    frequencies = first + 80e3 * np.arange(n)
+    data = rng.normal(size=(3, n)) + 1j * rng.normal(size=(3, n))
+    phases = np.exp(2j * np.pi * d.delays(n, 80e3)[:, None] * frequencies)
+    expected = 80e3 * (data * d.make_taper(taper, n)) @ phases.T
+    np.testing.assert_allclose(
+        d.delay_transform(data, frequencies, taper), expected, rtol=0, atol=1e-6 * 80e3 * n
+    )
+
+
+def test_a_source_appears_at_its_delay_along_any_axis():
+    frequencies = 180e6 + 80e3 * np.arange(64)
+    tau = d.delays(64, 80e3)[40]
+    data = np.exp(-2j * np.pi * tau * frequencies)[:, None] * np.ones(2)
+    transform = d.delay_transform(data, frequencies, "none", axis=0)
+    assert transform.shape == (64, 2)
+    np.testing.assert_allclose(transform[40], 64 * 80e3, rtol=1e-6)
+    assert np.abs(np.delete(transform, 40, axis=0)).max() < 1e-5 * 64 * 80e3
+
+
+@pytest.mark.parametrize("taper", sorted(d.TAPERS))
+def test_tapers_are_those_of_hera_pspec(taper):
+    from uvtools.dspec import gen_window
+
+    from calstudy.power.estimate import HERA_TAPERS
+
+    np.testing.assert_allclose(d.make_taper(taper, 48), gen_window(HERA_TAPERS[taper], 48), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("taper", sorted(d.TAPERS))
+def test_mode_correlation_is_that_of_white_noise(taper):
+    rng = np.random.default_rng(1)
+    noise = rng.normal(size=(40000, 32)) + 1j * rng.normal(size=(40000, 32))
+    power = np.abs(d.delay_transform(noise, 180e6 + 80e3 * np.arange(32), taper)) ** 2
+    measured = np.corrcoef(power.T)
+    expected = d.mode_correlation(taper, 32)
+    for lag in range(8):
+        circular = [measured[i, (i + lag) % 32] for i in range(32)]
+        assert np.mean(circular) == pytest.approx(expected[lag], abs=0.005)
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(ValueError, match=r"hamming.*allowed.*blackman-harris"):
+        d.make_taper("hamming", 8)
+    with pytest.raises(ValueError, match="8 channels, frequencies 9"):
+        d.delay_transform(np.zeros(8), 180e6 + 80e3 * np.arange(9), "none")
+    with pytest.raises(ValueError, match="equally spaced"):
+        d.delay_transform(np.zeros(3), np.array([1.0, 2.0, 4.0]), "none")

@@ -1,0 +1,228 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy import constants
+from astropy import units as u
+from hera_pspec import PSpecData, UVPSpec
+from hera_pspec.pspecbeam import PSpecBeamFromArray
+
+from calstudy.instrument.settings import GolombLayout, HexLayout, MwaLayout
+from calstudy.power import cosmology as c
+from calstudy.power.delay import delay_transform, delays, make_taper
+from calstudy.power.estimate import estimate_power, kelvin_per_jansky, make_pairs
+from calstudy.power.optimal import DiagonalPSpecData
+from calstudy.power.settings import KBins, PowerSettings
+from calstudy.power.spectra import delay_spectra
+from calstudy.power.spherical import spherical_average
+from calstudy.visibilities import antenna_pairs, baseline_vectors, from_cube
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:The Telescope.x_orientation attribute is deprecated:DeprecationWarning"
+)
+
+GOLOMB = GolombLayout(kind="golomb", count=5, spacing="14 m")
+
+
+def two(template, white, seed=1):
+    rng = np.random.default_rng(seed)
+    return white(template, rng), white(template, rng)
+
+
+@pytest.mark.filterwarnings("ignore:Casting complex values to real:numpy.exceptions.ComplexWarning:hera_pspec")
+@pytest.mark.parametrize("taper", ["blackman-harris", "hann", "tukey", "none"])
+@pytest.mark.parametrize("flagged", [False, True])
+@pytest.mark.parametrize("n_channels", [15, 16])
+def test_closed_forms_equal_hera_pspec(observe, white, taper, flagged, n_channels):
+    even, odd = two(observe(GOLOMB, n_channels), white)
+    if flagged:
+        even.flag_array[2, 3:5] = True
+        even.flag_array[5, 1] = True
+        odd.flag_array[2, 7] = True
+    baselines = [(int(a), int(b)) for a, b in antenna_pairs(even)]
+    results = []
+    for kind in (PSpecData, DiagonalPSpecData):
+        adapter = PSpecBeamFromArray({-5: np.full(n_channels, 0.14)}, {-5: np.full(n_channels, 0.07)}, even.freq_array)
+        estimator = kind(dsets=[even.copy(), odd.copy()], beam=adapter)
+        name = {"blackman-harris": "blackmanharris"}.get(taper, taper)
+        uvp = estimator.pspec(
+            baselines, baselines[::-1], (0, 1), [(-5, -5)], taper=name, allow_fft=True, verbose=False, store_window=True
+        )
+        key = (0, *baselines[2], "xx"), (1, *baselines[2], "xx")
+        results.append((uvp, estimator.get_G(*key), estimator.get_H(*key), estimator.get_H(*key, sampling=True)))
+    (ours, *our_matrices), (theirs, *their_matrices) = results[1], results[0]
+    for mine, reference in zip(our_matrices, their_matrices, strict=True):
+        np.testing.assert_allclose(mine, reference, rtol=0, atol=1e-12 * np.abs(reference).max())
+    np.testing.assert_allclose(ours.data_array[0], theirs.data_array[0], rtol=1e-10)
+    np.testing.assert_allclose(ours.window_function_array[0], theirs.window_function_array[0], atol=1e-12)
+
+
+def test_other_weightings_are_refused(observe, white):
+    even, odd = two(observe(GOLOMB), white)
+    estimator = DiagonalPSpecData(dsets=[even, odd])
+    bls = [(0, 1)]
+    with pytest.raises(NotImplementedError, match="identity"):
+        estimator.pspec(bls, bls, (0, 1), [(-5, -5)], input_data_weight="iC", verbose=False)
+    with pytest.raises(NotImplementedError, match="as many"):
+        estimator.pspec(bls, bls, (0, 1), [(-5, -5)], n_dlys=8, verbose=False)
+
+
+def expected_power(first, second, frequencies, beam, taper):
+    """The paper's P = X^2 Y / (Omega_pp B_pp) V~ V~* at the band centre, in mK^2 h^-3 Mpc^3."""
+    cosmo, centre, width = c.make_cosmology("Planck15"), frequencies.mean(), frequencies[1] - frequencies[0]
+    z = c.redshift(centre)
+    omega_p, omega_pp = beam.solid_angles(np.array([centre]), "xx")
+    kelvin = 2 * 1e-26 * (constants.c.value / frequencies) ** 2 / (2 * constants.k_B.value)
+    spectra = [delay_transform(v * kelvin, frequencies, taper) for v in (first, second)]
+    bandwidth = width * np.sum(make_taper(taper, frequencies.size) ** 2)
+    volume = c.transverse_scale(cosmo, z) ** 2 * c.radial_scale(cosmo, z)
+    # hera_pspec: the delay axis reversed, the first conjugated.
+    product = np.roll((spectra[0].conj() * spectra[1])[..., ::-1], 1 - frequencies.size % 2, axis=-1)
+    return 1e6 * cosmo.h**3 * volume / (omega_pp[0] * bandwidth) * product
+
+
+@pytest.mark.parametrize("taper", ["blackman-harris", "none"])
+def test_spectra_are_those_of_the_paper_in_a_narrow_band(observe, white, beam, taper):
+    """Within a narrow band nothing evolves: hera_pspec's number is the paper's formula."""
+    template = observe(GOLOMB, n_channels=32, width=1e3)
+    even, odd = two(template, white)
+    uvp = estimate_power(even, odd, beam, PowerSettings(taper=taper))
+    expected = expected_power(
+        even.data_array[..., 0], odd.data_array[..., 0], template.freq_array, beam, taper
+    )
+    np.testing.assert_allclose(uvp.data_array[0][..., 0], expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(uvp.dly_array, delays(32, 1e3), rtol=1e-9)
+    assert (uvp.vis_units, uvp.norm_units) == ("mK", "h^-3 Mpc^3")
+
+
+def white_sky_visibilities(template, beam, power, n_skies):
+    """Visibilities in Jy, (Nbls, Nfreqs, n_skies), of skies of flat P(k) in K^2 Mpc^3: a direct sum over pixels."""
+    healpy = pytest.importorskip("healpy")
+    cosmo, rng, nside = c.make_cosmology("Planck15"), np.random.default_rng(11), 64
+    theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside) // 2))
+    near = beam.power(theta, template.freq_array[0]) > 1e-6
+    theta, directions = theta[near], healpy.ang2vec(theta, phi)[near]
+    pixel_area = healpy.nside2pixarea(nside)
+    geometry = 2j * np.pi / constants.c.value * baseline_vectors(template) @ directions.T
+    cube = np.empty((template.Nbls, template.Nfreqs, n_skies), dtype=complex)
+    for channel, frequency in enumerate(template.freq_array):
+        z = c.redshift(frequency)
+        area = c.transverse_scale(cosmo, z) ** 2 * pixel_area
+        depth = c.radial_scale(cosmo, z) * template.channel_width[channel]
+        temperature = rng.normal(scale=np.sqrt(power / (area * depth)), size=(theta.size, n_skies))
+        brightness = (temperature * u.K).to_value(u.Jy / u.sr, u.brightness_temperature(frequency * u.Hz))
+        response = 0.5 * pixel_area * np.exp(geometry * frequency) * beam.power(theta, frequency)
+        cube[:, channel] = response @ brightness
+    return cube
+
+
+def test_flat_power_comes_back_within_one_percent(observe, beam, tabulate):
+    """White sky through a chromatic Gaussian beam over the paper's bandwidth -> the input P(k), outside the wedge."""
+    layout = GolombLayout(kind="golomb", count=10, spacing="4 m")
+    template = observe(layout, n_channels=96, width=320e3, polarizations=("xx", "yy"))
+    power, n_pairs_of_skies = 12482.356, 24
+    cube = white_sky_visibilities(template, beam, power, 2 * n_pairs_of_skies)
+    fixed = tabulate(beam, template.freq_array)
+    settings = PowerSettings(bins=KBins(width="0.5 h/Mpc"), wedge_buffer="200 ns")
+    estimates = []
+    for skies in np.split(cube, n_pairs_of_skies, axis=2):
+        uvd = from_cube(template, skies[None])
+        spectra = delay_spectra(estimate_power(uvd, uvd, fixed, settings), settings)
+        spectrum = spherical_average(spectra, settings, exclude_wedge=True)
+        filled = spectrum.n_modes > 0
+        assert spectrum.n_modes.sum() > 1000
+        estimates.append(np.average(spectrum.power.real[filled], weights=spectrum.n_modes[filled]))
+    expected = 1e6 * c.make_cosmology("Planck15").h ** 3 * power
+    assert np.std(estimates) / np.sqrt(n_pairs_of_skies) / expected < 0.005
+    assert np.mean(estimates) / expected == pytest.approx(1.0, abs=0.01)
+
+
+def test_flux_conventions():
+    frequencies = np.array([150e6, 180e6])
+    omega = np.array([0.2, 0.1])
+    kelvin = kelvin_per_jansky(frequencies, omega, "avg")
+    jansky = (1 * u.K).to_value(u.Jy / u.sr, u.brightness_temperature(frequencies * u.Hz)) * omega
+    np.testing.assert_allclose(kelvin * jansky, 1.0, rtol=1e-12)
+    for convention in (None, "sum"):
+        np.testing.assert_allclose(kelvin_per_jansky(frequencies, omega, convention), 2 * kelvin)
+    with pytest.raises(ValueError, match="'median' is unknown, allowed"):
+        kelvin_per_jansky(frequencies, omega, "median")
+
+
+def test_redundant_pairs_are_all_others_of_the_group_and_point_alike(observe):
+    template = observe(HexLayout(kind="hex", side=3), n_channels=8)
+    pairs = make_pairs(template, PowerSettings())
+    assert pairs.redundant
+    vectors = {}
+    for (a, b), vector in zip(antenna_pairs(template).tolist(), baseline_vectors(template), strict=True):
+        vectors[a, b], vectors[b, a] = vector, -vector
+    groups = {}
+    for first, second in zip(pairs.first, pairs.second, strict=True):
+        assert first not in (second, second[::-1])
+        np.testing.assert_allclose(vectors[first], vectors[second], atol=0.1)
+        groups.setdefault(tuple(np.rint(vectors[first] * 2).astype(int)), set()).add((first, second))
+    lengths = {tuple(np.rint(v * 2).astype(int)) for v in vectors.values()}
+    for group, found in groups.items():
+        members = {b for pair in found for b in pair}
+        assert len(found) == len(members) * (len(members) - 1)
+        assert len(members) == sum(np.allclose(v, np.array(group) / 2, atol=0.3) for v in vectors.values())
+        assert tuple(-np.array(group)) not in groups
+    singles = {g for g in lengths if sum(np.allclose(v, np.array(g) / 2, atol=0.3) for v in vectors.values()) == 1}
+    assert len(lengths - singles) == 2 * len(groups)
+
+
+def test_choice_of_pairs(observe):
+    random = observe(MwaLayout(kind="mwa-compact-minredundant", count=12), n_channels=8)
+    assert not make_pairs(random, PowerSettings()).redundant
+    golomb = observe(GOLOMB, n_channels=8)
+    with pytest.raises(ValueError, match="allowed for this array: 'same-baseline'"):
+        make_pairs(golomb, PowerSettings(pairs="redundant-group"))
+    hexagon = observe(HexLayout(kind="hex", side=2), n_channels=8)
+    assert len(make_pairs(hexagon, PowerSettings(pairs="same-baseline")).first) == hexagon.Nbls
+
+
+def test_reversed_baselines_of_a_group_are_conjugated(observe, beam):
+    """All baselines of a group see the same sky: crossing them gives the same as crossing each with itself."""
+    template = observe(HexLayout(kind="hex", side=2), n_channels=16)
+    swapped = template.copy()
+    swapped.reorder_blts(order="baseline")
+    swapped.conjugate_bls(np.arange(swapped.Nblts)[::2])
+    for uvd in (template, swapped):
+        vectors = baseline_vectors(uvd)
+        rng = np.random.default_rng(2)
+        sources = rng.normal(size=(40, 2)) * 0.1
+        phases = (vectors[:, :2] @ sources.T)[:, None] * uvd.freq_array[:, None] / constants.c.value
+        data = from_cube(uvd, np.exp(2j * np.pi * phases).sum(axis=-1)[None, ..., None])
+        settings = PowerSettings()
+        power = delay_spectra(estimate_power(data, data, beam, settings), settings).power
+        np.testing.assert_allclose(power.imag, 0, atol=1e-9 * power.real.max())
+        assert (power.real > 0).all()
+
+
+def test_inputs_are_untouched_and_the_result_survives_hdf5(observe, white, beam, tmp_path):
+    even, odd = two(observe(GOLOMB, polarizations=("xx", "yy")), white)
+    before = even.copy(), odd.copy()
+    uvp = estimate_power(even, odd, beam, PowerSettings())
+    assert (even, odd) == before
+    uvp.write_hdf5(str(tmp_path / "p.h5"))
+    back = UVPSpec()
+    back.read_hdf5(str(tmp_path / "p.h5"))
+    assert back == uvp
+    assert back.cosmo == uvp.cosmo
+    settings = PowerSettings()
+    np.testing.assert_array_equal(delay_spectra(back, settings).power, delay_spectra(uvp, settings).power)
+
+
+def test_bad_data_are_refused(observe, white, beam):
+    template = observe(GOLOMB)
+    even, odd = two(template, white)
+    many = white(observe(GOLOMB, n_times=2), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="even data have 2 integrations, expected 1"):
+        estimate_power(many, odd, beam, PowerSettings())
+    kelvin = odd.copy()
+    kelvin.vis_units = "K str"
+    with pytest.raises(ValueError, match=r"odd data are in 'K str', expected 'Jy'"):
+        estimate_power(even, kelvin, beam, PowerSettings())
+    fewer = white(observe(GOLOMB, n_channels=16), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="differ in freq_array"):
+        estimate_power(even, fewer, beam, PowerSettings())

@@ -1,0 +1,23 @@
+"""Beams for the simulators, read once."""
+
+from __future__ import annotations
+
+import pytest
+
+from calstudy.instrument import settings as instrument
+from calstudy.instrument.beams import make_beam
+
+
+@pytest.fixture(scope="session")
+def embedded_beam():
+    return make_beam(instrument.MwaEmbeddedBeam())
+
+
+@pytest.fixture(scope="session")
+def tile_beam():
+    return make_beam(instrument.MwaAnalyticBeam(kind="mwa-analytic"))
+
+
+@pytest.fixture(scope="session")
+def gaussian_beam():
+    return make_beam(instrument.GaussianBeam(kind="gaussian"))

@@ -1,0 +1,172 @@
+"""Engines against each other and against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy import units
+from astropy.coordinates import SkyCoord
+from pyradiosky import SkyModel
+from pyuvdata.analytic_beam import UniformBeam
+from scipy.constants import speed_of_light
+from simulation_cases import healpix_sky, local_coordinates, observe, point_sky, random_sky, relative_error
+
+from calstudy.instrument.beams import ExactBeam
+from calstudy.simulate.dense import DenseEngine
+from calstudy.simulate.engine import FastestEngine, make_engine
+from calstudy.simulate.nufft import FftvisEngine
+from calstudy.simulate.reference import PyuvsimEngine
+from calstudy.simulate.settings import SimulationSettings
+from calstudy.visibilities import baseline_vectors
+
+
+@pytest.fixture(scope="module")
+def template():
+    return observe()
+
+
+@pytest.fixture(scope="module")
+def sky(template):
+    return random_sky(template)
+
+
+@pytest.fixture(scope="module")
+def reference(template, sky, request):
+    return {}
+
+
+def pyuvsim_visibilities(name, request, sky, template):
+    """Return a beam and pyuvsim's visibilities of it."""
+    beam = request.getfixturevalue(name)
+    return beam, PyuvsimEngine().simulate(sky, beam, template)
+
+
+def test_the_test_sky_is_hard(template, sky):
+    heights = template.telescope.get_enu_antpos()[:, 2]
+    assert np.ptp(heights) > 0.05
+    assert sky.spectral_index.std() > 0.1
+
+
+@pytest.mark.parametrize("name", ["tile_beam", "embedded_beam", "gaussian_beam"])
+def test_dense_agrees_with_pyuvsim_to_rounding(name, request, sky, template):
+    beam, expected = pyuvsim_visibilities(name, request, sky, template)
+    assert relative_error(DenseEngine().simulate(sky, beam, template), expected) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["tile_beam", "embedded_beam"])
+def test_fftvis_agrees_with_pyuvsim(name, request, sky, template):
+    beam, expected = pyuvsim_visibilities(name, request, sky, template)
+    assert relative_error(FftvisEngine().simulate(sky, beam, template), expected) < 1e-10
+
+
+def test_single_precision_is_single(sky, template, tile_beam):
+    double = DenseEngine().simulate(sky, tile_beam, template)
+    error = relative_error(DenseEngine("single").simulate(sky, tile_beam, template), double)
+    assert 1e-9 < error < 1e-5
+
+
+def test_channel_by_channel_healpix_sky_in_kelvin(template, tile_beam):
+    sky = healpix_sky(template.freq_array)
+    expected = PyuvsimEngine().simulate(sky, tile_beam, template)
+    assert relative_error(DenseEngine().simulate(sky, tile_beam, template), expected) < 1e-12
+    assert relative_error(FftvisEngine().simulate(sky, tile_beam, template), expected) < 1e-10
+
+
+def test_polarizations_keep_their_place(sky, tile_beam):
+    both = observe(channels=1, times=1)
+    for engine in (DenseEngine(), PyuvsimEngine()):
+        cube = engine.simulate(sky, tile_beam, both)
+        for column, polarization in enumerate(("xx", "yy")):
+            alone = engine.simulate(sky, tile_beam, observe(channels=1, times=1, polarizations=(polarization,)))
+            np.testing.assert_allclose(alone[..., 0], cube[..., column], rtol=1e-12)
+        assert relative_error(cube[..., 0], cube[..., 1]) > 1e-2
+
+
+def test_a_source_at_zenith_gives_half_its_flux_with_the_phase_of_the_heights(gaussian_beam):
+    template = observe(times=1)
+    zenith = local_coordinates(template, np.array([np.pi / 2]), np.array([0.0]))
+    cube = DenseEngine().simulate(point_sky(zenith, [3.0]), gaussian_beam, template)
+    turns = baseline_vectors(template)[:, 2, None] * template.freq_array / speed_of_light
+    expected = np.broadcast_to(1.5 * np.exp(2j * np.pi * turns)[None, :, :, None], cube.shape)
+    np.testing.assert_allclose(cube, expected, rtol=1e-7)
+
+
+def test_a_uniform_hemisphere_gives_a_sinc():
+    """The integral of exp(2 pi i u.s) over a hemisphere is 2 pi sin(x) / x for horizontal u, x = 2 pi |u|: real part."""
+    template = observe(count=2, times=1, channels=2, polarizations=("xx",))
+    beam = ExactBeam(UniformBeam(), "uniform", "for this test")
+    nside = 128
+    pixels = np.arange(12 * nside**2)
+    stokes = np.zeros((4, 1, len(pixels)))
+    stokes[0] = 2.0
+    sky = SkyModel(
+        component_type="healpix",
+        nside=nside,
+        hpx_order="ring",
+        hpx_inds=pixels,
+        frame="icrs",
+        stokes=stokes * units.Jy / units.sr,
+        spectral_type="flat",
+    )
+    cube = DenseEngine().simulate(sky, beam, template)[0, 0, :, 0]
+    x = 2 * np.pi * template.freq_array / speed_of_light * np.linalg.norm(baseline_vectors(template)[0])
+    # The pixels end raggedly at the horizon: their size bounds the error.
+    assert np.abs(cube.real - 2 * np.pi * np.sinc(x / np.pi)).max() < 2 * np.pi / nside
+
+
+def test_visibilities_add_up_and_ignore_the_order_of_sources(sky, template, tile_beam):
+    engine = DenseEngine()
+    whole = engine.simulate(sky, tile_beam, template)
+    shuffled = np.random.default_rng(1).permutation(sky.Ncomponents)
+    parts = [sky.select(component_inds=part, inplace=False) for part in np.array_split(shuffled, 3)]
+    assert relative_error(sum(engine.simulate(part, tile_beam, template) for part in parts), whole) < 1e-13
+
+
+def test_no_source_above_the_horizon_gives_zeros(template, tile_beam):
+    nadir = local_coordinates(template, np.array([-1.5]), np.array([0.0]))
+    assert not DenseEngine().simulate(point_sky(nadir, [1.0]), tile_beam, template).any()
+
+
+def test_arguments_are_not_changed(sky, template, embedded_beam):
+    sky_before, template_before = sky.copy(), template.copy()
+    for engine in (DenseEngine(), PyuvsimEngine(), FftvisEngine()):
+        engine.simulate(sky, embedded_beam, template)
+        assert sky == sky_before, engine.name
+        assert template == template_before, engine.name
+
+
+def test_auto_takes_the_fastest_that_can(sky, template, tile_beam):
+    auto = make_engine(SimulationSettings())
+    assert isinstance(auto, FastestEngine)
+    assert auto.choose(sky, tile_beam, template).name == "dense"
+    polarized = point_sky(sky.skycoord[:2], [1.0, 1.0], stokes_q=0.3)
+    assert auto.choose(polarized, tile_beam, template).name == "pyuvsim"
+    np.testing.assert_array_equal(
+        auto.simulate(polarized, tile_beam, template), PyuvsimEngine().simulate(polarized, tile_beam, template)
+    )
+    with pytest.raises(ValueError, match="polarized sky"):
+        DenseEngine().simulate(polarized, tile_beam, template)
+
+
+def test_engines_are_chosen_by_name():
+    for name in ("dense", "fftvis", "pyuvsim"):
+        assert make_engine(SimulationSettings(engine=name)).name == name
+
+
+def test_cross_hands_go_to_an_engine_that_has_them(sky, template, tile_beam):
+    crossed = observe(channels=1, times=1, polarizations=("xx",))
+    crossed.polarization_array = np.array([-7])
+    auto = make_engine(SimulationSettings())
+    assert auto.choose(sky, tile_beam, crossed).name == "fftvis"
+    expected = PyuvsimEngine().simulate(sky, tile_beam, crossed)
+    assert relative_error(auto.simulate(sky, tile_beam, crossed), expected) < 1e-10
+
+
+def test_a_galactic_sky_is_where_it_should_be(template, tile_beam):
+    icrs = SkyCoord([30, 60] * units.deg, [-30, -20] * units.deg)
+    engine = DenseEngine()
+    np.testing.assert_allclose(
+        engine.simulate(point_sky(icrs.galactic, [1.0, 2.0]), tile_beam, template),
+        engine.simulate(point_sky(icrs, [1.0, 2.0]), tile_beam, template),
+        rtol=1e-11,
+    )
