@@ -83,6 +83,14 @@ def plan(file: File, scale: Scale = None, overrides: Set = None, workers: Worker
     show_plan(experiment, choose_workers(experiment, workers), Console(highlight=False))
 
 
+@app.command()
+def fields() -> None:
+    """Print the reference of all fields of an experiment file (Markdown)."""
+    from calstudy.experiment.reference import field_reference
+
+    typer.echo(field_reference(), nl=False)
+
+
 @data_app.command()
 def fetch(
     name: Annotated[str, typer.Argument(help="What to fetch: gleam.")],

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from calstudy.tasks import Task
@@ -62,8 +63,8 @@ def antenna_count(layout: Mapping[str, Any]) -> int:
     if kind == "hex":
         return 3 * layout["side"] * (layout["side"] - 1) + 1
     if kind == "csv":
-        with open(layout["path"], encoding="utf-8", errors="replace") as file:
-            return max(sum(1 for line in file if line.strip() and not line.startswith("#")) - 1, 2)
+        lines = Path(layout["path"]).read_text(encoding="utf-8", errors="replace").splitlines()
+        return max(sum(1 for line in lines if line.strip() and not line.startswith("#")) - 1, 2)
     whole = 128 if kind == "mwa-compact" else 36
     return layout.get("count") or whole
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calstudy.errors import InputError
@@ -39,6 +41,25 @@ class Schedule:
     damaged: tuple[Task, ...]
 
 
+@dataclass(frozen=True)
+class Crew:
+    """Who makes the products.
+
+    Attributes
+    ----------
+    workers
+        Worker processes to start on this machine; with one, the work is done in this process.
+    log
+        File to which worker processes of this machine append what they write to standard error.
+    scheduler
+        Address of a running dask scheduler whose workers to use instead, or None.
+    """
+
+    workers: int
+    log: Path
+    scheduler: str | None = None
+
+
 def schedule(targets: Iterable[Task], store: Store) -> Schedule:
     """Find out what must be made: the targets and what they need, as far as it is not in the store, intact."""
     todo: dict[str, Task] = {}
@@ -63,9 +84,15 @@ def schedule(targets: Iterable[Task], store: Store) -> Schedule:
     return Schedule(tuple(todo.values()), ready, tuple(damaged))
 
 
+def _write_errors_to(path: Path) -> None:
+    """Append what this process and its libraries write to standard error to a file from now on."""
+    with path.open("a") as file:
+        os.dup2(file.fileno(), 2)
+
+
 @contextmanager
-def _local_client(workers: int) -> Iterator[Client]:
-    """Start workers on this machine: threads of this process if there is one, else processes that share the cores."""
+def _local_client(workers: int, log: Path) -> Iterator[Client]:
+    """Start workers on this machine: a thread of this process if there is one, else processes that share the cores."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -91,21 +118,23 @@ def _local_client(workers: int) -> Iterator[Client]:
         ) as cluster,
         Client(cluster) as client,
     ):
+        if workers > 1:
+            client.run(_write_errors_to, log)
         yield client
 
 
 @contextmanager
-def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
-    if scheduler is None:
-        with _local_client(workers) as client:
+def _client(crew: Crew) -> Iterator[Client]:
+    if crew.scheduler is None:
+        with _local_client(crew.workers, crew.log) as client:
             yield client
         return
     from distributed import Client
 
     try:
-        client = Client(scheduler, timeout="20 s")
+        client = Client(crew.scheduler, timeout="20 s")
     except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {scheduler}: cannot connect ({error})") from None
+        raise InputError(f"--scheduler {crew.scheduler}: cannot connect ({error})") from None
     with client:
         yield client
 
@@ -134,8 +163,7 @@ def _perform_after(order: Order, needed: list[Product]) -> Product:
 def execute(
     tasks: Sequence[Task],
     store: Store,
-    workers: int,
-    scheduler: str | None = None,
+    crew: Crew,
     done: Callable[[Task, Product], None] = lambda task, product: None,
 ) -> dict[str, Product]:
     """Make the products of `tasks`, which are in an order that respects their inputs.
@@ -146,10 +174,8 @@ def execute(
         From `schedule`.
     store
         Where they go; on a file system that all workers share.
-    workers
-        Worker processes to start on this machine; with one, the work is done in this process.
-    scheduler
-        Address of a running dask scheduler to use instead.
+    crew
+        Who does the work.
     done
         Called after each product.
 
@@ -168,7 +194,7 @@ def execute(
     products: dict[str, Product] = {}
     if not tasks:
         return products
-    with _client(workers, scheduler) as client:
+    with _client(crew) as client:
         futures = _submit(tasks, store, client)
         for future in as_completed(futures):
             task = futures[future]

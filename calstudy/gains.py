@@ -16,6 +16,7 @@ from calstudy.visibilities import antenna_pairs
 if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
 
+
 def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = None) -> UVCal:
     """Return gains as UVCal, for all antennas of the template's telescope and the feeds of its polarizations.
 

@@ -17,8 +17,6 @@ from calstudy.stages.registry import STAGES, Job
 from calstudy.store import Product, Store
 from calstudy.tasks import Task
 
-logger = logging.getLogger(__name__)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
@@ -100,5 +98,4 @@ def _make(order: Order, store: Store) -> Product:
             "cpu_seconds": round(usage.cpu_seconds, 3),
             "peak_memory_bytes": usage.peak_memory,
         }
-        logger.info("%s (%s): %.1f s", order.stage, order.label, usage.seconds)
         return store.seal(folder, record)

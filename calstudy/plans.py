@@ -82,6 +82,8 @@ def _total(costs: list[Cost], tasks: Sequence[Task], workers: int, console: Cons
 def show_result(result: Run, console: Console) -> None:
     """Print what a run made, what it warns of, and where its results are."""
     made = {task.key for task in result.made}
+    if not made:
+        console.print("everything was in the store: nothing was computed")
     table = Table(title="products", title_justify="left")
     table.add_column("stage")
     for heading in ("made", "from store", "cpu time", "peak memory"):

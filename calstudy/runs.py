@@ -17,7 +17,7 @@ from rich.console import Console
 
 from calstudy.errors import InputError
 from calstudy.estimates import estimate
-from calstudy.execution import drop_temporary, execute, schedule
+from calstudy.execution import Crew, drop_temporary, execute, schedule
 from calstudy.experiment.files import dump
 from calstudy.experiment.model import Experiment
 from calstudy.progress import report
@@ -52,9 +52,13 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """What the stages warn of, once each."""
-        found = [text for product in self.products.values() for text in product.record["notes"].get("warnings", [])]
-        return list(dict.fromkeys(found))
+        """What the stages warn of, with the product that it is about."""
+        records = [product.record for product in self.products.values()]
+        return [
+            f"{record['stage']} ({record['label']}): {text}"
+            for record in records
+            for text in record["notes"].get("warnings", [])
+        ]
 
 
 def run_folder(experiment: Experiment) -> Path:
@@ -173,8 +177,13 @@ def run(experiment: Experiment, workers: int, scheduler: str | None, console: Co
             logger.warning(message)
             console.print(message, markup=False)
         costs = {task.key: estimate(task).seconds for task in plan.todo}
-        with report(plan.todo, costs, console) as done:
-            products = execute(plan.todo, store, workers, scheduler, done)
+        with report(plan.todo, costs, console) as show:
+
+            def done(task: Task, product: Product) -> None:
+                logger.info("%s (%s): %.1f s", task.stage, task.label, product.record["seconds"])
+                show(task, product)
+
+            products = execute(plan.todo, store, Crew(workers, folder / "run.log", scheduler), done)
         products |= plan.ready
         drop_temporary(graph.targets, store)
         for task in graph.tasks:

@@ -31,6 +31,12 @@ def to_cube(uvd: UVData) -> np.ndarray:
     return uvd.data_array.reshape(uvd.Ntimes, uvd.Nbls, uvd.Nfreqs, uvd.Npols)
 
 
+def flag_cube(uvd: UVData) -> np.ndarray:
+    """Return the flags as a view of shape (Ntimes, Nbls, Nfreqs, Npols), bool, in the order of `to_cube`."""
+    require_rectangular(uvd)
+    return uvd.flag_array.reshape(uvd.Ntimes, uvd.Nbls, uvd.Nfreqs, uvd.Npols)
+
+
 def from_cube(template: UVData, cube: np.ndarray) -> UVData:
     """Return a copy of `template` that holds `cube`, of shape (Ntimes, Nbls, Nfreqs, Npols).
 

@@ -32,7 +32,7 @@ DOWNSTREAM = {"levels", "corrupt", "calibrate-chunk", "calibrate", "average", "p
         ("power.wedge_buffer", "200 ns", {"spectra", "figure"}),
         ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure"}),
         ("power.taper", "hann", {"power", "spectra", "figure"}),
-        ("calibration.basis.buffer", "80 ns", {"calibrate-chunk", "calibrate", "average", "power", "spectra", "figure"}),
+        ("calibration.basis.buffer", "80 ns", DOWNSTREAM - {"levels", "corrupt"}),
         ("corruption.gains.seed", 99, {"gains"} | DOWNSTREAM - {"levels"}),
         ("corruption.noise.seeds", [8, 9], DOWNSTREAM - {"levels"}),
         ("corruption.noise.factor", 5.0, DOWNSTREAM),

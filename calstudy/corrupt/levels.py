@@ -41,7 +41,8 @@ def rms(visibilities: np.ndarray) -> float:
 def set_levels(foreground_rms: float, eor_rms: float, settings: CorruptionSettings) -> Levels:
     """Scale the EoR to `eor_level` below the foregrounds and the noise to its reference (design §4).
 
-    The level is an amplitude ratio: rms of scaled EoR / rms of foregrounds = 10^(level / 20).
+    The paper's decibels are of brightness: -40 dB is a ratio of rms visibilities of 1e-4, so that the residuals'
+    -45 dB are -90 dB in the power spectrum. So rms of scaled EoR / rms of foregrounds = 10^(level / 10).
 
     Raises
     ------
@@ -54,7 +55,7 @@ def set_levels(foreground_rms: float, eor_rms: float, settings: CorruptionSettin
     if settings.eor_level is not None:
         if foreground_rms <= 0:
             raise InputError("corruption.eor_level: the foregrounds it refers to are all zero")
-        factor = 10 ** (settings.eor_level / 20) * foreground_rms / eor_rms
+        factor = 10 ** (settings.eor_level / 10) * foreground_rms / eor_rms
     noise = settings.noise
     if noise.kind == "none":
         std = 0.0

@@ -82,7 +82,7 @@ class CorruptionSettings(Section):
 
     eor_level: Decibel | None = Field(
         -40.0,
-        description="rms of EoR over rms of foregrounds, in amplitude (20 log10); null keeps absolute units.",
+        description="rms of EoR over foregrounds, 10 log10 of brightness: -40 dB is 1e-4; null: absolute units.",
     )
     noise: Noise = NoiseRelativeToEor()
     gains: Gains = ChannelGains()

@@ -118,6 +118,17 @@ def _input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, Ba
 def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> Experiment:
     """Make the paths of input files absolute, relative ones from `base`, and check that they can be read."""
     faults, resolved = [], data
+    if experiment.sky.foregrounds.kind == "gleam" and experiment.sky.foregrounds.path is None:
+        from calstudy.sky.gleam import default_path
+
+        resolved = override(resolved, "sky.foregrounds.path", str(default_path()))
+        if not default_path().is_file():
+            raise ExperimentError(
+                [
+                    f"sky.foregrounds: GLEAM is not on this machine (looked for {default_path()}); get it with "
+                    "'calstudy data fetch gleam', name a file of yours under sky.foregrounds.path, or use g4jy-and-counts"
+                ]
+            )
     for path, section, field in _input_files(experiment):
         target = getattr(section, field)
         file = target.expanduser() if target.expanduser().is_absolute() else (base / target)

@@ -71,7 +71,7 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
         return []
     example = next(record for record in records if record["status"] != "converged")
     return [
-        f"calibration: {unconverged} of {len(records)} solves did not converge "
+        f"{unconverged} of {len(records)} solves did not converge "
         f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
         f"{example['integration']}: {example['message']}"
     ]

@@ -50,14 +50,20 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
     ("text", "told"),
     [
         ("{name: a, calibratoin: {}}", "calibratoin: unknown key, did you mean 'calibration'?"),
-        ("{name: a, calibration: {basis: {bufer: 1 ns}}}", "calibration.basis.bufer: unknown key, did you mean 'buffer'?"),
+        (
+            "{name: a, calibration: {basis: {bufer: 1 ns}}}",
+            "calibration.basis.bufer: unknown key, did you mean 'buffer'?",
+        ),
         ("{name: a, instrument: {channels: {first: 167}}}", "instrument.channels.first: 167 has no unit"),
         (
             "{name: a, instrument: {channels: {width: -80 kHz}}}",
             "instrument.channels.width = '-80 kHz': must be greater than 0 Hz",
         ),
         ("{name: a, instrument: {layout: hexa}}", "instrument.layout: 'hexa' is not a choice, did you mean 'hex'?"),
-        ("{name: a, instrument: {layout: {kind: hex, side: '3'}}}", "instrument.layout.side = '3': must be a whole number"),
+        (
+            "{name: a, instrument: {layout: {kind: hex, side: '3'}}}",
+            "instrument.layout.side = '3': must be a whole number",
+        ),
         ("{name: a, instrument: {times: {count: 2.5}}}", "instrument.times.count = 2.5: must be a whole number"),
         ("{name: a, instrument: {polarizations: []}}", "instrument.polarizations: must have at least 1 item(s), has 0"),
         ("{name: a, sky: {eor: {nside: 100}}}", "sky.eor.nside = 100: not a choice (allowed: 16, 32, 64, 128, 256)"),
@@ -66,7 +72,10 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ("{name: a, variants: {v: {components: [noise]}}}", "variants: needs one with components [eor] alone"),
         ("{name: a, corruption: {noise: none}}", "asks for noise, but corruption.noise is 'none'"),
         ("{name: a, corruption: {gains: {sigma: .nan}}}", "corruption.gains.sigma = nan: must be a finite number"),
-        ("{name: a, sky: {foregrounds: {kind: file, path: no.skyh5}}}", "sky.foregrounds.path = 'no.skyh5': no such file"),
+        (
+            "{name: a, sky: {foregrounds: {kind: file, path: no.skyh5}}}",
+            "sky.foregrounds.path = 'no.skyh5': no such file",
+        ),
         ("{name: a, sky: {foregrounds: file}}", "sky.foregrounds.path: missing, and it has no default"),
         ("{}", "name: missing, and it has no default"),
         ("{name: a b}", "name = 'a b': must match"),

@@ -131,7 +131,7 @@ def baseline_spectra() -> list[BaselineSpectra]:
 
 @pytest.fixture
 def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra) -> Callable[..., dict[str, Figure]]:
-    """Return a function that draws every kind of figure with the given stand-ins."""
+    """Return a function that draws every kind of figure, or those named, with the given stand-ins."""
     rng = np.random.default_rng(13)
     arrays = [LayoutPanel(f"array {n}", np.arange(n), 40 * rng.normal(size=(n, 3)), (0, 1)) for n in (9, 36)]
     gains = 1 + 0.1 * (rng.normal(size=(2, 2, 64)) + 1j * rng.normal(size=(2, 2, 64)))
@@ -139,23 +139,24 @@ def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra)
     seconds = np.array([[10.0], [40.0], [160.0]]) * np.exp(0.1 * rng.normal(size=(3, 50)))
     steps = [summarize_runtime(label, np.array([8, 16, 32]), seconds / speed) for label, speed in (("A", 1), ("B", 30))]
 
-    def draw(stand_ins: tuple[str, ...] = ()) -> dict[str, Figure]:
+    def draw(stand_ins: tuple[str, ...] = (), only: tuple[str, ...] | None = None) -> dict[str, Figure]:
         note = {"stand_ins": stand_ins}
-        return {
-            "layouts": draw_layouts(arrays, **note),
-            "layout": draw_layouts(arrays[:1], **note),
-            "wedge": draw_wedge(wedge_panels, **note),
-            "spherical": draw_spherical([make_column(1), excised], **note),
-            "spherical one column": draw_spherical([excised], **note),
-            "spherical comparison": draw_spherical_comparison(excised, make_column(3, empty=1), **note),
-            "gains": draw_gains(compare_gains((0, 1), FREQUENCY, *gains), **note),
-            "model": draw_model(visibility_comparison, **note),
-            "data": draw_data(visibility_comparison, **note),
-            "baselines": draw_baselines(baseline_spectra, **note),
-            "three baselines": draw_baselines(baseline_spectra[:3], **note),
-            "baseline": draw_baselines(baseline_spectra[:1], **note),
-            "reflections": draw_reflections(in_two_domains(FREQUENCY, gains[0]), **note),
-            "runtime": draw_runtime(steps, "number of antennas", r"N_\mathrm{ant}", **note),
+        drawings = {
+            "layouts": lambda: draw_layouts(arrays, **note),
+            "layout": lambda: draw_layouts(arrays[:1], **note),
+            "wedge": lambda: draw_wedge(wedge_panels, **note),
+            "spherical": lambda: draw_spherical([make_column(1), excised], **note),
+            "spherical one column": lambda: draw_spherical([excised], **note),
+            "spherical comparison": lambda: draw_spherical_comparison(excised, make_column(3, empty=1), **note),
+            "gains": lambda: draw_gains(compare_gains((0, 1), FREQUENCY, *gains), **note),
+            "model": lambda: draw_model(visibility_comparison, **note),
+            "data": lambda: draw_data(visibility_comparison, **note),
+            "baselines": lambda: draw_baselines(baseline_spectra, **note),
+            "three baselines": lambda: draw_baselines(baseline_spectra[:3], **note),
+            "baseline": lambda: draw_baselines(baseline_spectra[:1], **note),
+            "reflections": lambda: draw_reflections(in_two_domains(FREQUENCY, gains[0]), **note),
+            "runtime": lambda: draw_runtime(steps, "number of antennas", r"N_\mathrm{ant}", **note),
         }
+        return {name: drawings[name]() for name in only or drawings}
 
     return draw

@@ -42,14 +42,15 @@ def test_a_metre_is_as_long_east_as_north(panels):
         assert (positions > low).all() and (positions < high).all()
 
 
-def test_circles_do_not_overlap():
-    spacing = 14.0
-    hexagon = np.array([(x + y / 2, y * np.sqrt(3) / 2) for x in range(-3, 4) for y in range(-3, 4) if abs(x + y) <= 3])
-    figure = draw_layouts([LayoutPanel("hex", np.arange(37), spacing * hexagon)] * 2)
+@pytest.mark.parametrize(("spacing", "extent"), [(14.0, 60.0), (7.72, 165.0)])
+def test_circles_do_not_overlap(spacing, extent):
+    """Two neighbours in an array of the paper's size, and in a wide one."""
+    positions = np.array([(0, 0), (spacing, 0), (0, extent), (extent, extent)])
+    figure = draw_layouts([LayoutPanel("pair", np.arange(4), positions)] * 2)
     figure.draw_without_rendering()
     axes = figure.axes[0]
-    (origin, neighbour) = axes.transData.transform([(0, 0), (spacing, 0)]) * 72 / figure.dpi
-    assert axes.get_lines()[0].get_markersize() <= neighbour[0] - origin[0]
+    origin, neighbour = axes.transData.transform(positions[:2]) * 72 / figure.dpi
+    assert 4 <= axes.get_lines()[0].get_markersize() <= neighbour[0] - origin[0]
 
 
 def test_large_arrays_have_no_numbers():

@@ -14,7 +14,7 @@ from calstudy.errors import InputError
 from calstudy.instrument import settings as section
 from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, integrate_power, make_beam
 
-CHANNELS = 167.075e6 + 80e3 * np.arange(384)
+CHANNELS = 167.075e6 + 320e3 * np.arange(96)
 BAND = np.array([167.075e6, 182e6, 197.715e6])
 
 
@@ -119,7 +119,9 @@ def test_ideal_and_embedded_tile_have_nearly_the_same_width(embedded):
     angle = np.deg2rad(np.arange(0, 20, 0.1))
     ideal = make_beam(section.MwaAnalyticBeam(kind="mwa-analytic"))
     for azimuth in (0, np.pi / 2):
-        widths = [np.rad2deg(half_width(power(beam, azimuth, angle, BAND[1:2])[0], angle)) for beam in (embedded, ideal)]
+        widths = [
+            np.rad2deg(half_width(power(beam, azimuth, angle, BAND[1:2])[0], angle)) for beam in (embedded, ideal)
+        ]
         assert widths[0] == pytest.approx(widths[1], abs=0.25)
 
 
@@ -147,7 +149,7 @@ def test_smooth_fit_follows_the_table_to_its_scatter(embedded):
 def test_smooth_fit_is_smooth_where_tabulated_steps_are_not(embedded):
     """Delay transform of the power beam: the fit has nothing at the 781 ns of the table's 1.28 MHz; others have."""
     taper = blackmanharris(len(CHANNELS), sym=False)
-    delays = np.abs(np.fft.fftfreq(len(CHANNELS), 80e3))
+    delays = np.abs(np.fft.fftfreq(len(CHANNELS), 320e3))
 
     def beyond_wedge(beam, low, high):
         table = beam.at(CHANNELS)
@@ -155,9 +157,7 @@ def test_smooth_fit_is_smooth_where_tabulated_steps_are_not(embedded):
         spectrum = np.abs(np.fft.fft(values * taper[:, None, None], axis=0)) / taper.sum()
         return np.sqrt(np.mean(spectrum[(delays > low) & (delays < high)] ** 2))
 
-    point_to_point = {
-        kind: make_beam(section.MwaEmbeddedBeam(interpolation=kind)) for kind in ("cubic", "nearest")
-    }
+    point_to_point = {kind: make_beam(section.MwaEmbeddedBeam(interpolation=kind)) for kind in ("cubic", "nearest")}
     assert beyond_wedge(embedded, 200e-9, 400e-9) < 1e-6
     assert beyond_wedge(embedded, 200e-9, 400e-9) < 0.1 * beyond_wedge(point_to_point["cubic"], 200e-9, 400e-9)
     assert beyond_wedge(embedded, 700e-9, 860e-9) < 1e-7
@@ -183,6 +183,22 @@ def test_fewer_channels_keep_the_same_beam(embedded):
     )
 
 
+def test_band_between_two_tabulated_frequencies(embedded):
+    """Eight channels span 0.56 MHz, less than the table's 1.28 MHz."""
+    narrow = make_beam(section.MwaEmbeddedBeam(), section.Channels(first="182.1 MHz", count=8))
+    assert 0 < narrow.fit_error < 4e-4
+    frequency = np.array([182.3e6])
+    np.testing.assert_allclose(narrow.at(frequency).data_array, embedded.at(frequency).data_array, atol=4e-5)
+
+
+def test_few_tabulated_frequencies_limit_the_interpolation(tmp_path, embedded):
+    path = tmp_path / "beam.beamfits"
+    embedded.at(np.array([166e6, 183e6, 200e6])).write_beamfits(path)
+    assert make_beam(section.FileBeam(kind="beamfits", path=path, interpolation="linear")).fit_error < 1e-12
+    with pytest.raises(InputError, match="cubic needs 4 tabulated frequencies"):
+        make_beam(section.FileBeam(kind="beamfits", path=path, interpolation="cubic"))
+
+
 def test_frequencies_outside_the_band_are_refused(embedded):
     with pytest.raises(InputError, match="outside the band"):
         embedded.at(np.array([150e6]))
@@ -195,9 +211,10 @@ def test_beamfits_round_trip(tmp_path, embedded):
     frequencies = np.arange(166e6, 199.5e6, 1e6)
     embedded.at(frequencies).write_beamfits(path)
     beam = make_beam(section.FileBeam(kind="beamfits", path=path))
-    np.testing.assert_allclose(beam.at(BAND).data_array, embedded.at(BAND).data_array, atol=1e-7)
+    # A fit to samples of the fit, over a narrower band: the same but for the order's own truncation.
+    np.testing.assert_allclose(beam.at(BAND).data_array, embedded.at(BAND).data_array, atol=3e-5)
     assert "beam.beamfits" in beam.stand_in
-    np.testing.assert_allclose(beam.solid_angles(BAND, "yy"), embedded.solid_angles(BAND, "yy"), rtol=1e-6)
+    np.testing.assert_allclose(beam.solid_angles(BAND, "yy"), embedded.solid_angles(BAND, "yy"), rtol=1e-4)
 
 
 def test_unusable_beam_files_are_refused(tmp_path):
@@ -215,7 +232,7 @@ def test_unusable_beam_files_are_refused(tmp_path):
 
 def test_power_beam_files_are_refused(tmp_path):
     dipole = ShortDipoleBeam().to_uvbeam(
-        freq_array=BAND, beam_type="power", axis1_array=AZIMUTHS, axis2_array=ZENITH_ANGLES[::10]
+        freq_array=BAND[:1], beam_type="power", axis1_array=AZIMUTHS, axis2_array=ZENITH_ANGLES[::10]
     )
     assert isinstance(dipole, UVBeam)
     dipole.write_beamfits(tmp_path / "power.beamfits")

@@ -103,7 +103,9 @@ def test_subset_observes_the_same_baselines_at_other_times_and_frequencies(templ
     np.testing.assert_array_equal(nodes.freq_array, frequencies)
     np.testing.assert_array_equal(nodes.polarization_array, template.polarization_array)
     sidereal_rate = 2 * np.pi / 86164.0905
-    np.testing.assert_allclose(nodes.lst_array[::10] - template.lst_array[0], np.array([0.1, 0.7, 3.0]) * sidereal_rate, atol=1e-8)
+    np.testing.assert_allclose(
+        nodes.lst_array[::10] - template.lst_array[0], np.array([0.1, 0.7, 3.0]) * sidereal_rate, atol=1e-8
+    )
 
 
 def test_writes_and_reads_back(tmp_path, template):

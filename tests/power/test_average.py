@@ -16,9 +16,7 @@ def drifting_source(template, position):
     """Visibilities exp(2 pi i nu b.s / c) of a source of 1 Jy at `position`, without a beam."""
     vectors = baseline_vectors(template)
     times = np.unique(template.time_array)
-    horizontal = position.transform_to(
-        AltAz(obstime=Time(times, format="jd"), location=template.telescope.location)
-    )
+    horizontal = position.transform_to(AltAz(obstime=Time(times, format="jd"), location=template.telescope.location))
     east = np.cos(horizontal.alt) * np.sin(horizontal.az)
     north = np.cos(horizontal.alt) * np.cos(horizontal.az)
     directions = np.stack([east, north, np.sin(horizontal.alt)], axis=1).value

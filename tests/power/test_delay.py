@@ -20,9 +20,7 @@ def test_transform_is_the_sum_of_the_paper(n, taper, first, seed):
     data = rng.normal(size=(3, n)) + 1j * rng.normal(size=(3, n))
     phases = np.exp(2j * np.pi * d.delays(n, 80e3)[:, None] * frequencies)
     expected = 80e3 * (data * d.make_taper(taper, n)) @ phases.T
-    np.testing.assert_allclose(
-        d.delay_transform(data, frequencies, taper), expected, rtol=0, atol=1e-6 * 80e3 * n
-    )
+    np.testing.assert_allclose(d.delay_transform(data, frequencies, taper), expected, rtol=0, atol=1e-6 * 80e3 * n)
 
 
 def test_a_source_appears_at_its_delay_along_any_axis():

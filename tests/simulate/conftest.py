@@ -19,5 +19,11 @@ def tile_beam():
 
 
 @pytest.fixture(scope="session")
+def dipole_beam():
+    """A beam that does not vanish at the horizon."""
+    return make_beam(instrument.DipoleBeam(kind="short-dipole"))
+
+
+@pytest.fixture(scope="session")
 def gaussian_beam():
     return make_beam(instrument.GaussianBeam(kind="gaussian"))

@@ -43,7 +43,7 @@ def point_sky(coordinates, flux, spectral_index=None, stokes_q=0.0):
 
 def local_coordinates(template, altitude, azimuth):
     """Return ICRS coordinates of directions (rad) at the middle of an observation."""
-    middle = Time(template.time_array.mean(), format="jd", location=template.telescope.location)
+    middle = Time(np.median(template.time_array), format="jd", location=template.telescope.location)
     frame = AltAz(obstime=middle, location=template.telescope.location)
     return SkyCoord(azimuth * units.rad, altitude * units.rad, frame=frame).icrs
 
@@ -73,6 +73,7 @@ def healpix_sky(frequencies, nside=8, seed=6):
         stokes=stokes * units.K,
         spectral_type="full",
         freq_array=frequencies * units.Hz,
+        run_check=False,  # It warns that brightness differences are negative.
     )
 
 

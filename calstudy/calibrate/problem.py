@@ -1,0 +1,148 @@
+"""One calibration problem: data, weights and unknowns of one integration and polarization, without files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from calstudy.calibrate.basis import ForegroundBasis
+
+Prior = Literal["sum", "post-hoc", "none"]
+
+
+@dataclass(frozen=True, eq=False)
+class FitStructure:
+    """Which antennas make which baseline, and which baselines share a foreground model.
+
+    Every integration of a data set shares one instance; solvers compile once per instance.
+
+    Attributes
+    ----------
+    antennas
+        Antenna indices (a, b) of each baseline, shape (Nbls, 2), each in 0 ... n_antennas - 1.
+    n_antennas
+        Number of antennas.
+    basis
+        The bases of the foreground models.
+    groups
+        Index of each baseline's foreground model, shape (Nbls,): ``arange(Nbls)`` for per-baseline modelling
+        (paper Eq. LOGLIKELIHOOD), the redundant group otherwise (Eq. LOGLIKELIHOODREDUNDANT).
+    conjugated
+        True where a baseline sees the conjugate of its model because it points the other way, shape (Nbls,).
+    """
+
+    antennas: np.ndarray
+    n_antennas: int
+    basis: ForegroundBasis
+    groups: np.ndarray
+    conjugated: np.ndarray
+
+    def __post_init__(self) -> None:
+        n_baselines = len(self.antennas)
+        if self.antennas.shape != (n_baselines, 2) or n_baselines == 0:
+            raise ValueError(f"antennas: shape {self.antennas.shape}, expected (Nbls, 2) with at least one baseline")
+        if self.antennas.min() < 0 or self.antennas.max() >= self.n_antennas:
+            raise ValueError(f"antennas: indices must lie in 0 ... {self.n_antennas - 1}")
+        if self.groups.shape != (n_baselines,) or self.conjugated.shape != (n_baselines,):
+            raise ValueError(f"groups and conjugated: one entry for each of the {n_baselines} baselines is needed")
+        if not np.array_equal(np.unique(self.groups), np.arange(self.basis.n_models)):
+            raise ValueError(f"groups: every one of the {self.basis.n_models} foreground models needs a baseline")
+
+    @classmethod
+    def per_baseline(cls, antennas: np.ndarray, n_antennas: int, basis: ForegroundBasis) -> FitStructure:
+        """Return the structure in which every baseline has a foreground model of its own (paper Eq. LOGLIKELIHOOD)."""
+        n_baselines = len(antennas)
+        return cls(antennas, n_antennas, basis, np.arange(n_baselines), np.zeros(n_baselines, bool))
+
+    @property
+    def n_baselines(self) -> int:
+        """Number of baselines."""
+        return len(self.antennas)
+
+    @property
+    def n_frequencies(self) -> int:
+        """Number of channels."""
+        return self.basis.n_frequencies
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationProblem:
+    """Data and weights of one integration and polarization.
+
+    Attributes
+    ----------
+    structure
+        Antennas, baselines and foreground models.
+    visibilities
+        Measured visibilities, shape (Nbls, Nfreqs), complex128, in the unit of the data (Jy). Values with zero weight
+        are set to zero, whatever they were, NaN included.
+    weights
+        Weights w of the likelihood, shape (Nbls, Nfreqs), float64, none negative; zero where flagged. The paper's are
+        ``1 / (Nbls * Nfreqs)`` (see `flag_weights`).
+    initial_gains
+        Where the solver starts, and the reference for the phase of the solution, shape (Nants, Nfreqs), complex128.
+    sky_model
+        Visibilities m whose weighted sum fixes the overall scale, shape (Nbls, Nfreqs); None for the measured
+        visibilities divided by the initial gains.
+    prior
+        How the overall scale is fixed: in the loss and after it (``sum``), only after (``post-hoc``), or not.
+
+    Raises
+    ------
+    ValueError
+        For wrong shapes, weights that are negative or not finite, data that are not finite where the weight is not
+        zero, data that are zero everywhere, or initial gains that are zero or not finite.
+    """
+
+    structure: FitStructure
+    visibilities: np.ndarray
+    weights: np.ndarray
+    initial_gains: np.ndarray
+    sky_model: np.ndarray | None = None
+    prior: Prior = "sum"
+
+    def __post_init__(self) -> None:
+        shape = (self.structure.n_baselines, self.structure.n_frequencies)
+        gain_shape = (self.structure.n_antennas, self.structure.n_frequencies)
+        expected = {"visibilities": shape, "weights": shape, "initial_gains": gain_shape}
+        if self.sky_model is not None:
+            expected["sky_model"] = shape
+        for name, wanted in expected.items():
+            if getattr(self, name).shape != wanted:
+                raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {wanted}")
+        if self.prior not in get_args(Prior):
+            raise ValueError(f"prior: {self.prior!r} is not one of {', '.join(get_args(Prior))}")
+        if np.iscomplexobj(self.weights) or not np.isfinite(self.weights).all() or (self.weights < 0).any():
+            raise ValueError("weights: must be real, finite and not negative")
+        if not np.isfinite(self.initial_gains).all() or (self.initial_gains == 0).any():
+            raise ValueError("initial_gains: must be finite and not zero")
+        used = self.weights > 0
+        object.__setattr__(self, "visibilities", np.where(used, self.visibilities, 0).astype(np.complex128))
+        if not np.isfinite(self.visibilities).all():
+            raise ValueError("visibilities: not finite where the weight is not zero; flag those samples")
+        if not self.visibilities.any():
+            raise ValueError("visibilities: zero wherever the weight is not, so that there is nothing to calibrate")
+        if self.sky_model is not None:
+            object.__setattr__(self, "sky_model", np.where(used, self.sky_model, 0).astype(np.complex128))
+            if not np.isfinite(self.sky_model).all():
+                raise ValueError("sky_model: not finite where the weight is not zero")
+
+    @property
+    def prior_target(self) -> complex:
+        """The weighted sum of the sky model, in the unit of the data: sum over baselines and channels of w m."""
+        sky_model = self.sky_model
+        if sky_model is None:
+            sky_model = self.visibilities / gain_products(self.initial_gains, self.structure.antennas)
+        return complex(np.sum(self.weights * sky_model))
+
+
+def flag_weights(flags: np.ndarray) -> np.ndarray:
+    """Return the paper's weights 1 / (Nbls Nfreqs), zero where flagged; shape of `flags`, (Nbls, Nfreqs), float64."""
+    return np.where(flags, 0.0, 1.0 / flags.size)
+
+
+def gain_products(gains: np.ndarray, antennas: np.ndarray) -> np.ndarray:
+    """Return g_a g_b* of each baseline, shape (Nbls, Nfreqs), from gains (Nants, Nfreqs) and antennas (Nbls, 2)."""
+    return gains[antennas[:, 0]] * gains[antennas[:, 1]].conj()

@@ -1,0 +1,133 @@
+"""Variable projection: the best foregrounds for given gains in closed form, and the problem that is left for the gains.
+
+For gains g and a baseline p = (a, b) write G_p = g_a g_b* and D_p = w_p |G_p|^2, and let R be its foreground model. The
+likelihood is linear least squares in u_R, with normal matrix N_R = A^T (sum_p D_p) A over the baselines of R. Putting
+its solution back leaves a function of the gains alone (Golub & Pereyra 1973), whose gradient and Gauss-Newton matrix
+are below for a relative change eta of the gains, g (1 + eta).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import tensorflow as tf
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.tensors import FitTensors
+
+# Regularizes N relative to its mean diagonal: far below any signal, enough for models with most channels flagged.
+RIDGE = 1e-12
+# Singular values kept in the common basis of all buckets, relative to the largest.
+SPAN_CUTOFF = 1e-9
+
+
+class Projection(NamedTuple):
+    """The reduced problem at given gains.
+
+    Attributes
+    ----------
+    loss
+        sum w |v - G F|^2 at the best foregrounds; scalar, float64.
+    model
+        F, shape (2, Nmodels, Nfreqs), float64.
+    descent
+        Minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64.
+    curvature
+        D of each baseline, shape (Nbls, Nfreqs), float32.
+    baseline_model
+        F on the baselines, shape (2, Nbls, Nfreqs), float32.
+    absorber
+        W of each model, shape (Nmodels, Q, Q), float32: foregrounds answer a weighted change y of the visibilities of
+        their group with ``Q W Q^T y``, where Q is the common basis.
+    roots
+        For each bucket the inverse Cholesky factors of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel
+        without the common basis is ``Q W Q^T = (L^-1 A^T)^T (L^-1 A^T)``.
+    """
+
+    loss: tf.Tensor
+    model: tf.Tensor
+    descent: tf.Tensor
+    curvature: tf.Tensor
+    baseline_model: tf.Tensor
+    absorber: tf.Tensor
+    roots: tuple[tf.Tensor, ...]
+
+
+class Projector:
+    """Eliminates the foregrounds of one fit structure.
+
+    The loss, its gradient and N are evaluated in float64: in float32 the scale of the gains drifts unseen. The inner
+    products of the iteration need only float32.
+    """
+
+    def __init__(self, tensors: FitTensors) -> None:
+        self.tensors = tensors
+        left, singular, _ = np.linalg.svd(np.concatenate(tensors.bases, axis=1), full_matrices=False)
+        common = left[:, singular > SPAN_CUTOFF * singular[0]]
+        self.common = tf.constant(common, tf.float32)
+        self.rank = common.shape[1]
+        self._bases = [tf.constant(basis, tf.float64) for basis in tensors.bases]
+        self._overlaps = [tf.constant(basis.T @ common, tf.float32) for basis in tensors.bases]
+        self.project = tf.function(self._project)
+
+    def _normal_cholesky(self, curvature: tf.Tensor, basis: tf.Tensor) -> tf.Tensor:
+        """Return the Cholesky factors of N for the models of one bucket, shape (Nmembers, Nvec, Nvec)."""
+        n_frequencies, n_vectors = basis.shape
+        weighted = tf.reshape(curvature[:, None, :] * tf.transpose(basis), [-1, n_frequencies])
+        normal = tf.reshape(weighted @ basis, [-1, n_vectors, n_vectors])
+        mean = tf.reduce_mean(tf.linalg.diag_part(normal), -1)[:, None, None]
+        # A model without any data gets the identity, and with it coefficients of zero.
+        ridge = tf.where(mean > 0, RIDGE * mean, 1.0)
+        return tf.linalg.cholesky(normal + ridge * tf.eye(n_vectors, dtype=normal.dtype))
+
+    def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
+        tensors = self.tensors
+        products = tensors.gain_products(gains)
+        curvature = weights * pairs.squared_modulus(products)
+        group_curvature = tensors.sum_over_group(curvature)
+        matched = tensors.sum_pairs_over_group(pairs.conjugate_multiply(products, weights * visibilities))
+        models, absorbers, roots = [], [], []
+        for (start, end), basis, overlap in zip(tensors.slices, self._bases, self._overlaps, strict=True):
+            factor = self._normal_cholesky(group_curvature[start:end], basis)
+            n_frequencies, n_vectors = basis.shape
+            projected = tf.reshape(tf.reshape(matched[:, start:end], [-1, n_frequencies]) @ basis, [2, -1, n_vectors])
+            coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
+            coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
+            models.append(tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, n_frequencies]))
+            identity = tf.eye(n_vectors, batch_shape=[end - start], dtype=tf.float64)
+            root = tf.cast(tf.linalg.triangular_solve(factor, identity), tf.float32)
+            spread = tf.reshape(tf.reshape(root, [-1, n_vectors]) @ overlap, [-1, n_vectors, self.rank])
+            absorbers.append(tf.matmul(spread, spread, transpose_a=True))
+            roots.append(root)
+        model = tf.concat(models, axis=1)
+        baseline_model = tensors.to_baselines(model)
+        residual = visibilities - pairs.multiply(products, baseline_model)
+        loss = tf.reduce_sum(weights * pairs.squared_modulus(residual))
+        pull = pairs.conjugate_multiply(baseline_model, weights * pairs.conjugate_multiply(products, residual))
+        return Projection(
+            loss,
+            model,
+            tensors.sum_over_antenna(pull),
+            tf.cast(curvature, tf.float32),
+            tf.cast(baseline_model, tf.float32),
+            tf.concat(absorbers, axis=0),
+            tuple(roots),
+        )
+
+    def absorb(self, values: tf.Tensor, absorber: tf.Tensor) -> tf.Tensor:
+        """Return ``Q W Q^T values`` for each model; values and result (2, Nmodels, Nfreqs)."""
+        n_frequencies, rank = self.common.shape
+        inner = tf.reshape(tf.reshape(values, [-1, n_frequencies]) @ self.common, [2, -1, rank])
+        # W is symmetric, so that models can share one batched product for real and imaginary parts.
+        inner = tf.transpose(tf.transpose(inner, [1, 0, 2]) @ absorber, [1, 0, 2])
+        outer = tf.matmul(tf.reshape(inner, [-1, rank]), self.common, transpose_b=True)
+        return tf.reshape(outer, tf.shape(values))
+
+    def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs), float32."""
+        tensors = self.tensors
+        curvature, model = projection.curvature, projection.baseline_model
+        change = curvature * pairs.multiply(model, tensors.relative_change(eta))
+        absorbed = tensors.to_baselines(self.absorb(tensors.sum_pairs_over_group(change), projection.absorber))
+        return tensors.sum_over_antenna(pairs.conjugate_multiply(model, change - curvature * absorbed))

@@ -1,0 +1,59 @@
+"""What a solve gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+Status = Literal["converged", "max-steps", "stalled", "failed", "skipped"]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Gains and foreground model of one integration and polarization.
+
+    Attributes
+    ----------
+    gains
+        Shape (Nants, Nfreqs), complex128, dimensionless.
+    model
+        Intrinsic visibilities F, shape (Nbls, Nfreqs), complex128, in the unit of the data.
+    loss_history
+        Loss before the first step and after each, shape (n_steps + 1,), in the unit of the data squared.
+    status
+        ``converged``; ``max-steps`` or ``stalled`` for a usable estimate that is short of the minimum; ``failed`` for
+        none; ``skipped`` if there were no data to fit.
+    message
+        One sentence on why it stopped.
+    n_steps
+        Steps taken.
+    seconds
+        Wall time.
+    """
+
+    gains: np.ndarray
+    model: np.ndarray
+    loss_history: np.ndarray
+    status: Status
+    message: str
+    n_steps: int
+    seconds: float
+
+    @property
+    def usable(self) -> bool:
+        """Whether gains and model are an estimate at all."""
+        return self.status in ("converged", "max-steps", "stalled")
+
+    def summary(self) -> dict[str, Any]:
+        """Return status, steps, first and last loss and seconds, as plain JSON types."""
+        losses = self.loss_history
+        return {
+            "status": self.status,
+            "message": self.message,
+            "n_steps": self.n_steps,
+            "first_loss": float(losses[0]) if losses.size else None,
+            "last_loss": float(losses[-1]) if losses.size else None,
+            "seconds": self.seconds,
+        }

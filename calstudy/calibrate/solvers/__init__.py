@@ -1,0 +1,1 @@
+"""Solvers of the calibration problem, one file each."""

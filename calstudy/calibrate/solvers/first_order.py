@@ -1,0 +1,227 @@
+"""First-order descent on gains and foreground coefficients together; Adamax at 0.01 is the paper's solver.
+
+One call runs many steps inside one compiled loop. The loss is Eq. LOGLIKELIHOOD of visibilities in units of their rms,
+so that the learning rate is a relative change, plus the prior on the summed model where the problem asks for it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+import tensorflow as tf
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.loss import foreground_model, likelihood, sum_prior
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure
+from calstudy.calibrate.projection import Projector
+from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
+from calstudy.calibrate.tensors import FitTensors
+
+Method = Literal["adamax", "adam", "sgd"]
+Precision = Literal["single", "double"]
+
+# Decay of the first and second moment and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-7
+STEPS_PER_CALL = 50
+
+
+class Parameters(NamedTuple):
+    """Unknowns or anything of their shape: gains (2, Nants, Nfreqs) and one (2, Nmembers, Nvec) per bucket."""
+
+    gains: tf.Tensor
+    coefficients: tuple[tf.Tensor, ...]
+
+
+class FitData(NamedTuple):
+    """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's target (2,), in units of the rms."""
+
+    visibilities: tf.Tensor
+    weights: tf.Tensor
+    target: tf.Tensor
+
+
+def _map(function, *parameters: Parameters) -> Parameters:
+    return tf.nest.map_structure(function, *parameters)
+
+
+def update(
+    method: Method, learning_rate: float, step: tf.Tensor, parameters: Parameters, moments: tuple, gradient: Parameters
+) -> tuple[Parameters, tuple[Parameters, Parameters]]:
+    """Return parameters and moments after one step of Adamax, Adam (Kingma & Ba 2014) or plain gradient descent.
+
+    Parameters
+    ----------
+    step
+        Number of this step, from one, in the dtype of the parameters.
+    moments
+        First and second moment of the gradient, each of the shape of the parameters.
+    """
+    if method == "sgd":
+        return _map(lambda x, g: x - learning_rate * g, parameters, gradient), moments
+    first = _map(lambda m, g: BETA_1 * m + (1 - BETA_1) * g, moments[0], gradient)
+    rate = learning_rate / (1 - tf.cast(BETA_1, step.dtype) ** step)
+    if method == "adamax":
+        second = _map(lambda n, g: tf.maximum(BETA_2 * n, tf.abs(g)), moments[1], gradient)
+        moved = _map(lambda x, m, n: x - rate * m / (n + EPSILON), parameters, first, second)
+    else:
+        rate *= tf.sqrt(1 - tf.cast(BETA_2, step.dtype) ** step)
+        second = _map(lambda n, g: BETA_2 * n + (1 - BETA_2) * g * g, moments[1], gradient)
+        moved = _map(lambda x, m, n: x - rate * m / (tf.sqrt(n) + EPSILON), parameters, first, second)
+    return moved, (first, second)
+
+
+class Kernels:
+    """The compiled descent for one fit structure and one setting of the optimizer."""
+
+    def __init__(
+        self, structure: FitStructure, method: Method, learning_rate: float, precision: Precision, with_prior: bool
+    ) -> None:
+        self.dtype = tf.float32 if precision == "single" else tf.float64
+        self.tensors = FitTensors(structure)
+        self.projector = Projector(self.tensors)
+        self.bases = [tf.constant(basis.T, self.dtype) for basis in self.tensors.bases]
+        self._method, self._learning_rate, self._with_prior = method, learning_rate, with_prior
+        self.descend = tf.function(self._descend, jit_compile=True)
+
+    def loss(self, parameters: Parameters, data: FitData) -> tf.Tensor:
+        """Return the likelihood, plus the sum prior where the problem has it."""
+        model = self.tensors.to_baselines(foreground_model(parameters.coefficients, self.bases))
+        value = likelihood(self.tensors, parameters.gains, model, data.visibilities, data.weights)
+        return value + sum_prior(self.tensors, model, data.weights, data.target) if self._with_prior else value
+
+    def loss_and_gradient(self, parameters: Parameters, data: FitData) -> tuple[tf.Tensor, Parameters]:
+        """Return the loss and its gradient, of the shape of the parameters."""
+        with tf.GradientTape() as tape:
+            tape.watch(parameters)
+            value = self.loss(parameters, data)
+        return value, _map(tf.convert_to_tensor, tape.gradient(value, parameters))
+
+    def _descend(self, n_steps, done, parameters, moments, best_loss, best, data):
+        """Take `n_steps` steps and remember the best parameters seen; returns all that changed, and the losses."""
+
+        def body(index, parameters, moments, best_loss, best, losses):
+            value, gradient = self.loss_and_gradient(parameters, data)
+            better = value < best_loss
+            best = _map(lambda new, old: tf.where(better, new, old), parameters, best)
+            losses = tf.tensor_scatter_nd_update(losses, [[index]], [value])
+            step = tf.cast(done + index + 1, self.dtype)
+            moved, moments = update(self._method, self._learning_rate, step, parameters, moments, gradient)
+            return index + 1, moved, moments, tf.where(better, value, best_loss), best, losses
+
+        start = (tf.constant(0), parameters, moments, best_loss, best, tf.zeros([STEPS_PER_CALL], self.dtype))
+        result = tf.while_loop(lambda index, *_: index < n_steps, body, start, parallel_iterations=1)
+        final = self.loss(result[1], data)
+        return (*result[1:], final)
+
+
+@lru_cache(maxsize=2)
+def compiled(
+    structure: FitStructure, method: Method, learning_rate: float, precision: Precision, with_prior: bool
+) -> Kernels:
+    """Return the kernels of a structure and setting, compiled once for all its integrations."""
+    return Kernels(structure, method, learning_rate, precision, with_prior)
+
+
+@dataclass(frozen=True, eq=False)
+class FirstOrderState:
+    """One point of the descent; losses are in units of the data's mean square."""
+
+    kernels: Kernels
+    data: FitData
+    scale: float
+    parameters: Parameters
+    moments: tuple[Parameters, Parameters]
+    best_loss: tf.Tensor
+    best: Parameters
+    history: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """Adamax, Adam or gradient descent at a fixed rate, keeping the best parameters seen.
+
+    Parameters
+    ----------
+    method
+        The optimizer.
+    learning_rate
+        Step size, for visibilities in units of their rms.
+    tolerance
+        Converged when the best loss, in units of the data's mean square, falls by less than this over
+        `STEPS_PER_CALL` steps.
+    max_steps
+        Steps at most.
+    precision
+        Float32 or float64 throughout.
+    """
+
+    method: Method = "adamax"
+    learning_rate: float = 0.01
+    tolerance: float = 1e-14
+    max_steps: int = 10_000
+    precision: Precision = "single"
+
+    def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> FirstOrderState:
+        """Start from the foregrounds that fit best, in weighted least squares, with the first gains."""
+        kernels = compiled(problem.structure, self.method, self.learning_rate, self.precision, problem.prior == "sum")
+        exact = kernels.tensors.load(problem, tf.float64)
+        gains = pairs.to_pair(problem.initial_gains if warm is None else warm.gains, tf.float64)
+        model = kernels.projector.project(gains, exact.visibilities, exact.weights).model
+        parts = zip(kernels.tensors.slices, kernels.tensors.bases, strict=True)
+        coefficients = tuple(tf.cast(model[:, start:end] @ basis, kernels.dtype) for (start, end), basis in parts)
+        parameters = Parameters(tf.cast(gains, kernels.dtype), coefficients)
+        target = pairs.to_pair(np.array(problem.prior_target / exact.scale), kernels.dtype)
+        data = FitData(tf.cast(exact.visibilities, kernels.dtype), tf.cast(exact.weights, kernels.dtype), target)
+        loss = kernels.loss(parameters, data)
+        zero = _map(tf.zeros_like, parameters)
+        return FirstOrderState(kernels, data, exact.scale, parameters, (zero, zero), loss, parameters, (float(loss),))
+
+    def step(self, state: FirstOrderState) -> FirstOrderState:
+        """Take up to `STEPS_PER_CALL` steps."""
+        done = len(state.history) - 1
+        n_steps = min(STEPS_PER_CALL, self.max_steps - done)
+        parameters, moments, best_loss, best, losses, final = state.kernels.descend(
+            tf.constant(n_steps),
+            tf.constant(done),
+            state.parameters,
+            state.moments,
+            state.best_loss,
+            state.best,
+            state.data,
+        )
+        if final < best_loss:
+            best_loss, best = final, parameters
+        history = (*state.history, *losses.numpy()[1:n_steps].astype(float), float(final))
+        return replace(state, parameters=parameters, moments=moments, best_loss=best_loss, best=best, history=history)
+
+    def terminate(self, state: FirstOrderState) -> Verdict | None:
+        """Judge by the change of the best loss over the last call."""
+        n_steps = len(state.history) - 1
+        if not math.isfinite(state.history[-1]):
+            return Verdict("failed", f"the loss is not finite after {n_steps} steps; lower the learning rate")
+        if n_steps >= STEPS_PER_CALL:
+            before = min(state.history[:-STEPS_PER_CALL])
+            if abs(before - float(state.best_loss)) < self.tolerance:
+                return Verdict(
+                    "converged", f"the best loss fell by less than {self.tolerance:g} over {STEPS_PER_CALL} steps"
+                )
+        if n_steps >= self.max_steps:
+            return Verdict("max-steps", f"not converged after {n_steps} steps")
+        return None
+
+    def losses(self, state: FirstOrderState) -> Sequence[float]:
+        """Return the loss history, prior included, in the unit of the data squared."""
+        return [loss * state.scale**2 for loss in state.history]
+
+    def estimate(self, state: FirstOrderState) -> Estimate:
+        """Return the best gains and foregrounds seen."""
+        model = foreground_model(state.best.coefficients, state.kernels.bases)
+        return Estimate(pairs.to_complex(state.best.gains), state.kernels.tensors.unload(model, state.scale))
+
+    def memory(self, state: FirstOrderState) -> None:
+        """Return nothing: only the gains carry over."""

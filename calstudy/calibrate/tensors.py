@@ -1,0 +1,123 @@
+"""From the structure of a fit to TensorFlow: index tensors, and the moves between antennas, baselines and models.
+
+Inside the solvers, baselines are sorted by foreground model and models by bucket, so that each bucket is a slice. A
+baseline that sees the conjugate of its model is turned around: its antennas swap and its visibility is conjugated, and
+nothing after that needs to know.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import tensorflow as tf
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure
+
+
+class Measurements(NamedTuple):
+    """The data of one problem, in the solvers' order and orientation.
+
+    Attributes
+    ----------
+    visibilities
+        Shape (2, Nbls, Nfreqs), divided by `scale`.
+    weights
+        Shape (Nbls, Nfreqs), as in the problem.
+    scale
+        Weighted rms of the problem's visibilities, in their unit.
+    """
+
+    visibilities: tf.Tensor
+    weights: tf.Tensor
+    scale: float
+
+
+class FitTensors:
+    """Index tensors of one `FitStructure`.
+
+    Attributes
+    ----------
+    first, second
+        Antennas of each baseline, shape (Nbls,), int32.
+    model_index
+        Model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model.
+    slices
+        Range of models of each bucket.
+    bases
+        Basis of each bucket, shape (Nfreqs, Nvec), float64 arrays.
+    orientation
+        1, or -1 for baselines that were turned around, shape (Nbls, 1); None if there are none.
+    """
+
+    def __init__(self, structure: FitStructure) -> None:
+        buckets = structure.basis.buckets
+        model_order = np.concatenate([bucket.members for bucket in buckets])
+        model_position = np.empty(structure.basis.n_models, int)
+        model_position[model_order] = np.arange(structure.basis.n_models)
+        position = model_position[structure.groups]
+        self._order = np.argsort(position, kind="stable")
+        self._conjugated = structure.conjugated[self._order]
+        pairs_sorted = structure.antennas[self._order]
+        pairs_sorted = np.where(self._conjugated[:, None], pairs_sorted[:, ::-1], pairs_sorted)
+        self.n_antennas = structure.n_antennas
+        self.n_baselines = structure.n_baselines
+        self.n_frequencies = structure.n_frequencies
+        self.n_models = structure.basis.n_models
+        self.first = tf.constant(pairs_sorted[:, 0], tf.int32)
+        self.second = tf.constant(pairs_sorted[:, 1], tf.int32)
+        shared = self.n_models < self.n_baselines
+        self.model_index = tf.constant(position[self._order], tf.int32) if shared else None
+        ends = np.cumsum([bucket.members.size for bucket in buckets])
+        self.slices = [(int(end - bucket.members.size), int(end)) for bucket, end in zip(buckets, ends, strict=True)]
+        self.bases = [bucket.vectors for bucket in buckets]
+        self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
+
+    def load(self, problem: CalibrationProblem, dtype: tf.DType) -> Measurements:
+        """Return the problem's data as tensors of `dtype`."""
+        visibilities, weights = problem.visibilities[self._order], problem.weights[self._order]
+        visibilities = np.where(self._conjugated[:, None], visibilities.conj(), visibilities)
+        scale = float(np.sqrt(np.sum(weights * np.abs(visibilities) ** 2) / np.sum(weights)))
+        return Measurements(pairs.to_pair(visibilities / scale, dtype), tf.constant(weights, dtype), scale)
+
+    def unload(self, model: tf.Tensor, scale: float) -> np.ndarray:
+        """Return a model (2, Nmodels, Nfreqs) on the problem's baselines, shape (Nbls, Nfreqs), times `scale`."""
+        sorted_model = scale * pairs.to_complex(self.to_baselines(model))
+        result = np.empty_like(sorted_model)
+        result[self._order] = np.where(self._conjugated[:, None], sorted_model.conj(), sorted_model)
+        return result
+
+    def to_baselines(self, model: tf.Tensor) -> tf.Tensor:
+        """Give each baseline its model: (2, Nmodels, Nfreqs) to (2, Nbls, Nfreqs)."""
+        return model if self.model_index is None else tf.gather(model, self.model_index, axis=1)
+
+    def sum_over_group(self, values: tf.Tensor) -> tf.Tensor:
+        """Add up the baselines of each model, the transpose of `to_baselines`; first axis (Nbls,) to (Nmodels,)."""
+        return values if self.model_index is None else tf.math.segment_sum(values, self.model_index)
+
+    def sum_pairs_over_group(self, values: tf.Tensor) -> tf.Tensor:
+        """`sum_over_group` for (2, Nbls, Nfreqs)."""
+        if self.model_index is None:
+            return values
+        return tf.stack([self.sum_over_group(values[0]), self.sum_over_group(values[1])])
+
+    def gain_products(self, gains: tf.Tensor) -> tf.Tensor:
+        """Return g_a g_b*, shape (2, Nbls, Nfreqs), from gains (2, Nants, Nfreqs)."""
+        first, second = tf.gather(gains, self.first, axis=1), tf.gather(gains, self.second, axis=1)
+        return pairs.conjugate_multiply(second, first)
+
+    def relative_change(self, eta: tf.Tensor) -> tf.Tensor:
+        """Return eta_a + eta_b*: the first-order relative change of g_a g_b* when g becomes g (1 + eta)."""
+        first, second = tf.gather(eta, self.first, axis=1), tf.gather(eta, self.second, axis=1)
+        return tf.stack([first[0] + second[0], first[1] - second[1]])
+
+    def sum_over_antenna(self, values: tf.Tensor) -> tf.Tensor:
+        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`; (2, Nants, Nfreqs)."""
+
+        def scatter(part: tf.Tensor, index: tf.Tensor) -> tf.Tensor:
+            return tf.math.unsorted_segment_sum(part, index, self.n_antennas)
+
+        real = scatter(values[0], self.first) + scatter(values[0], self.second)
+        imaginary = scatter(values[1], self.first) - scatter(values[1], self.second)
+        return tf.stack([real, imaginary])

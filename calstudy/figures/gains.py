@@ -1,0 +1,97 @@
+"""Recovered gains of two antennas against the truth (the paper's Fig. GAIN_RESID)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from calstudy.figures import style
+from calstudy.figures.domains import TwoDomains, in_two_domains
+from calstudy.figures.panels import delay_panel, frequency_and_delay
+
+ANTENNA_COLOURS = ((style.BLUE, "#003A5C"), (style.ORANGE, "#7A5300"))
+"""Colours of true and of recovered gains, for each antenna."""
+
+
+@dataclass(frozen=True)
+class GainComparison:
+    """Gains of two antennas at one integration, in frequency and delay.
+
+    Attributes
+    ----------
+    antennas
+        The two antenna numbers.
+    true, recovered, residual
+        Injected gains, solutions and true - recovered, spectra of shape (2, Nfreqs).
+    correction
+        The gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, (Nfreqs,).
+    """
+
+    antennas: tuple[int, int]
+    true: TwoDomains
+    recovered: TwoDomains
+    residual: TwoDomains
+    correction: TwoDomains
+
+
+def compare_gains(
+    antennas: tuple[int, int], frequency: np.ndarray, true: np.ndarray, recovered: np.ndarray
+) -> GainComparison:
+    """Compare true and recovered gains, (2, Nfreqs) complex, on channels `frequency` (Nfreqs,) Hz.
+
+    The recovered gains must have their degeneracies fixed (overall scale and phase), or residuals mean nothing.
+    """
+    if np.shape(true) != (2, frequency.size) or np.shape(recovered) != (2, frequency.size):
+        raise ValueError(
+            f"gains have shapes {np.shape(true)} and {np.shape(recovered)}, expected two antennas and "
+            f"{frequency.size} channels"
+        )
+    ratio = true[0] * np.conj(true[1]) / (recovered[0] * np.conj(recovered[1])) - 1
+    spectra = (in_two_domains(frequency, values) for values in (true, recovered, true - recovered, ratio))
+    return GainComparison(antennas, *spectra)
+
+
+@style.journal_style()
+def draw_gains(comparison: GainComparison, stand_ins: Sequence[str] = ()) -> Figure:
+    """Draw real parts against frequency (left) and transforms' amplitudes against delay (right).
+
+    True gains are solid, recovered dashed, residuals dotted; the gain-correction ratio is black and dotted.
+    """
+    figure, (*gains, residuals), delays = frequency_and_delay(rows=3)
+    for index, (bright, dark) in enumerate(ANTENNA_COLOURS):
+        axes = gains[index]
+        _draw_both(axes, delays, comparison.true, index, {"color": bright, "linestyle": "-", "linewidth": 0.9})
+        _draw_both(axes, delays, comparison.recovered, index, {"color": dark, "linestyle": "--", "linewidth": 0.7})
+        _draw_both(residuals, delays, comparison.residual, index, {"color": bright, "linestyle": ":", "linewidth": 1.0})
+        axes.set_ylabel(rf"Re $g_{{{comparison.antennas[index]}}}$")
+    ratio = comparison.correction
+    black = {"color": style.BLACK, "linestyle": ":"}
+    residuals.plot(ratio.frequency / 1e6, ratio.values.real, **black)
+    delays.plot(ratio.delay * 1e9, np.abs(ratio.transform), **black)
+    residuals.set_ylabel("Re residual")
+    delay_panel(delays, comparison.true.delay, r"$|\widetilde{g}(\tau)|$")
+    _add_legend(figure, comparison.antennas)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: dict[str, Any]) -> None:
+    axes.plot(spectra.frequency / 1e6, spectra.values[index].real, **look)
+    delays.plot(spectra.delay * 1e9, np.abs(spectra.transform[index]), **look)
+
+
+def _add_legend(figure: Figure, antennas: tuple[int, int]) -> None:
+    handles = []
+    for number, (bright, dark) in zip(antennas, ANTENNA_COLOURS, strict=True):
+        for colour, line, label in ((bright, "-", "true"), (dark, "--", "recovered"), (bright, ":", "residual")):
+            handles.append(Line2D([], [], color=colour, linestyle=line, label=rf"$g_{{{number}}}$ {label}"))
+    a, b = antennas
+    ratio = rf"$g_{{{a}}}g_{{{b}}}^*/(\hat{{g}}_{{{a}}}\hat{{g}}_{{{b}}}^*)-1$"
+    handles.append(Line2D([], [], color=style.BLACK, linestyle=":", label=ratio))
+    figure.legend(handles=handles, loc="outside upper center", ncols=7, columnspacing=1.1)

@@ -1,0 +1,221 @@
+"""Spherical power spectra of one array (the paper's Figs. SPHERICAL and SPHERICAL_LOW_SNR)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, StrMethodFormatter
+
+from calstudy.figures import style
+
+if TYPE_CHECKING:
+    from calstudy.power.spherical import SphericalSpectrum
+
+SIGMAS_95 = 1.96
+"""Half-width of a 95 % interval, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class SphericalColumn:
+    """The spherical spectra of one column: one array, one choice of Fourier modes.
+
+    Attributes
+    ----------
+    title
+        What is averaged, or which array.
+    eor
+        P^S with the sample variance as its error: the grey band.
+    uncorrupted
+        P^{S+F+N}, perfect gains.
+    uncalibrated
+        P^V, corrupted by gain errors.
+    residual
+        P^R, the calibrated residual.
+    residual_without_eor
+        P^R of a simulation of foregrounds and noise only.
+    noise
+        P^N, thermal noise only.
+    """
+
+    title: str
+    eor: SphericalSpectrum
+    uncorrupted: SphericalSpectrum | None = None
+    uncalibrated: SphericalSpectrum | None = None
+    residual: SphericalSpectrum | None = None
+    residual_without_eor: SphericalSpectrum | None = None
+    noise: SphericalSpectrum | None = None
+
+
+class Marking(NamedTuple):
+    """How one series is drawn; `shift` moves it sideways by that part of a bin, to uncover what it would hide."""
+
+    label: str
+    marker: str
+    colour: str
+    size: float
+    shift: float = 0.0
+
+
+MARKINGS = {
+    "uncorrupted": Marking(r"$P^{S+F+N}$", "o", style.BLACK, 2.8),
+    "uncalibrated": Marking(r"$P^{V}$", "D", style.RED, 2.5),
+    "noise": Marking(r"$P^{N}$", "o", style.MAGENTA, 2.6, -0.15),
+    "residual_without_eor": Marking(r"$P^{R}$, no EoR", "s", style.CYAN, 2.4, 0.15),
+    "residual": Marking(r"$P^{R}$", "s", style.ORANGE, 2.8),
+}
+"""Series in the order in which they are drawn, the later over the earlier."""
+LEGEND_ORDER = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "noise")
+ZOOMED = ("residual", "residual_without_eor", "noise")
+
+
+@style.journal_style()
+def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stand_ins: Sequence[str] = ()) -> Figure:
+    """Draw spherical power spectra: full range above, signal and residuals enlarged below.
+
+    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ.
+
+    Parameters
+    ----------
+    columns
+        One or two, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone
+        (Fig. SPHERICAL_LOW_SNR). Power in mK² h⁻³ Mpc³, k in h/Mpc.
+    zoom_k
+        Upper end of the lower row's k axis, h/Mpc.
+    stand_ins
+        See `calstudy.figures.style.note_stand_ins`.
+
+    Raises
+    ------
+    ValueError
+        If there are not one or two columns, a spectrum has no power at all, or a power has no error bar.
+    """
+    if len(columns) not in (1, 2):
+        raise ValueError(f"a spherical figure has 1 or 2 columns, not {len(columns)}")
+    for column in columns:
+        _check(column)
+    width = style.ONE_COLUMN if len(columns) == 1 else style.TWO_COLUMNS
+    figure = style.new_figure(width, 5.6)
+    figure.get_layout_engine().set(hspace=0.02, wspace=0.02)
+    grid = figure.subplots(2, len(columns), sharex="row", sharey="row", squeeze=False)
+    for top, bottom, column in zip(*grid, columns, strict=True):
+        _draw_column(top, column, tuple(MARKINGS))
+        _draw_column(bottom, column, ZOOMED)
+        top.set_title(column.title)
+        bottom.set_xlabel(style.WAVENUMBER)
+    first, last = _k_limits(columns)
+    zoomed_last = min(last, zoom_k)
+    for row, ylim, end in zip(grid, (_full_limits(columns), _zoom_limits(columns)), (last, zoomed_last), strict=True):
+        row[0].set(xscale="log", yscale="log", ylim=ylim, xlim=(first, end))
+        row[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
+        row[0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        row[0].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    _add_legend(figure, columns)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _check(column: SphericalColumn) -> None:
+    for name in ("eor", *MARKINGS):
+        spectrum = getattr(column, name)
+        if spectrum is None:
+            continue
+        finite = np.isfinite(spectrum.power.real)
+        if not finite.any():
+            raise ValueError(f"column '{column.title}': no power of '{name}' is finite")
+        if not np.isfinite(spectrum.error[finite]).all():
+            raise ValueError(f"column '{column.title}': '{name}' has power without an error bar")
+
+
+def _draw_column(axes: Axes, column: SphericalColumn, names: Sequence[str]) -> None:
+    eor = column.eor
+    finite = np.isfinite(eor.power.real)
+    power, half = eor.power.real[finite], SIGMAS_95 * eor.error[finite]
+    axes.fill_between(eor.k[finite], power - half, power + half, color=style.BAND, linewidth=0, zorder=0, label="eor")
+    axes.plot(eor.k[finite], power, color=style.GREY, linewidth=0.7, zorder=1)
+    for name in names:
+        spectrum = getattr(column, name)
+        if spectrum is not None:
+            _draw_series(axes, spectrum, name)
+
+
+def _draw_series(axes: Axes, spectrum: SphericalSpectrum, name: str) -> None:
+    marking = MARKINGS[name]
+    power = spectrum.power.real
+    k = _shifted(spectrum, marking.shift)
+    for negative in (False, True):
+        chosen = np.isfinite(power) & ((power < 0) == negative)
+        axes.errorbar(
+            k[chosen],
+            np.abs(power[chosen]),
+            yerr=SIGMAS_95 * spectrum.error[chosen],
+            fmt=marking.marker,
+            color=marking.colour,
+            markersize=marking.size,
+            markerfacecolor="white" if negative else marking.colour,
+            ecolor=(marking.colour, 0.55),
+            elinewidth=0.7,
+            zorder=2 + list(MARKINGS).index(name),
+            label=f"{name}, {'negative' if negative else 'positive'}",
+        )
+
+
+def _present(columns: Sequence[SphericalColumn], names: Sequence[str]) -> list[SphericalSpectrum]:
+    spectra = [getattr(column, name) for column in columns for name in names]
+    return [spectrum for spectrum in spectra if spectrum is not None]
+
+
+def _magnitudes(spectra: Sequence[SphericalSpectrum]) -> np.ndarray:
+    values = np.abs(np.concatenate([spectrum.power.real for spectrum in spectra]))
+    return values[np.isfinite(values) & (values > 0)]
+
+
+def _full_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
+    """Return limits that hold all but the faintest few points, which are noise about zero."""
+    values = _magnitudes(_present(columns, ("eor", *MARKINGS)))
+    return 0.5 * float(np.quantile(values, 0.02)), 4 * float(values.max())
+
+
+def _zoom_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
+    """Return limits from below the noise to above the EoR and the bulk of the residuals."""
+    low = min(np.median(_magnitudes([spectrum])) for spectrum in _present(columns, ("eor", *ZOOMED)))
+    bands = [column.eor.power.real + SIGMAS_95 * column.eor.error for column in columns]
+    residuals = [np.quantile(_magnitudes([item]), 0.98) for item in _present(columns, ("residual",))]
+    return 0.1 * float(low), 2 * float(max(*(np.nanmax(band) for band in bands), *residuals, low))
+
+
+def _shifted(spectrum: SphericalSpectrum, shift: float) -> np.ndarray:
+    return spectrum.k + shift * np.diff(spectrum.bin_edges)
+
+
+def _k_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
+    """Return limits that hold all drawn points, the shifted ones too."""
+    reach = max(abs(marking.shift) for marking in MARKINGS.values())
+    spectra = [(item, np.isfinite(item.power.real)) for item in _present(columns, ("eor", *MARKINGS))]
+    first = min(_shifted(item, -reach)[finite].min() for item, finite in spectra if finite.any())
+    last = max(_shifted(item, reach)[finite].max() for item, finite in spectra if finite.any())
+    return 0.85 * float(first), 1.1 * float(last)
+
+
+def _add_legend(figure: Figure, columns: Sequence[SphericalColumn]) -> None:
+    handles: list[Line2D | tuple[Patch, Line2D]] = []
+    labels: list[str] = []
+    for name in LEGEND_ORDER:
+        if _present(columns, (name,)):
+            marking = MARKINGS[name]
+            shape = {"marker": marking.marker, "color": marking.colour, "markersize": marking.size + 0.8}
+            handles.append(Line2D([], [], linestyle="none", **shape))
+            labels.append(marking.label)
+    handles.append((Patch(color=style.BAND), Line2D([], [], color=style.GREY, linewidth=0.7)))
+    labels.append(r"$P^{S}$, 95% sample variance")
+    open_marker = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
+    handles.append(Line2D([], [], linestyle="none", **open_marker))
+    labels.append(r"open: $P < 0$")
+    spacing = {"columnspacing": 1.0, "handletextpad": 0.3}
+    figure.legend(handles, labels, loc="outside upper center", ncols=7 if len(columns) == 2 else 3, **spacing)

@@ -1,0 +1,206 @@
+"""Cylindrical power spectra of five data sets (the paper's Fig. WEDGE)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator
+
+from calstudy.figures import style
+from calstudy.figures.domains import horizon_delay
+
+if TYPE_CHECKING:
+    from calstudy.power.wedge import WedgeSpectrum
+
+# Yellow against blue: signs stay apart for every kind of colour vision, and both darken with |P|.
+POSITIVE = LinearSegmentedColormap.from_list(
+    "positive power", ["#fffbe0", "#fbd65c", "#ee8a1e", "#c23a2b", "#76134f", "#1d0b2e"]
+)
+NEGATIVE = LinearSegmentedColormap.from_list("negative power", ["#e3f1fb", "#7fbfe8", "#2b7bbd", "#0b3a75"])
+EMPTY = "0.8"
+
+
+@dataclass(frozen=True)
+class WedgePanels:
+    """The five cylindrical spectra, of the same delays.
+
+    Attributes
+    ----------
+    uncorrupted
+        P^{S+N+F}, EoR, noise and foregrounds with perfect gains.
+    uncalibrated
+        P^V, the same corrupted by gain errors.
+    residual
+        P^R, the calibrated residual.
+    eor
+        P^S, EoR alone.
+    noise
+        P^N, thermal noise alone.
+    """
+
+    uncorrupted: WedgeSpectrum
+    uncalibrated: WedgeSpectrum
+    residual: WedgeSpectrum
+    eor: WedgeSpectrum
+    noise: WedgeSpectrum
+
+
+TITLES = {
+    "uncorrupted": r"$P^{S+N+F}$",
+    "uncalibrated": r"$P^{V}$",
+    "residual": r"$P^{R}$",
+    "eor": r"$P^{S}$",
+    "noise": r"$P^{N}$",
+}
+
+
+@style.journal_style()
+def draw_wedge(
+    panels: WedgePanels, buffer: float = 100e-9, max_delay: float | None = 2e-6, stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw the real parts of five cylindrical power spectra on one scale of colours, negative values in blue.
+
+    Parameters
+    ----------
+    panels
+        Spectra with strictly increasing baseline lengths and delays >= 0, power in mK² h⁻³ Mpc³.
+    buffer
+        The dashed line is this delay above the horizon, seconds.
+    max_delay
+        Upper end of the delay axis, seconds; all delays if None or larger than those.
+    stand_ins
+        See `calstudy.figures.style.note_stand_ins`.
+
+    Raises
+    ------
+    ValueError
+        If the axes of a spectrum are not increasing or do not match its power, or the delays of two spectra differ.
+    """
+    spectra = {name: getattr(panels, name) for name in TITLES}
+    for name, spectrum in spectra.items():
+        _check(name, spectrum, panels.uncorrupted.delay)
+    floor, highest, lowest = _colour_limits(spectra.values())
+    norms = (LogNorm(floor, highest), LogNorm(floor, lowest))
+    figure = style.new_figure(style.TWO_COLUMNS, 3.5)
+    figure.get_layout_engine().set(wspace=0.02, w_pad=0.02)
+    grid = figure.subplots(1, len(spectra), sharey=True)
+    for axes, (name, spectrum) in zip(grid, spectra.items(), strict=True):
+        _draw_power(axes, spectrum, norms)
+        _draw_horizon(axes, spectrum, buffer)
+        _label_axes(axes, spectrum, max_delay)
+        axes.set_title(TITLES[name], pad=4)
+    grid[0].set_ylabel(style.K_PARALLEL)
+    _delay_axis(grid[-1], spectra["noise"])
+    grid[0].legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
+    _colour_bars(figure, grid, norms)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _check(name: str, spectrum: WedgeSpectrum, delay: np.ndarray) -> None:
+    shape = (len(spectrum.baseline_length), len(spectrum.delay))
+    if spectrum.power.shape != shape:
+        raise ValueError(f"wedge panel '{name}': power has shape {spectrum.power.shape}, its axes need {shape}")
+    for axis, values in (("baseline_length", spectrum.baseline_length), ("delay", spectrum.delay)):
+        if len(values) < (2 if axis == "delay" else 1) or not (np.diff(values) > 0).all() or values[0] < 0:
+            raise ValueError(f"wedge panel '{name}': {axis} is not strictly increasing from 0 or more")
+    if not np.array_equal(spectrum.delay, delay):
+        raise ValueError(f"wedge panel '{name}': its delays differ from those of 'uncorrupted'")
+
+
+def _colour_limits(spectra: Iterable[WedgeSpectrum]) -> tuple[float, float, float]:
+    """Return the least |P| with a colour of its own, the largest P and the largest -P, in whole decades.
+
+    The least is where a tenth of the faintest panel's values lie below.
+    """
+    panels = [spectrum.power.real[np.isfinite(spectrum.power.real)] for spectrum in spectra]
+    faintest = min((np.quantile(np.abs(panel[panel != 0]), 0.1) for panel in panels if panel.any()), default=1.0)
+    floor = 10.0 ** np.floor(np.log10(faintest))
+    tops = [max(np.max(sign * panel, initial=10 * floor) for panel in panels) for sign in (1, -1)]
+    highest, lowest = (10.0 ** np.ceil(np.log10(top)) for top in tops)
+    return floor, highest, lowest
+
+
+def _length_cells(spectrum: WedgeSpectrum) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges (M + 1,) in m of contiguous cells, and which of them each bin of lengths fills, (Nb,) int.
+
+    Cells between bins that are not adjacent hold no baselines.
+    """
+    edges = np.unique(spectrum.bin_edges)
+    return edges, np.searchsorted(edges, spectrum.bin_edges[:, 0])
+
+
+def _delay_edges(centres: np.ndarray) -> np.ndarray:
+    """Return the (N + 1,) edges halfway between (N,) increasing centres >= 0; none is below 0."""
+    middle = (centres[1:] + centres[:-1]) / 2
+    return np.concatenate([[max(2 * centres[0] - middle[0], 0.0)], middle, [2 * centres[-1] - middle[-1]]])
+
+
+def _draw_power(axes: Axes, spectrum: WedgeSpectrum, norms: tuple[LogNorm, LogNorm]) -> None:
+    lengths, filled = _length_cells(spectrum)
+    power = np.full((spectrum.delay.size, lengths.size - 1), np.nan)
+    power[:, filled] = spectrum.power.real.T
+    x, y = lengths * _ratio(spectrum.k_perp, spectrum.baseline_length), _delay_edges(spectrum.k_parallel)
+    axes.set_facecolor(EMPTY)
+    for sign, norm, colours in ((1, norms[0], POSITIVE), (-1, norms[1], NEGATIVE)):
+        drawn = power >= 0 if sign > 0 else power < 0
+        signed = np.ma.masked_where(~drawn, sign * power)
+        # Fainter than the scale, exact zeros included, is not missing: it has the lowest colour.
+        axes.pcolormesh(x, y, np.ma.maximum(signed, norm.vmin), norm=norm, cmap=colours, rasterized=True)
+
+
+def _draw_horizon(axes: Axes, spectrum: WedgeSpectrum, buffer: float) -> None:
+    lengths = spectrum.bin_edges[[0, -1], [0, 1]]
+    k_perp = lengths * _ratio(spectrum.k_perp, spectrum.baseline_length)
+    per_second = _ratio(spectrum.k_parallel, spectrum.delay)
+    for extra, line, label in ((0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")):
+        edge = (horizon_delay(lengths) + extra) * per_second
+        axes.plot(k_perp, edge, line, color="black", linewidth=0.8, label=label)
+
+
+def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> float:
+    """Return the constant factor between two proportional axes."""
+    return float(numerator[-1] / denominator[-1])
+
+
+def _label_axes(axes: Axes, spectrum: WedgeSpectrum, max_delay: float | None) -> None:
+    metres = _ratio(spectrum.baseline_length, spectrum.k_perp)
+    shortest, longest = spectrum.bin_edges[[0, -1], [0, 1]]
+    top = _delay_edges(spectrum.k_parallel)[-1]
+    if max_delay is not None:
+        top = min(top, max_delay * _ratio(spectrum.k_parallel, spectrum.delay))
+    axes.set(xlim=(shortest / metres, longest / metres), ylim=(0, top), xlabel=style.K_PERPENDICULAR)
+    axes.tick_params(which="both", top=False, right=False, direction="out")
+    axes.locator_params(axis="x", nbins=3)
+    lengths = axes.secondary_xaxis("top", functions=(lambda k: k * metres, lambda b: b / metres))
+    lengths.set_xlabel(style.BASELINE_LENGTH, fontsize=style.SMALL_SIZE, labelpad=2)
+    lengths.tick_params(direction="out", labelsize=style.SMALL_SIZE, pad=1)
+    lengths.xaxis.set_major_locator(MaxNLocator(nbins=3))
+
+
+def _delay_axis(axes: Axes, spectrum: WedgeSpectrum) -> None:
+    per_nanosecond = _ratio(spectrum.k_parallel, spectrum.delay) * 1e-9
+    delays = axes.secondary_yaxis("right", functions=(lambda k: k / per_nanosecond, lambda t: t * per_nanosecond))
+    delays.set_ylabel(style.DELAY)
+    delays.tick_params(direction="out")
+
+
+def _colour_bars(figure: Figure, grid: np.ndarray, norms: tuple[LogNorm, LogNorm]) -> None:
+    columns = len(grid) - 2
+    settings = {"location": "bottom", "aspect": 30, "pad": 0.03, "fraction": 0.05}
+    for norm, colours, shared, label in (
+        (norms[0], POSITIVE, grid[:columns], rf"$P > 0$ ({style.POWER_UNIT})"),
+        (norms[1], NEGATIVE, grid[columns:], rf"$-P$ where $P < 0$ ({style.POWER_UNIT})"),
+    ):
+        bar = figure.colorbar(ScalarMappable(norm, colours), ax=list(shared), **settings)
+        bar.ax.xaxis.set_major_locator(LogLocator(numticks=8))
+        bar.ax.xaxis.set_minor_locator(LogLocator(numticks=99))
+        bar.ax.tick_params(which="both", direction="out")
+        bar.set_label(label, labelpad=2)

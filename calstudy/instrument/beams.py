@@ -1,0 +1,203 @@
+"""Primary beams: efield beams for the simulators, and the solid angles that power spectra need.
+
+Throughout, A(θ, φ) = |J_az|² + |J_za|² of a feed is the power beam, one at the zenith (where all beams here peak);
+a visibility is V_xx = ½ ∫ A I exp(−2πi ν b·s/c) dΩ.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from pyuvdata import UVBeam
+from pyuvdata.analytic_beam import AiryBeam, AnalyticBeam, GaussianBeam, ShortDipoleBeam
+from scipy.constants import speed_of_light
+from scipy.interpolate import CubicSpline
+
+from calstudy.instrument import settings as section
+from calstudy.instrument.tabulated import TabulatedBeam, read_beamfits, read_mwa_embedded_element
+
+FEEDS = {"xx": 0, "yy": 1}
+ZENITH_ANGLES = np.linspace(0, np.pi / 2, 361)
+AZIMUTHS = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+STAND_IN = "beam: {what}, not the MWA full embedded element of Sokolowski et al. (2017)"
+
+TILE_DIPOLES = 4
+TILE_SPACING = 1.1
+# Height of the bow-tie's centre above its image plane.
+TILE_HEIGHT = 0.278
+
+
+class Beam(Protocol):
+    """What an antenna sees of the sky, the same for all antennas.
+
+    Attributes
+    ----------
+    name
+        Which beam it is.
+    stand_in
+        A sentence if it is not the beam of the paper, otherwise None.
+    """
+
+    name: str
+    stand_in: str | None
+
+    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
+        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)), feeds x (east-west) and y (north-south)."""
+
+    def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return Ω_p = ∫A dΩ and Ω_pp = ∫A² dΩ above the horizon, in sr, each of shape (Nfreqs,).
+
+        `frequencies` are in Hz; `polarization` is "xx" or "yy".
+        """
+
+
+class MwaTile(AnalyticBeam):
+    """An ideal 4 x 4 MWA tile pointed at zenith.
+
+    Short dipoles, east-west and north-south, 1.1 m apart and 0.278 m above an infinite conducting ground screen,
+    without mutual coupling. It is chromatic, and one at zenith. An analytic beam rather than a table: it is evaluated
+    exactly at every source and frequency.
+    """
+
+    basis_vector_type = "az_za"
+
+    def _efield_eval(self, *, az_grid: np.ndarray, za_grid: np.ndarray, f_grid: np.ndarray) -> np.ndarray:
+        """Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
+        wavenumber = 2 * np.pi * f_grid / speed_of_light
+        east = np.sin(za_grid) * np.cos(az_grid)
+        north = np.sin(za_grid) * np.sin(az_grid)
+        screen = np.sin(wavenumber * TILE_HEIGHT * np.cos(za_grid)) / np.sin(wavenumber * TILE_HEIGHT)
+        gain = screen * _row_factor(wavenumber * east) * _row_factor(wavenumber * north)
+        jones = self._get_empty_data_array(az_grid.shape)
+        jones[0, self.east_ind] = -np.sin(az_grid) * gain
+        jones[0, self.north_ind] = np.cos(az_grid) * gain
+        jones[1, self.east_ind] = np.cos(za_grid) * np.cos(az_grid) * gain
+        jones[1, self.north_ind] = np.cos(za_grid) * np.sin(az_grid) * gain
+        return jones
+
+
+def _row_factor(wavenumber: np.ndarray) -> np.ndarray:
+    """Array factor of one row of dipoles for a wavenumber along it, one at zenith."""
+    offsets = TILE_SPACING * (np.arange(TILE_DIPOLES) - (TILE_DIPOLES - 1) / 2)
+    return sum(np.cos(wavenumber * offset) for offset in offsets) / TILE_DIPOLES
+
+
+class ExactBeam:
+    """A beam with a formula, evaluated where it is asked for (`Beam`)."""
+
+    def __init__(self, analytic: AnalyticBeam, name: str, stand_in: str) -> None:
+        self.name = name
+        self.stand_in = stand_in
+        self._analytic = analytic
+
+    def at(self, frequencies: np.ndarray) -> AnalyticBeam:
+        """Return the analytic efield beam; it holds at any frequency (Hz)."""
+        return self._analytic
+
+    def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return Ω_p and Ω_pp in sr, each of shape (Nfreqs,); see `Beam`."""
+        azimuth, zenith_angle = (grid.ravel() for grid in np.meshgrid(AZIMUTHS, ZENITH_ANGLES))
+        angles = []
+        for frequency in frequencies:
+            jones = self._analytic.efield_eval(
+                az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency], dtype=float)
+            )
+            power = (np.abs(jones[:, FEEDS[polarization], 0]) ** 2).sum(axis=0)
+            angles.append(integrate_power(power.reshape(len(ZENITH_ANGLES), len(AZIMUTHS)), ZENITH_ANGLES))
+        return tuple(np.array(angles).T)
+
+
+class GriddedBeam:
+    """A beam known on a grid of directions and frequencies (`Beam`).
+
+    Attributes
+    ----------
+    fit_error
+        Largest difference of a Jones component from the tabulated one, over all tabulated directions and frequencies
+        of the band, relative to the zenith; what part of it is the table's own scatter, only a smooth fit can show.
+    """
+
+    def __init__(self, table: TabulatedBeam, name: str, stand_in: str | None) -> None:
+        self.name = name
+        self.stand_in = stand_in
+        self.fit_error = table.fit_error
+        self._table = table
+
+    def at(self, frequencies: np.ndarray) -> UVBeam:
+        """Return the efield beam tabulated at `frequencies` (Hz, shape (Nfreqs,)).
+
+        Raises
+        ------
+        InputError
+            If a frequency is outside the band for which the beam was made.
+        """
+        return self._table.at(frequencies)
+
+    def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return Ω_p and Ω_pp in sr, each of shape (Nfreqs,); see `Beam`."""
+        zenith_angle = self._table.zenith_angles
+        angles = []
+        for frequency in frequencies:
+            jones = self._table.jones(np.array([frequency], dtype=float))[:, FEEDS[polarization], 0]
+            angles.append(integrate_power((np.abs(jones) ** 2).sum(axis=0), zenith_angle))
+        return tuple(np.array(angles).T)
+
+
+def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> tuple[float, float]:
+    """Return ∫A dΩ and ∫A² dΩ above the horizon, in sr.
+
+    Parameters
+    ----------
+    power
+        A on a grid of zenith angles and equally spaced azimuths, shape (Nza, Naz).
+    zenith_angles
+        In radians, increasing from 0, shape (Nza,).
+    """
+    horizon = min(np.pi / 2, zenith_angles[-1])
+    rings = [2 * np.pi * np.sin(zenith_angles) * values.mean(axis=1) for values in (power, power**2)]
+    first, second = (float(CubicSpline(zenith_angles, ring).integrate(0, horizon)) for ring in rings)
+    return first, second
+
+
+def make_beam(settings: section.Beam, channels: section.Channels | None = None) -> Beam:
+    """Return the beam that the `instrument.beam` section asks for.
+
+    Parameters
+    ----------
+    settings
+        Any kind of beam section.
+    channels
+        The channels to be observed, the paper's by default: tabulated beams are read and fitted over a band a bit
+        wider than theirs, and refuse frequencies outside it.
+
+    Raises
+    ------
+    InputError
+        If a beam file is missing, cannot be read, or does not cover the channels.
+    """
+    channels = section.Channels() if channels is None else channels
+    band = (channels.first, channels.first + (channels.count - 1) * channels.width)
+    if isinstance(settings, section.MwaEmbeddedBeam):
+        table = read_mwa_embedded_element(settings.path, band)
+        return GriddedBeam(TabulatedBeam(table, band, settings.interpolation), settings.kind, None)
+    if isinstance(settings, section.FileBeam):
+        table = TabulatedBeam(read_beamfits(settings.path), band, settings.interpolation)
+        return GriddedBeam(table, settings.path.name, STAND_IN.format(what=f"the file {settings.path.name}"))
+    return _exact(settings)
+
+
+def _exact(settings: section.Beam) -> ExactBeam:
+    if isinstance(settings, section.MwaAnalyticBeam):
+        return ExactBeam(MwaTile(), settings.kind, STAND_IN.format(what="an ideal 4 x 4 tile of short dipoles"))
+    if isinstance(settings, section.GaussianBeam):
+        # Half power at half the FWHM; the efield's sigma, for pyuvdata widens a power sigma again at every copy.
+        sigma = np.deg2rad(settings.fwhm_deg) / 2 / np.sqrt(np.log(2))
+        gaussian = GaussianBeam(
+            sigma=sigma, sigma_type="efield", spectral_index=-1.0, reference_frequency=settings.reference_frequency
+        )
+        return ExactBeam(gaussian, settings.kind, STAND_IN.format(what=f"a Gaussian of {settings.fwhm_deg:g}° FWHM"))
+    if isinstance(settings, section.AiryBeam):
+        airy = AiryBeam(diameter=settings.diameter)
+        return ExactBeam(airy, settings.kind, STAND_IN.format(what=f"a {settings.diameter:g} m Airy disk"))
+    return ExactBeam(ShortDipoleBeam(), settings.kind, STAND_IN.format(what="a short dipole"))

@@ -1,0 +1,229 @@
+"""Named antenna layouts in local coordinates, and the redundancy of their baselines."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import EarthLocation
+from pyuvdata import utils as uvutils
+
+from calstudy.errors import InputError
+from calstudy.instrument import settings as section
+
+# The array centre of the observatory's own metafits files, given here because astropy looks sites up online.
+MWA_LOCATION = EarthLocation.from_geodetic(
+    lon=116.67081524 * units.deg, lat=-26.70331941 * units.deg, height=377.827 * units.m
+)
+
+CORE_TILES = tuple(
+    f"Tile{receiver:02d}{tile}"
+    for receiver, tiles in (
+        (1, range(1, 9)),
+        (2, range(1, 9)),
+        (3, range(1, 9)),
+        (4, range(1, 9)),
+        (6, range(1, 9)),
+        (8, range(1, 9)),
+        (9, range(1, 9)),
+    )
+    for tile in tiles
+)
+HEX_EAST_TILES = tuple(f"HexE{tile:02d}" for tile in range(1, 37))
+HEX_SOUTH_TILES = tuple(f"HexS{tile:02d}" for tile in range(1, 37))
+COMPACT_TILES = CORE_TILES + HEX_EAST_TILES + HEX_SOUTH_TILES
+MWA_TILES = {
+    "mwa-compact-minredundant": CORE_TILES[:36],
+    "mwa-compact-hex-east": HEX_EAST_TILES,
+    "mwa-compact-hex-south": HEX_SOUTH_TILES,
+    "mwa-compact": COMPACT_TILES,
+}
+
+# Optimal Golomb rulers by order (all their differences are distinct; length proved shortest).
+GOLOMB_MARKS = {
+    2: (0, 1),
+    3: (0, 1, 3),
+    4: (0, 1, 4, 6),
+    5: (0, 1, 4, 9, 11),
+    6: (0, 1, 4, 10, 12, 17),
+    7: (0, 1, 4, 10, 18, 23, 25),
+    8: (0, 1, 4, 9, 15, 22, 32, 34),
+    9: (0, 1, 5, 12, 25, 27, 35, 41, 44),
+    10: (0, 1, 6, 10, 23, 26, 34, 41, 53, 55),
+    11: (0, 1, 4, 13, 28, 33, 47, 54, 64, 70, 72),
+    12: (0, 2, 6, 24, 29, 40, 43, 55, 68, 75, 76, 85),
+}
+ROW_LENGTH = 8
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the antennas of an array stand.
+
+    Attributes
+    ----------
+    name
+        Name of the layout.
+    numbers
+        Antenna numbers, unique, int array of shape (Nants,). Tiles of the MWA keep their place in the 128-tile compact
+        configuration whichever part of it is used.
+    names
+        Antenna names, unique.
+    enu
+        East, north, up in metres about the array centre, float64, shape (Nants, 3).
+    location
+        The array centre.
+    """
+
+    name: str
+    numbers: np.ndarray
+    names: tuple[str, ...]
+    enu: np.ndarray
+    location: EarthLocation
+
+
+@dataclass(frozen=True)
+class RedundantGroups:
+    """Which baselines measure the same thing.
+
+    Attributes
+    ----------
+    index
+        Group of each baseline, int array of shape (Nbls,); groups are numbered by their first baseline.
+    conjugated
+        Whether a baseline points against the first baseline of its group, so that its visibility is the complex
+        conjugate of the group's, bool array of shape (Nbls,).
+    """
+
+    index: np.ndarray
+    conjugated: np.ndarray
+
+
+def make_layout(settings: section.Layout) -> Layout:
+    """Return the antennas that the `instrument.layout` section asks for.
+
+    Parameters
+    ----------
+    settings
+        Any kind of layout section.
+
+    Raises
+    ------
+    InputError
+        If a CSV file is missing or does not hold antenna positions.
+    """
+    if isinstance(settings, section.MwaLayout):
+        return _mwa(settings)
+    if isinstance(settings, section.CsvLayout):
+        return _from_csv(settings.path)
+    return _synthetic(settings.kind, SYNTHETIC[settings.kind](settings))
+
+
+def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
+    """Sort baselines into redundant groups, a baseline and its reverse into the same one.
+
+    Parameters
+    ----------
+    vectors
+        Baseline vectors in metres, shape (Nbls, 3).
+    tolerance
+        Baselines that differ by less than this, in metres, are redundant.
+    """
+    groups, _, _, _ = uvutils.redundancy.get_baseline_redundancies(
+        np.arange(len(vectors)), np.asarray(vectors, dtype=float), tol=tolerance, include_conjugates=True
+    )
+    index = np.empty(len(vectors), dtype=int)
+    conjugated = np.zeros(len(vectors), dtype=bool)
+    for number, members in enumerate(sorted((np.sort(group) for group in groups), key=lambda group: group[0])):
+        index[members] = number
+        conjugated[members] = vectors[members] @ vectors[members[0]] < 0
+    return RedundantGroups(index, conjugated)
+
+
+def _mwa(settings: section.MwaLayout) -> Layout:
+    """Tiles from the observatory positions that pyuvdata carries (ECEF relative to the array centre)."""
+    with (files("pyuvdata") / "data" / "mwa_ant_pos.csv").open() as table:
+        relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
+    tiles = MWA_TILES[settings.kind][: settings.count]
+    centre = np.array([axis.to_value("m") for axis in MWA_LOCATION.geocentric])
+    enu = uvutils.ENU_from_ECEF(centre + [relative[tile] for tile in COMPACT_TILES], center_loc=MWA_LOCATION)
+    # The table's heights are above the ellipsoid, not the array centre (+377.83 m in all of them).
+    enu[:, 2] -= enu[:, 2].mean()
+    numbers = np.array([COMPACT_TILES.index(tile) for tile in tiles])
+    return Layout(settings.kind, numbers, tiles, enu[numbers], MWA_LOCATION)
+
+
+def _synthetic(kind: str, positions: np.ndarray) -> Layout:
+    """Flat array of (east, north) positions, centred on the MWA site."""
+    enu = np.column_stack([positions - positions.mean(axis=0), np.zeros(len(positions))])
+    numbers = np.arange(len(enu))
+    return Layout(kind, numbers, tuple(f"{kind}{number:03d}" for number in numbers), enu, MWA_LOCATION)
+
+
+def _hex(settings: section.HexLayout) -> np.ndarray:
+    rows = []
+    for row in range(1 - settings.side, settings.side):
+        count = 2 * settings.side - 1 - abs(row)
+        east = np.arange(count) - (count - 1) / 2
+        rows.append(np.column_stack([east, np.full(count, row * math.sqrt(3) / 2)]))
+    return settings.spacing * np.concatenate(rows)
+
+
+def _linear(settings: section.LinearLayout) -> np.ndarray:
+    return np.column_stack([settings.spacing * np.arange(settings.count), np.zeros(settings.count)])
+
+
+def _golomb(settings: section.GolombLayout) -> np.ndarray:
+    return np.column_stack([settings.spacing * np.array(GOLOMB_MARKS[settings.count]), np.zeros(settings.count)])
+
+
+def _rectangular(settings: section.RectangularLayout) -> np.ndarray:
+    row, column = np.divmod(np.arange(settings.count), ROW_LENGTH)
+    east = settings.spacing * column
+    first, second = np.triu_indices(settings.count, 1)
+    rows_apart = np.abs(row[first] - row[second])
+    across = np.abs(east[first] - east[second])[rows_apart > 0]
+    # The widest row distance at which no pair of antennas in different rows is farther apart than the limit.
+    distance = np.min(np.sqrt(settings.max_baseline**2 - across**2) / rows_apart[rows_apart > 0])
+    return np.column_stack([east, distance * row])
+
+
+SYNTHETIC: dict[str, Callable[[Any], np.ndarray]] = {
+    "hex": _hex,
+    "linear": _linear,
+    "rectangular": _rectangular,
+    "golomb": _golomb,
+}
+
+
+def _from_csv(path: Path) -> Layout:
+    """Positions, and names and numbers where given, from a CSV file."""
+    if not path.is_file():
+        raise InputError(f"instrument.layout.path: there is no file {path}")
+    with path.open(newline="", encoding="utf-8-sig") as table:
+        rows = list(csv.DictReader(table))
+    columns = set(rows[0]) if rows else set()
+    missing = {"east_m", "north_m", "up_m"} - columns
+    if missing or len(rows) < 2:
+        raise InputError(
+            f"instrument.layout.path: {path} needs at least two rows with columns east_m, north_m, up_m"
+            + (f"; missing: {', '.join(sorted(missing))}" if missing else "")
+        )
+    try:
+        enu = np.array([[float(row[f"{axis}_m"]) for axis in ("east", "north", "up")] for row in rows])
+        numbers = np.array([int(row["number"]) for row in rows]) if "number" in columns else np.arange(len(rows))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"instrument.layout.path: {path} holds an entry that is not a number ({error})") from None
+    names = tuple(row["name"] for row in rows) if "name" in columns else tuple(f"ant{n:03d}" for n in numbers)
+    if len(set(numbers)) < len(rows) or len(set(names)) < len(rows) or numbers.min() < 0:
+        raise InputError(f"instrument.layout.path: antenna numbers (>= 0) and names in {path} must be unique")
+    if not np.isfinite(enu).all():
+        raise InputError(f"instrument.layout.path: positions in {path} must be finite")
+    return Layout(path.stem, numbers, names, enu, MWA_LOCATION)

@@ -1,0 +1,165 @@
+"""The `instrument` section of an experiment file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from calstudy.schema import Section, choice
+from calstudy.units import Frequency, HourAngle, Length, Time
+
+
+class MwaLayout(Section):
+    """Tiles of the MWA Phase II compact configuration (paper §Simulations; Wayth et al. 2018)."""
+
+    kind: Literal["mwa-compact-minredundant", "mwa-compact-hex-east", "mwa-compact-hex-south", "mwa-compact"] = Field(
+        "mwa-compact-minredundant",
+        description="The first 36 tiles of the core, one of the two 36-tile hexagons, or all 128 tiles.",
+    )
+    count: int | None = Field(None, ge=2, description="Keep only the first `count` antennas (all by default).")
+
+    @model_validator(mode="after")
+    def _enough_antennas(self) -> MwaLayout:
+        size = 128 if self.kind == "mwa-compact" else 36
+        if self.count is not None and self.count > size:
+            raise ValueError(f"count = {self.count} is more than the {size} antennas of {self.kind}")
+        return self
+
+
+class HexLayout(Section):
+    """A filled regular hexagon, flat, at the MWA site."""
+
+    kind: Literal["hex"]
+    side: int = Field(4, ge=2, description="Antennas along one side; `side` = 4 gives 37.")
+    spacing: Length = Field(14.0, gt=0, description="Distance between neighbours.")
+
+
+class LinearLayout(Section):
+    """An east-west line of equally spaced antennas (paper Fig. MAXBL_RUNTIME)."""
+
+    kind: Literal["linear"]
+    count: int = Field(10, ge=2)
+    spacing: Length = Field(14.0, gt=0)
+
+
+class RectangularLayout(Section):
+    """Rows of eight antennas, spread so that the longest baseline is `max_baseline` (paper Fig. ANTPOS_RUNTIME)."""
+
+    kind: Literal["rectangular"]
+    count: int = Field(16, ge=9, description="Antennas; nine at least, for there to be two rows.")
+    spacing: Length = Field(2.0, gt=0, description="Distance between neighbours in a row.")
+    max_baseline: Length = Field(100.0, gt=0)
+
+    @model_validator(mode="after")
+    def _rows_fit(self) -> RectangularLayout:
+        if self.max_baseline <= 7 * self.spacing:
+            raise ValueError(
+                f"max_baseline = {self.max_baseline:g} m must exceed the length of a row, 7 x spacing = "
+                f"{7 * self.spacing:g} m"
+            )
+        return self
+
+
+class GolombLayout(Section):
+    """An east-west line at the marks of an optimal Golomb ruler: every baseline is unique."""
+
+    kind: Literal["golomb"]
+    count: int = Field(8, ge=2, le=12, description="Antennas, i.e. marks of the ruler.")
+    spacing: Length = Field(4.0, gt=0, description="Length of one unit of the ruler.")
+
+
+class CsvLayout(Section):
+    """Positions from a CSV file with columns east_m, north_m, up_m and, optionally, name and number."""
+
+    kind: Literal["csv"]
+    path: Path = Field(strict=False, description="CSV file, relative to the experiment file or absolute.")
+
+
+Layout = Annotated[
+    MwaLayout | HexLayout | LinearLayout | RectangularLayout | GolombLayout | CsvLayout,
+    Field(discriminator="kind"),
+    choice("kind", "mwa-compact-minredundant"),
+]
+
+
+class MwaEmbeddedBeam(Section):
+    """The MWA full embedded element beam (Sokolowski et al. 2017), pointed at zenith."""
+
+    kind: Literal["mwa-embedded-element"] = "mwa-embedded-element"
+    path: Path | None = Field(
+        None, strict=False, description="Beam file; by default the one that the mwa_pb package carries."
+    )
+    interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = Field(
+        "chebyshev",
+        description="Between tabulated frequencies, 1.28 MHz apart: a smooth fit, or point to point as in the paper.",
+    )
+
+
+class MwaAnalyticBeam(Section):
+    """An ideal 4 x 4 MWA tile: array factor of short dipoles over a ground screen, pointed at zenith."""
+
+    kind: Literal["mwa-analytic"]
+
+
+class GaussianBeam(Section):
+    """A Gaussian power beam whose width scales with wavelength."""
+
+    kind: Literal["gaussian"]
+    fwhm_deg: float = Field(22.0, gt=0, lt=180, description="Full width at half maximum of the power beam, in degrees.")
+    reference_frequency: Frequency = Field(182.0e6, gt=0, description="Where the width is `fwhm_deg`.")
+
+
+class AiryBeam(Section):
+    """The beam of a uniformly lit circular aperture."""
+
+    kind: Literal["airy"]
+    diameter: Length = Field(4.0, gt=0)
+
+
+class DipoleBeam(Section):
+    """A short dipole."""
+
+    kind: Literal["short-dipole"]
+
+
+class FileBeam(Section):
+    """Any beam that pyuvdata reads from a beamfits file."""
+
+    kind: Literal["beamfits"]
+    path: Path = Field(strict=False)
+    interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = "chebyshev"
+
+
+Beam = Annotated[
+    MwaEmbeddedBeam | MwaAnalyticBeam | GaussianBeam | AiryBeam | DipoleBeam | FileBeam,
+    Field(discriminator="kind"),
+    choice("kind", "mwa-embedded-element"),
+]
+
+
+class Channels(Section):
+    """Equally spaced channel centres; the default is the paper's (384 x 80 kHz from 167.075 MHz)."""
+
+    first: Frequency = Field(167.075e6, gt=0, description="Centre of the first channel.")
+    width: Frequency = Field(80e3, gt=0)
+    count: int = Field(384, ge=8)
+
+
+class Times(Section):
+    """Equally spaced integrations; the default is the paper's (56 x 2 s from LST 1.8 h)."""
+
+    start_lst: HourAngle = Field(1.8, ge=0, lt=24, description="Local sidereal time at the centre of the first one.")
+    integration: Time = Field(2.0, gt=0)
+    count: int = Field(56, ge=1)
+
+
+class InstrumentSettings(Section):
+    """Where the antennas are, what they see, and when and at which frequencies they observe."""
+
+    layout: Layout = MwaLayout()
+    beam: Beam = MwaEmbeddedBeam()
+    channels: Channels = Channels()
+    times: Times = Times()
+    polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(strict=False, min_length=1, max_length=2)] = ("xx",)

@@ -1,0 +1,191 @@
+"""Beams known at tabulated frequencies, made available at any frequency of a band."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from pyuvdata import UVBeam
+from scipy.interpolate import interp1d
+
+from calstudy.errors import InputError
+
+MWA_FILE = "mwa_full_embedded_element_pattern.h5"
+PIXELS_PER_DEGREE = 1
+
+# The tabulated MWA beam scatters from frequency to frequency by 2.4e-5 rms of the zenith value. A polynomial of order 8
+# over 36 MHz is the lowest that leaves no more than that; a higher one would follow the scatter. Narrower observations
+# keep the 36 MHz, so that the beam is as well determined and does not depend on how many channels are simulated.
+FIT_BAND = 36e6
+FIT_ORDER = 8
+FIT_MARGIN = 2.56e6
+POINTS_NEEDED = {"chebyshev": 1, "cubic": 4, "linear": 2, "nearest": 1}
+
+
+def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> UVBeam:
+    """Read the zenith-pointed full embedded element beam of an MWA tile (Sokolowski et al. 2017).
+
+    Parameters
+    ----------
+    path
+        Beam file (HDF5), by default the one in the mwa_pb package.
+    band
+        Lowest and highest frequency of interest in Hz; the margin that a fit needs is read, too.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or is not an MWA beam file of this band.
+    """
+    path = Path(str(files("mwa_pb") / "data" / MWA_FILE)) if path is None else path
+    if not path.is_file():
+        raise InputError(f"instrument.beam.path: there is no file {path}")
+    return _read_mwa(path, *_fit_range(band))
+
+
+@lru_cache(maxsize=2)
+def _read_mwa(path: Path, low: float, high: float) -> UVBeam:
+    try:
+        return UVBeam.from_file(path, file_type="mwa_beam", pixels_per_deg=PIXELS_PER_DEGREE, freq_range=[low, high])
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"instrument.beam.path: {path} cannot be read as an MWA beam file ({error})") from error
+
+
+def read_beamfits(path: Path) -> UVBeam:
+    """Read an efield beam on a grid of azimuth and zenith angle from a beamfits file.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cannot be read, or holds another kind of beam.
+    """
+    if not path.is_file():
+        raise InputError(f"instrument.beam.path: there is no file {path}")
+    try:
+        beam = UVBeam.from_file(path, file_type="beamfits")
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"instrument.beam.path: {path} cannot be read as beamfits ({error})") from error
+    usable = beam.beam_type == "efield" and beam.pixel_coordinate_system == "az_za"
+    if not usable or list(beam.feed_array) not in (["x", "y"], ["x"]) or beam.axis2_array[0] != 0:
+        raise InputError(
+            f"instrument.beam.path: {path} must hold an efield beam of feeds x and y on a grid of azimuth and zenith "
+            f"angle from the zenith; it holds a {beam.beam_type} beam of feeds {beam.feed_array} on "
+            f"{beam.pixel_coordinate_system}"
+        )
+    return beam
+
+
+def _fit_range(band: tuple[float, float]) -> tuple[float, float]:
+    low, high = band[0] - FIT_MARGIN, band[1] + FIT_MARGIN
+    missing = max(0.0, FIT_BAND - (high - low))
+    return low - missing / 2, high + missing / 2
+
+
+class TabulatedBeam:
+    """Jones components on a grid of directions, continuous in frequency.
+
+    Interpolation "chebyshev" fits one smooth polynomial in frequency to all tabulated ones, per direction, feed and
+    component; it is a polynomial in frequency to rounding, and so adds nothing at large delays. "cubic", "linear" and
+    "nearest" go from point to point, as in the paper, and follow the table's scatter.
+
+    The result is divided by its own zenith value, feed by feed. That is a smooth function of frequency, where the
+    largest tabulated value (the maximum over pixels and feeds) need not be, and for these beams it is the peak.
+
+    Attributes
+    ----------
+    zenith_angles
+        In radians, shape (Nza,).
+    fit_error
+        Largest |ΔJ| against the table, relative to the zenith, over directions and the tabulated frequencies of the
+        band, those next to its ends included.
+    """
+
+    def __init__(self, table: UVBeam, band: tuple[float, float], interpolation: str) -> None:
+        low, high = _fit_range(band)
+        chosen = (table.freq_array >= low) & (table.freq_array <= high)
+        tabulated = table.freq_array[chosen]
+        if not chosen.any() or band[0] < tabulated[0] or band[1] > tabulated[-1]:
+            raise InputError(
+                f"instrument.channels: {_megahertz(*band)} is not within the beam file's "
+                f"{_megahertz(table.freq_array[0], table.freq_array[-1])}"
+            )
+        if len(tabulated) < POINTS_NEEDED[interpolation]:
+            raise InputError(
+                f"instrument.beam.interpolation: {interpolation} needs {POINTS_NEEDED[interpolation]} tabulated "
+                f"frequencies near the channels, the beam file has {len(tabulated)}"
+            )
+        self.zenith_angles = table.axis2_array
+        self._table = table
+        self._band = (float(tabulated[0]), float(tabulated[-1]))
+        values = np.moveaxis(table.data_array[:, :, chosen], 2, 0)
+        if interpolation == "chebyshev":
+            self._evaluate = _smooth_fit(tabulated, values)
+        else:
+            self._evaluate = interp1d(tabulated, values, kind=interpolation, axis=0, assume_sorted=True)
+        first, last = np.searchsorted(tabulated, band[0], side="right") - 1, np.searchsorted(tabulated, band[1])
+        reference = _zenith_normalized(np.moveaxis(values[first : last + 1], 0, 2))
+        self.fit_error = float(np.abs(self.jones(tabulated[first : last + 1]) - reference).max())
+
+    def jones(self, frequencies: np.ndarray) -> np.ndarray:
+        """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz."""
+        frequencies = np.asarray(frequencies, dtype=float)
+        low, high = self._band
+        if frequencies.min() < low or frequencies.max() > high:
+            raise InputError(
+                f"frequencies {_megahertz(frequencies.min(), frequencies.max())} are outside the band for which the "
+                f"beam was made, {_megahertz(low, high)}"
+            )
+        return _zenith_normalized(np.moveaxis(self._evaluate(frequencies), 0, 2))
+
+    def at(self, frequencies: np.ndarray) -> UVBeam:
+        """Return the efield beam tabulated at `frequencies` in Hz, shape (Nfreqs,)."""
+        table = self._table
+        return UVBeam.new(
+            telescope_name=table.telescope_name,
+            feed_name=table.feed_name,
+            feed_version=table.feed_version,
+            model_name=table.model_name,
+            model_version=table.model_version,
+            data_normalization="peak",
+            freq_array=np.asarray(frequencies, dtype=float),
+            feed_array=table.feed_array,
+            feed_angle=table.feed_angle,
+            mount_type="fixed",
+            pixel_coordinate_system="az_za",
+            axis1_array=table.axis1_array,
+            axis2_array=table.axis2_array,
+            basis_vector_array=table.basis_vector_array,
+            data_array=np.ascontiguousarray(self.jones(frequencies)),
+            history=table.history,
+        )
+
+
+def _megahertz(low: float, high: float) -> str:
+    return f"{low / 1e6:g} to {high / 1e6:g} MHz"
+
+
+def _zenith_normalized(jones: np.ndarray) -> np.ndarray:
+    """Divide by the square root of the zenith power, per feed and frequency."""
+    zenith = np.sqrt((np.abs(jones[..., 0, 0]) ** 2).sum(axis=0))
+    return jones / zenith[None, :, :, None, None]
+
+
+def _smooth_fit(tabulated: np.ndarray, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of frequencies: the least-squares polynomial through `values` along their first axis."""
+    width = tabulated[-1] - tabulated[0]
+    # Beyond 2 sqrt(n) a polynomial through n equally spaced points swings between them.
+    order = min(
+        max(FIT_ORDER, round(FIT_ORDER * width / FIT_BAND)), int(2 * np.sqrt(len(tabulated))), len(tabulated) - 1
+    )
+    domain = [tabulated[0], tabulated[-1]] if width > 0 else [tabulated[0] - 1, tabulated[0] + 1]
+
+    def basis(frequencies: np.ndarray) -> np.ndarray:
+        scaled = np.polynomial.polyutils.mapdomain(np.asarray(frequencies, dtype=float), domain, [-1, 1])
+        return chebyshev.chebvander(scaled, order)
+
+    coefficients = np.tensordot(np.linalg.pinv(basis(tabulated)), values, axes=1)
+    return lambda frequencies: np.tensordot(basis(frequencies), coefficients, axes=1)

@@ -1,0 +1,152 @@
+"""The observation without its data: a UVData that holds antennas, baselines, times, channels and polarizations."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import EarthLocation
+from astropy.utils import iers
+from pyuvdata import Telescope, UVData
+from pyuvdata import utils as uvutils
+
+from calstudy.instrument.layouts import Layout, make_layout
+from calstudy.instrument.settings import InstrumentSettings
+
+# Noon UTC of 2016 November 15; the observation starts within the sidereal day after it. At the MWA the field of the
+# paper (LST 1.8 h) is then up at night, and the Earth's orientation is known, not predicted.
+REFERENCE_JD = 2457708.0
+SECONDS_PER_DAY = 86400.0
+SIDEREAL_DAY = 0.99726956633
+POLARIZATION_NUMBERS = {"xx": -5, "yy": -6}
+
+
+def use_bundled_earth_orientation() -> None:
+    """Keep astropy from downloading Earth-orientation tables: the bundled ones cover the simulated date.
+
+    Call it in every process that computes sidereal times or source positions.
+    """
+    iers.conf.auto_download = False
+
+
+def make_template(settings: InstrumentSettings, autos: bool = False) -> UVData:
+    """Return the metadata of the simulated observation.
+
+    Baselines are (a, b) with a before b in the layout, ordered by a and then b, all of them at every time, time by
+    time. The telescope drifts (unprojected phase centre); feed x is the east-west dipole, feed y the north-south one.
+    Fluxes are in Jy with the convention V_xx = ½∫A I, i.e. I = XX + YY.
+
+    Parameters
+    ----------
+    settings
+        The `instrument` section.
+    autos
+        Whether to include autocorrelations.
+
+    Returns
+    -------
+    UVData
+        Metadata only: no data, flag or nsample array.
+
+    Raises
+    ------
+    InputError
+        If the layout's file cannot be used.
+    """
+    layout = make_layout(settings.layout)
+    first, second = np.triu_indices(len(layout.numbers), 0 if autos else 1)
+    times, channels = settings.times, settings.channels
+    start = time_of_lst(times.start_lst, layout.location)
+    return _metadata(
+        _telescope(layout),
+        np.column_stack([layout.numbers[first], layout.numbers[second]]),
+        times=start + np.arange(times.count) * times.integration / SECONDS_PER_DAY,
+        frequencies=channels.first + np.arange(channels.count) * channels.width,
+        resolution=(times.integration, channels.width),
+        polarizations=np.array([POLARIZATION_NUMBERS[polarization] for polarization in settings.polarizations]),
+    )
+
+
+def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndarray) -> UVData:
+    """Return the template's observation at other times and frequencies, such as interpolation nodes.
+
+    Parameters
+    ----------
+    template
+        From `make_template`.
+    times_jd
+        Times as Julian dates, shape (Ntimes,).
+    frequencies
+        Frequencies in Hz, shape (Nfreqs,).
+    """
+    return _metadata(
+        template.telescope.copy(),
+        np.column_stack([template.ant_1_array, template.ant_2_array])[: template.Nbls],
+        times=np.asarray(times_jd, dtype=float),
+        frequencies=np.asarray(frequencies, dtype=float),
+        resolution=(template.integration_time[0], template.channel_width[0]),
+        polarizations=template.polarization_array.copy(),
+    )
+
+
+def time_of_lst(lst_hours: float, location: EarthLocation) -> float:
+    """Return the first Julian date after `REFERENCE_JD` at which the apparent sidereal time is `lst_hours`."""
+    use_bundled_earth_orientation()
+    target = lst_hours * np.pi / 12
+    jd = REFERENCE_JD
+    ahead = (target - _lst(jd, location)) % (2 * np.pi)
+    # Nutation makes sidereal time run slightly unevenly: two more rounds bring the error below the JD's own 40 us.
+    for _ in range(3):
+        jd += ahead / (2 * np.pi) * SIDEREAL_DAY
+        ahead = (target - _lst(jd, location) + np.pi) % (2 * np.pi) - np.pi
+    return jd
+
+
+def _lst(jd: float, location: EarthLocation) -> float:
+    return float(uvutils.get_lst_for_time(np.array([jd]), telescope_loc=location)[0])
+
+
+def _telescope(layout: Layout) -> Telescope:
+    centre = np.array([axis.to_value(units.m) for axis in layout.location.geocentric])
+    return Telescope.new(
+        # Not "MWA": pyuvdata fills in what it knows of that name, some of it looked up online.
+        name=f"calstudy {layout.name}",
+        instrument="calstudy",
+        location=layout.location,
+        antenna_positions=uvutils.ECEF_from_ENU(layout.enu, center_loc=layout.location) - centre,
+        antenna_names=list(layout.names),
+        antenna_numbers=layout.numbers,
+        feed_array=["x", "y"],
+        feed_angle=[np.pi / 2, 0.0],
+        mount_type="fixed",
+        update_from_known=False,
+    )
+
+
+def _metadata(
+    telescope: Telescope,
+    antenna_pairs: np.ndarray,
+    times: np.ndarray,
+    frequencies: np.ndarray,
+    resolution: tuple[float, float],
+    polarizations: np.ndarray,
+) -> UVData:
+    """Build the UVData; `resolution` is the integration time in s and the channel width in Hz."""
+    use_bundled_earth_orientation()
+    integration, width = resolution
+    uvd = UVData.new(
+        telescope=telescope,
+        antpairs=antenna_pairs,
+        times=times,
+        freq_array=frequencies,
+        polarization_array=polarizations,
+        integration_time=float(integration),
+        channel_width=float(width),
+        do_blt_outer=True,
+        time_axis_faster_than_bls=False,
+        update_telescope_from_known=False,
+        vis_units="Jy",
+        pol_convention="sum",
+    )
+    # Instead of pyuvdata's own, which holds the time of day: same settings, same template.
+    uvd.history = "calstudy instrument template"
+    return uvd

@@ -1,0 +1,47 @@
+"""Fringe stopping and coherent averaging over a run (paper §Reduction of Simulation Products and Power Spectra)."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy.time import Time
+from pyuvdata import UVData
+
+from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.visibilities import require_rectangular
+
+
+def fringe_stop_and_average(uvd: UVData) -> UVData:
+    """Phase to the zenith at the middle of the run and average all integrations into one.
+
+    Parameters
+    ----------
+    uvd
+        Drift-scan visibilities. Not mutated. Flagged samples do not enter the average; samples weigh by nsamples.
+
+    Returns
+    -------
+    UVData with one integration, phased to the ICRS position of the zenith at the middle of the run, in the same unit
+    and with the baselines in the same order.
+
+    Raises
+    ------
+    ValueError
+        If the data set is not rectangular.
+    """
+    require_rectangular(uvd)
+    use_bundled_earth_orientation()
+    middle = Time((uvd.time_array.min() + uvd.time_array.max()) / 2, format="jd", scale="utc")
+    averaged = uvd.copy()
+    averaged.phase_to_time(middle)
+    if averaged.Ntimes > 1:
+        averaged.downsample_in_time(n_times_to_avg=averaged.Ntimes, allow_drift=False)
+    # pyuvdata sorts by baseline number; bring back the order of the input.
+    averaged.reorder_blts(order=_positions(averaged.baseline_array, uvd.baseline_array[: uvd.Nbls]))
+    averaged.data_array = averaged.data_array.astype(np.complex128, copy=False)
+    return averaged
+
+
+def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Where each of `wanted` is in `values`, both 1D of unique entries."""
+    order = np.argsort(values)
+    return order[np.searchsorted(values, wanted, sorter=order)]

@@ -1,0 +1,103 @@
+"""From baselines and delays to wavenumbers: the one cosmology of a study.
+
+The amplitude of the simulated 21 cm signal and the power spectrum estimator both go through astropy's cosmologies.
+hera_pspec has its own class with its own distances; `hera_conversions` makes one that agrees with astropy.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import astropy.cosmology
+import numpy as np
+from astropy import constants
+from astropy import units as u
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+if TYPE_CHECKING:
+    from astropy.cosmology import FLRW
+    from hera_pspec.conversions import Cosmo_Conversions
+
+HYDROGEN_LINE = 1420.405751e6
+"""Rest frequency of the 21 cm line in Hz, as in hera_pspec."""
+
+
+def make_cosmology(name: str) -> FLRW:
+    """Return astropy's cosmology of this name ("Planck15", "Planck18" or "WMAP9"); raises ValueError for another."""
+    if name not in astropy.cosmology.available:
+        raise ValueError(f"cosmology {name!r} is unknown, allowed: {', '.join(astropy.cosmology.available)}")
+    return getattr(astropy.cosmology, name)
+
+
+def redshift(frequency: float | np.ndarray) -> float | np.ndarray:
+    """Return the redshift at which the 21 cm line is observed at `frequency` (Hz)."""
+    return HYDROGEN_LINE / frequency - 1.0
+
+
+def transverse_scale(cosmology: FLRW, z: float) -> float:
+    """Return X, the transverse comoving distance per angle at redshift `z`, in Mpc/rad."""
+    return float(cosmology.comoving_transverse_distance(z).to_value(u.Mpc))
+
+
+def radial_scale(cosmology: FLRW, z: float) -> float:
+    """Return Y = c (1+z)^2 / (H(z) f21), the line-of-sight comoving distance per frequency at `z`, in Mpc/Hz."""
+    return float((constants.c / cosmology.H(z)).to_value(u.Mpc)) * (1.0 + z) ** 2 / HYDROGEN_LINE
+
+
+def k_perpendicular(cosmology: FLRW, length: np.ndarray, frequency: float) -> np.ndarray:
+    """Return k_perp = 2 pi |b| / (lambda X) in h/Mpc for baseline lengths in m, any shape, at `frequency` (Hz)."""
+    wavelengths = np.asarray(length) * frequency / constants.c.value
+    return 2 * np.pi * wavelengths / transverse_scale(cosmology, redshift(frequency)) / cosmology.h
+
+
+def k_parallel(cosmology: FLRW, delay: np.ndarray, frequency: float) -> np.ndarray:
+    """Return k_par = 2 pi tau / Y in h/Mpc for delays in s, any shape, at the band centre `frequency` (Hz)."""
+    return 2 * np.pi * np.asarray(delay) / radial_scale(cosmology, redshift(frequency)) / cosmology.h
+
+
+def hera_conversions(cosmology: FLRW, z: float) -> Cosmo_Conversions:
+    """Return hera_pspec's cosmology object with astropy's distances around redshift `z`.
+
+    hera_pspec knows matter, curvature and Lambda only, which makes its X^2 Y 0.1 to 0.8 % too large for Planck15
+    because radiation and massive neutrinos are missing, and stores those numbers in its files. Here the matter and
+    Lambda terms are set so that both H(z) and the comoving distance equal astropy's at `z`: *effective* densities,
+    which survive a round trip through HDF5 and describe this redshift, not today.
+
+    Parameters
+    ----------
+    cosmology
+        A flat astropy cosmology.
+    z
+        Redshift at the centre of the band.
+
+    Raises
+    ------
+    ValueError
+        If the cosmology is not flat.
+    """
+    from hera_pspec.conversions import Cosmo_Conversions
+
+    if cosmology.Ok0 != 0.0:
+        raise ValueError(f"cosmology {cosmology.name!r} is curved (Ok0 = {cosmology.Ok0}), allowed: flat cosmologies")
+    dark_energy, matter = _effective_densities(cosmology, z)
+    # Plain floats: hera_pspec writes their repr to HDF5 and cannot read "np.float64(...)" back.
+    baryons = float(cosmology.Ob0)
+    return Cosmo_Conversions(
+        Om_L=dark_energy, Om_b=baryons, Om_c=matter - baryons, Om_M=matter, Om_k=0.0, H0=float(cosmology.H0.value)
+    )
+
+
+def _effective_densities(cosmology: FLRW, z: float) -> tuple[float, float]:
+    """Lambda and matter for which E^2 = Lambda + matter (1+z)^3 has astropy's H and comoving distance at `z`."""
+    expansion = float(cosmology.efunc(z)) ** 2
+    distance = float((cosmology.comoving_distance(z) / cosmology.hubble_distance).decompose().value)
+
+    def matter(dark_energy: float) -> float:
+        return (expansion - dark_energy) / (1 + z) ** 3
+
+    def excess(dark_energy: float) -> float:
+        return quad(lambda x: (dark_energy + matter(dark_energy) * (1 + x) ** 3) ** -0.5, 0.0, z)[0] - distance
+
+    dark_energy = brentq(excess, 0.3, 1.2, xtol=1e-13)
+    return dark_energy, matter(dark_energy)

@@ -1,0 +1,85 @@
+"""The delay transform of visibilities (paper §Reduction of Simulation Products and Power Spectra)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import windows
+
+TAPERS = {
+    "blackman-harris": windows.blackmanharris,
+    "hann": windows.hann,
+    "tukey": windows.tukey,
+    "none": windows.boxcar,
+}
+"""The tapers of `calstudy.power.settings.PowerSettings`."""
+
+
+def make_taper(name: str, n_channels: int) -> np.ndarray:
+    """Return the taper T(nu), shape (n_channels,), peak 1; raises ValueError for an unknown name."""
+    if name not in TAPERS:
+        raise ValueError(f"taper {name!r} is unknown, allowed: {', '.join(TAPERS)}")
+    return TAPERS[name](n_channels)
+
+
+def delays(n_channels: int, channel_width: float) -> np.ndarray:
+    """Return the delays in s of a band of channels `channel_width` Hz wide, ascending, shape (n_channels,)."""
+    return np.fft.fftshift(np.fft.fftfreq(n_channels, d=channel_width))
+
+
+def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: str, axis: int = -1) -> np.ndarray:
+    """Transform visibilities from frequency to delay.
+
+    V~(tau) = dnu sum_nu exp(2 pi i tau nu) V(nu) T(nu) (paper, third equation of §Reduction of Simulation Products).
+
+    Parameters
+    ----------
+    visibilities
+        Complex, any shape with frequency along `axis`, in Jy.
+    frequencies
+        Equally spaced ascending channel centres in Hz, shape (Nfreqs,).
+    taper
+        Name of the taper, see `TAPERS`.
+    axis
+        The frequency axis, replaced by delay in the order of `delays`.
+
+    Returns
+    -------
+    Complex array of the same shape, in Jy Hz.
+
+    Raises
+    ------
+    ValueError
+        If the frequencies do not match the axis or are not equally spaced, or the taper is unknown.
+    """
+    visibilities = np.moveaxis(np.asarray(visibilities), axis, -1)
+    n_channels = frequencies.size
+    if visibilities.shape[-1] != n_channels:
+        raise ValueError(f"visibilities have {visibilities.shape[-1]} channels, frequencies {n_channels}")
+    width = channel_width(frequencies)
+    transform = np.fft.ifft(visibilities * make_taper(taper, n_channels), axis=-1) * (n_channels * width)
+    transform = np.fft.fftshift(transform, axes=-1)
+    transform *= np.exp(2j * np.pi * delays(n_channels, width) * frequencies[0])
+    return np.moveaxis(transform, -1, axis)
+
+
+def channel_width(frequencies: np.ndarray) -> float:
+    """Return the spacing in Hz of `frequencies` (Nfreqs,); raises ValueError unless equally spaced and ascending."""
+    steps = np.diff(frequencies)
+    if steps.size == 0 or steps[0] <= 0 or not np.allclose(steps, steps[0], rtol=1e-6):
+        raise ValueError("frequencies must be at least two equally spaced ascending channels")
+    return float((frequencies[-1] - frequencies[0]) / steps.size)
+
+
+def mode_correlation(taper: str, n_channels: int) -> np.ndarray:
+    """Return how the powers of two delays of one baseline correlate, for white Gaussian data.
+
+    A taper T mixes neighbouring delays: V~(tau) and V~(tau + m/B) have the correlation sum T^2 exp(2 pi i m n / N) over
+    sum T^2, and the powers, quadratic in Gaussian variables, the square of its modulus.
+
+    Returns
+    -------
+    Correlation coefficients at separations of 0, 1, ... n_channels // 2 delay bins, shape (n_channels // 2 + 1,); they
+    are periodic in n_channels.
+    """
+    amplitude = np.abs(np.fft.rfft(make_taper(taper, n_channels) ** 2))
+    return (amplitude / amplitude[0]) ** 2

@@ -1,0 +1,150 @@
+r"""Error bars of averaged power spectra (paper §Reduction: sigma_P^2 = (sigma_N + sigma_S)^2).
+
+One mode (one baseline, one delay) of even times odd has, for Gaussian sky of power P_S and noise of power P_N,
+
+    var Re(E* O) = P_S^2 + P_S P_N + P_N^2 / 2,
+
+that is sigma_S = P_S without noise and sigma_N = P_N / sqrt(2), the rms of a noise-only spectrum, without signal. The
+paper's sum is exact in both limits and conservative in between (sqrt(2) P_S P_N in place of P_S P_N).
+
+Averages have fewer independent modes than modes:
+
+- a taper correlates neighbouring delays (`calstudy.power.delay.mode_correlation`); tau and -tau are independent;
+- the n (n-1) products of different baselines of a redundant group have independent noise and the same signal:
+  sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same goes for two polarizations;
+- the signal of two baselines closer than the size of an antenna is partly the same. For a Gaussian beam with squared
+  integral Omega_pp the visibilities correlate by exp(-pi Omega_pp |db|^2 / lambda^2), powers by its square.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy import constants
+from scipy.spatial import cKDTree
+
+from calstudy.power.delay import mode_correlation
+
+if TYPE_CHECKING:
+    from calstudy.power.spectra import DelaySpectra
+    from calstudy.power.spherical import SphericalSpectrum
+
+NEGLIGIBLE = 1e-3
+"""Correlations of powers below this are taken as zero."""
+
+
+def noise_level(noise: DelaySpectra) -> float:
+    """Return sigma_N of a single product of two baselines, from spectra of noise only.
+
+    The rms over all units and delays of the real part, scaled up by the number of products averaged in each unit. The
+    noise must be white and alike on all baselines, as in the paper's simulations.
+
+    Returns
+    -------
+    Standard deviation in the unit of ``noise.power``.
+    """
+    products = noise.n_pairs * noise.n_polarizations
+    return float(np.sqrt(np.mean(products[:, None] * noise.power.real**2)))
+
+
+def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return how many independent products of noise each bin averages: sigma_N falls by its square root.
+
+    Parameters
+    ----------
+    spectra
+        The averaged spectra.
+    bins
+        Bin of each mode, (Nu, Nd) int, -1 for those left out.
+    n_bins
+        Number of bins.
+
+    Returns
+    -------
+    (n_bins,) float, zero for empty bins.
+    """
+    units = np.arange(len(spectra.n_pairs))
+    products = spectra.n_pairs * spectra.n_polarizations
+    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / products))
+
+
+def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return how many independent modes of the signal each bin averages; parameters as in `noise_modes`."""
+    first, second, correlation = _signal_correlation(spectra)
+    return _effective_modes(spectra, bins, n_bins, (first, second, correlation))
+
+
+def with_errors(
+    spectrum: SphericalSpectrum, noise: float = 0.0, signal: SphericalSpectrum | None = None
+) -> SphericalSpectrum:
+    """Return `spectrum` with its error bars, sigma_P = sigma_N + sigma_S in each bin.
+
+    Parameters
+    ----------
+    spectrum
+        Any averaged spectrum. Not mutated.
+    noise
+        sigma_N of a single product, from `noise_level`; zero for spectra of the signal only.
+    signal
+        Spectrum of the signal only in the same bins, whose real part is the sample standard deviation of one mode;
+        None for spectra of noise only.
+
+    Raises
+    ------
+    ValueError
+        If the bins differ.
+    """
+    if signal is not None and not np.array_equal(signal.bin_edges, spectrum.bin_edges):
+        raise ValueError("the signal's spectrum has other bins than the spectrum that needs errors, expected the same")
+    amplitude = np.zeros(spectrum.k.size) if signal is None else np.abs(signal.power.real)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        noise_error = np.where(spectrum.n_modes > 0, noise / np.sqrt(spectrum.noise_modes), np.nan)
+        sample_error = np.where(spectrum.n_modes > 0, amplitude / np.sqrt(spectrum.sample_modes), np.nan)
+    return dataclasses.replace(spectrum, noise_error=noise_error, sample_error=sample_error)
+
+
+def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of units (both orders and with themselves) that share signal, and the correlation of their powers."""
+    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / constants.c.value) ** 2
+    reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
+    tree = cKDTree(spectra.vectors)
+    units = np.arange(len(spectra.vectors))
+    # V(-b) is the conjugate of V(b), its powers those at -tau: the same |k|.
+    close = [tree.query_pairs(reach, output_type="ndarray")]
+    opposite = tree.query_ball_point(-spectra.vectors, reach)
+    close.append(np.array([(i, j) for i, found in enumerate(opposite) for j in found if i < j]).reshape(-1, 2))
+    pairs = np.unique(np.concatenate(close).astype(int), axis=0)
+    first, second = pairs.T
+    distance = np.minimum(
+        np.linalg.norm(spectra.vectors[first] - spectra.vectors[second], axis=1),
+        np.linalg.norm(spectra.vectors[first] + spectra.vectors[second], axis=1),
+    )
+    correlation = np.exp(-rate * distance**2)
+    return (
+        np.concatenate([units, first, second]),
+        np.concatenate([units, second, first]),
+        np.concatenate([np.ones(units.size), correlation, correlation]),
+    )
+
+
+def _effective_modes(
+    spectra: DelaySpectra, bins: np.ndarray, n_bins: int, covariance: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """(sum w)^2 / sum_ij w_i w_j C_ij over the modes i, j of each bin, w the number of pairs, C units times delays."""
+    first, second, between_units = covariance
+    weights = spectra.n_pairs.astype(float)
+    between_units = between_units * weights[first] * weights[second]
+    between_delays = mode_correlation(spectra.taper, spectra.delay.size)
+    variance = np.zeros(n_bins)
+    for lag in np.flatnonzero(between_delays > NEGLIGIBLE):
+        shifted = np.roll(bins, -lag, axis=1)
+        shared = (bins[first] == shifted[second]) & (bins[first] >= 0)
+        # Both signs of the lag: the list of units has each pair in both orders.
+        both = 1.0 if lag == 0 else 2.0
+        values = np.broadcast_to((both * between_delays[lag] * between_units)[:, None], shared.shape)[shared]
+        variance += np.bincount(bins[first][shared], values, minlength=n_bins)
+    used = bins >= 0
+    total = np.bincount(bins[used], np.broadcast_to(weights[:, None], bins.shape)[used], minlength=n_bins)
+    return np.divide(total**2, variance, out=np.zeros(n_bins), where=variance > 0)

@@ -1,0 +1,206 @@
+"""Delay power spectra of baseline pairs from even and odd visibilities, through hera_pspec.
+
+Units are mK^2 h^-3 Mpc^3. Visibilities are in Jy with V_xx = 1/2 int A I, the convention of pyuvsim and fftvis, unless
+the data set says ``pol_convention="avg"``.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from astropy import constants
+from hera_pspec import UVPSpec
+from hera_pspec.pspecbeam import PSpecBeamFromArray
+from pyuvdata import UVData, utils
+
+from calstudy.instrument.layouts import redundant_groups
+from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
+from calstudy.power.optimal import DiagonalPSpecData
+from calstudy.visibilities import antenna_pairs, baseline_vectors
+
+if TYPE_CHECKING:
+    from calstudy.power.settings import PowerSettings
+
+logger = logging.getLogger(__name__)
+
+POWER_UNIT = "mK2 h-3 Mpc3"
+"""Unit of every power spectrum of this package."""
+
+HERA_TAPERS = {"blackman-harris": "blackmanharris", "hann": "hann", "tukey": "tukey", "none": "none"}
+
+Baseline = tuple[int, int]
+
+
+class PowerBeam(Protocol):
+    """What the estimator needs of a beam (`calstudy.instrument.beams`)."""
+
+    def solid_angles(self, frequencies: np.ndarray, pol: str) -> tuple[np.ndarray, np.ndarray]:
+        """Integrals over the sky in sr of the power beam and of its square, (Nfreqs,) each, for "xx" or "yy"."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Baselines to cross, as antenna numbers (a, b): ``first[i]`` of the even data with ``second[i]`` of the odd."""
+
+    first: list[Baseline]
+    second: list[Baseline]
+    redundant: bool
+
+
+def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
+    """Choose which baselines to cross (paper §Reduction of Simulation Products and Power Spectra).
+
+    Either each baseline with itself (ab = cd), or each with every *other* of its redundant group, in both orders
+    (ab != cd), reversed where the group needs it. With ``pairs="auto"`` groups are used if at least half of the
+    baselines have a redundant partner.
+
+    Raises
+    ------
+    ValueError
+        If groups are asked for and no two baselines are redundant.
+    """
+    baselines = [(int(a), int(b)) for a, b in antenna_pairs(uvd)]
+    same = Pairs(baselines, baselines, redundant=False)
+    if settings.pairs == "same-baseline":
+        return same
+    groups = redundant_groups(baseline_vectors(uvd), settings.redundancy_tolerance)
+    members = np.bincount(groups.index)
+    partnered = np.mean(members[groups.index] > 1)
+    if settings.pairs == "auto" and partnered < 0.5:
+        return same
+    if partnered == 0:
+        raise ValueError(
+            f"power.pairs is 'redundant-group' but no two baselines are within {settings.redundancy_tolerance} m, "
+            "allowed for this array: 'same-baseline' or 'auto'"
+        )
+    oriented = [
+        pair[::-1] if conjugated else pair for pair, conjugated in zip(baselines, groups.conjugated, strict=True)
+    ]
+    order = np.argsort(groups.index, kind="stable")
+    crossed = []
+    for group in np.split(order, np.cumsum(members)[:-1]):
+        crossed += [(oriented[i], oriented[j]) for i in group for j in group if i != j]
+    return Pairs([pair[0] for pair in crossed], [pair[1] for pair in crossed], redundant=True)
+
+
+def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_convention: str | None) -> np.ndarray:
+    """Return the beam-weighted mean brightness temperature of a visibility of 1 Jy, in K/Jy, shape (Nfreqs,).
+
+    A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2, and half of that in the convention
+    V_xx = 1/2 int A I (``pol_convention`` None or "sum").
+
+    Parameters
+    ----------
+    frequencies
+        Hz, shape (Nfreqs,).
+    omega_p
+        Solid angle of the power beam in sr, shape (Nfreqs,).
+    pol_convention
+        As in `pyuvdata.UVData`: "avg", "sum" or None.
+    """
+    halves = {None: 2.0, "sum": 2.0, "avg": 1.0}
+    if pol_convention not in halves:
+        raise ValueError(f"pol_convention {pol_convention!r} is unknown, allowed: None, 'sum', 'avg'")
+    wavelength = constants.c.value / frequencies
+    return halves[pol_convention] * 1e-26 * wavelength**2 / (2 * constants.k_B.value * omega_p)
+
+
+def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings) -> UVPSpec:
+    """Cross the delay spectra of two data sets that share the sky but not the noise.
+
+    P = X^2 Y / (Omega_pp B_pp) V~ V~* (paper Eq. of Parsons et al. 2012) by hera_pspec's quadratic estimator with
+    identity weighting. The beam is divided out channel by channel (Omega_p to temperature, Omega_pp / Omega_p^2 in the
+    normalization), so its frequency dependence is accounted for; X and Y are taken over the band likewise.
+
+    Parameters
+    ----------
+    even, odd
+        One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy. Not mutated.
+    beam
+        Gives the solid angles of the power beam.
+    settings
+        Taper, pairs, redundancy tolerance, cosmology.
+
+    Returns
+    -------
+    UVPSpec, one spectrum per baseline pair and polarization, complex, in mK^2 h^-3 Mpc^3, unfolded, without window
+    functions; it can be written to HDF5 and read back. hera_pspec's conventions: conj(even) times odd, with the kernel
+    exp(-2 pi i tau nu), so that its delay axis is the paper's, reversed.
+
+    Raises
+    ------
+    ValueError
+        If the data sets differ in anything but data, have more than one integration, are not in Jy, or leave no
+        unflagged pair. Baselines flagged altogether are left out.
+    """
+    _require_match(even, odd)
+    pairs = _unflagged(make_pairs(even, settings), even, odd)
+    frequencies = even.freq_array
+    polarizations = [int(pol) for pol in even.polarization_array]
+    angles = {pol: beam.solid_angles(frequencies, utils.polnum2str(pol)) for pol in polarizations}
+    centre = float(redshift(frequencies.mean()))
+    adapter = PSpecBeamFromArray(
+        OmegaP={pol: angles[pol][0] for pol in polarizations},
+        OmegaPP={pol: angles[pol][1] for pol in polarizations},
+        beam_freqs=frequencies,
+        cosmo=hera_conversions(make_cosmology(settings.cosmology), centre),
+    )
+    estimator = DiagonalPSpecData(
+        dsets=[_to_millikelvin(uvd, angles) for uvd in (even, odd)], labels=["even", "odd"], beam=adapter
+    )
+    logger.info("crossing %d pairs of baselines (redundant groups: %s)", len(pairs.first), pairs.redundant)
+    return estimator.pspec(
+        pairs.first,
+        pairs.second,
+        dsets=(0, 1),
+        pols=[(pol, pol) for pol in polarizations],
+        input_data_weight="identity",
+        taper=HERA_TAPERS[settings.taper],
+        # A group may be wider than the tolerance between neighbours; that choice was made above.
+        baseline_tol=np.inf,
+        store_window=False,
+        allow_fft=True,
+        verbose=False,
+        history="calstudy",
+    )
+
+
+def _unflagged(pairs: Pairs, even: UVData, odd: UVData) -> Pairs:
+    """Leave out pairs with a baseline that has no data in some polarization."""
+    good = [~uvd.flag_array.all(axis=1).any(axis=1) for uvd in (even, odd)]
+    usable = []
+    for observed in good:
+        listed = antenna_pairs(even)[observed].tolist()
+        usable.append({(a, b) for a, b in listed} | {(b, a) for a, b in listed})
+    kept = [
+        pair for pair in zip(pairs.first, pairs.second, strict=True) if pair[0] in usable[0] and pair[1] in usable[1]
+    ]
+    if not kept:
+        raise ValueError("all pairs of baselines are flagged, expected at least one with data")
+    if len(kept) < len(pairs.first):
+        logger.warning("left out %d of %d pairs of baselines: flagged", len(pairs.first) - len(kept), len(pairs.first))
+    return Pairs([first for first, _ in kept], [second for _, second in kept], pairs.redundant)
+
+
+def _to_millikelvin(uvd: UVData, angles: dict[int, tuple[np.ndarray, np.ndarray]]) -> UVData:
+    converted = uvd.copy()
+    for index, pol in enumerate(uvd.polarization_array):
+        factor = 1e3 * kelvin_per_jansky(uvd.freq_array, angles[int(pol)][0], uvd.pol_convention)
+        converted.data_array[..., index] *= factor
+    converted.vis_units = "mK"
+    return converted
+
+
+def _require_match(even: UVData, odd: UVData) -> None:
+    for name, uvd in (("even", even), ("odd", odd)):
+        if uvd.Ntimes != 1:
+            raise ValueError(f"the {name} data have {uvd.Ntimes} integrations, expected 1: average them first")
+        if uvd.vis_units is None or uvd.vis_units.lower() != "jy":
+            raise ValueError(f"the {name} data are in {uvd.vis_units!r}, expected 'Jy'")
+    for name in ("ant_1_array", "ant_2_array", "freq_array", "polarization_array"):
+        first, second = getattr(even, name), getattr(odd, name)
+        if first.shape != second.shape or not np.allclose(first, second, rtol=1e-12, atol=0):
+            raise ValueError(f"the even and odd data differ in {name}, expected the same")

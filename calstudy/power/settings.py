@@ -1,0 +1,34 @@
+"""The `power` section of an experiment file."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from calstudy.schema import Section
+from calstudy.units import Delay, Length, Wavenumber
+
+
+class KBins(Section):
+    """Equal spherical bins in |k|."""
+
+    min: Wavenumber = Field(0.0, ge=0)
+    max: Wavenumber = Field(3.4, gt=0)
+    width: Wavenumber = Field(0.04, gt=0)
+
+
+class PowerSettings(Section):
+    """From calibrated visibilities to wedge and spherical power spectra."""
+
+    taper: Literal["blackman-harris", "hann", "tukey", "none"] = "blackman-harris"
+    pairs: Literal["same-baseline", "redundant-group", "auto"] = Field(
+        "auto",
+        description="Cross each baseline with itself, or with the others of its redundant group; auto: groups if at "
+        "least half of the baselines have a redundant partner.",
+    )
+    redundancy_tolerance: Length = Field(1.0, gt=0, description="Baselines closer than this are one group.")
+    wedge_buffer: Delay = Field(100e-9, ge=0, description="Modes with |delay| <= |b|/c + buffer count as wedge.")
+    length_bin: Length = Field(4.0, gt=0, description="Width of the cylindrical (wedge) bins in baseline length.")
+    bins: KBins = KBins()
+    cosmology: Literal["Planck15", "Planck18", "WMAP9"] = "Planck15"

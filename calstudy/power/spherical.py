@@ -1,0 +1,106 @@
+"""Spherical averages of delay spectra, over all modes or outside the wedge (paper Figs. SPHERICAL*)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy import constants
+
+from calstudy.power.errors import noise_modes, sample_modes
+
+if TYPE_CHECKING:
+    from calstudy.power.settings import KBins, PowerSettings
+    from calstudy.power.spectra import DelaySpectra
+
+
+@dataclass(frozen=True)
+class SphericalSpectrum:
+    """A power spectrum in Nk bins of |k|. Empty bins hold NaN power and zero modes.
+
+    Attributes
+    ----------
+    k, bin_edges
+        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc. A bin holds what is above its lower and not above its upper edge.
+    power
+        Mean over modes, (Nk,) complex; the real part estimates P(k).
+    n_modes
+        Modes (baseline or redundant group, and delay) averaged, (Nk,) int.
+    noise_modes, sample_modes
+        Independent modes of noise and of signal among them, (Nk,); see `calstudy.power.errors`.
+    noise_error, sample_error
+        Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.errors.with_errors`.
+    wedge_excluded
+        Whether modes inside the wedge were left out.
+    """
+
+    k: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    n_modes: np.ndarray = field(metadata={"unit": ""})
+    noise_modes: np.ndarray = field(metadata={"unit": ""})
+    sample_modes: np.ndarray = field(metadata={"unit": ""})
+    noise_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    sample_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    wedge_excluded: bool = field(metadata={"unit": ""})
+
+    @property
+    def error(self) -> np.ndarray:
+        """sigma_P = sigma_N + sigma_S, one standard deviation, (Nk,)."""
+        return self.noise_error + self.sample_error
+
+
+def make_bin_edges(bins: KBins) -> np.ndarray:
+    """Return the edges in h/Mpc of equal bins from ``bins.min`` up to at least ``bins.max``, shape (Nk + 1,)."""
+    count = int(np.ceil((bins.max - bins.min) / bins.width - 1e-9))
+    return bins.min + bins.width * np.arange(count + 1)
+
+
+def outside_wedge(spectra: DelaySpectra, buffer: float) -> np.ndarray:
+    """Return which modes have |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool."""
+    horizon = spectra.length / constants.c.value
+    return np.abs(spectra.delay) > horizon[:, None] + buffer
+
+
+def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool) -> SphericalSpectrum:
+    """Average over all modes of equal |k|, each pair of baselines counting the same.
+
+    Parameters
+    ----------
+    spectra
+        Delay spectra of units.
+    settings
+        Bins and wedge buffer.
+    exclude_wedge
+        Leave out modes with |tau| <= |b|/c + buffer.
+
+    Returns
+    -------
+    SphericalSpectrum without error bars.
+    """
+    edges = make_bin_edges(settings.bins)
+    n_bins = edges.size - 1
+    magnitude = np.hypot(spectra.k_perp[:, None], spectra.k_parallel)
+    bins = np.searchsorted(edges, magnitude, side="left") - 1
+    bins[(bins < 0) | (bins >= n_bins)] = -1
+    if exclude_wedge:
+        bins[~outside_wedge(spectra, settings.wedge_buffer)] = -1
+    used = bins >= 0
+    weights = np.broadcast_to(spectra.n_pairs[:, None], bins.shape)[used]
+    total = np.bincount(bins[used], weights, minlength=n_bins)
+    values = weights * spectra.power[used]
+    summed = np.bincount(bins[used], values.real, minlength=n_bins).astype(complex)
+    summed += 1j * np.bincount(bins[used], values.imag, minlength=n_bins)
+    unknown = np.full(n_bins, np.nan)
+    return SphericalSpectrum(
+        k=(edges[1:] + edges[:-1]) / 2,
+        bin_edges=edges,
+        power=np.divide(summed, total, out=np.full(n_bins, np.nan, dtype=complex), where=total > 0),
+        n_modes=np.bincount(bins[used], minlength=n_bins),
+        noise_modes=noise_modes(spectra, bins, n_bins),
+        sample_modes=sample_modes(spectra, bins, n_bins),
+        noise_error=unknown,
+        sample_error=unknown,
+        wedge_excluded=exclude_wedge,
+    )

@@ -1,0 +1,214 @@
+"""A simulation in independent pieces: nodes in time and frequency, sources that rise or set, and the check of both.
+
+A chunk is a block of consecutive frequency nodes at all integrations. Each is simulated on its own, stored if one
+likes, and the chunks of a simulation assemble to its visibilities. The result does not depend on how many there are.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calstudy.instrument.telescope import subset_template
+from calstudy.simulate.directions import split_by_horizon
+from calstudy.simulate.nodes import NodeGrid, integration_times, node_grid
+
+if TYPE_CHECKING:
+    from pyradiosky import SkyModel
+    from pyuvdata import UVData
+
+    from calstudy.simulate.engine import BeamSource, Engine
+    from calstudy.simulate.settings import SimulationSettings
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A block of a simulation's frequency nodes.
+
+    Attributes
+    ----------
+    grid
+        All nodes of the simulation.
+    nodes
+        Which of `grid.frequencies` belong to this chunk.
+    """
+
+    grid: NodeGrid
+    nodes: slice
+
+    @property
+    def frequencies(self) -> np.ndarray:
+        """Frequencies of the chunk's nodes, (Nf,), Hz."""
+        return self.grid.frequencies[self.nodes]
+
+    @property
+    def channels(self) -> slice:
+        """The channels that the chunk's nodes are; raises ValueError where nodes are not channels."""
+        if not self.grid.at_channels:
+            raise ValueError("the chunk's frequency nodes are not channels, the sky must be smooth in frequency for it")
+        return self.nodes
+
+
+@dataclass(frozen=True)
+class InterpolationCheck:
+    """Interpolated against directly simulated visibilities where they should differ most.
+
+    Attributes
+    ----------
+    max_error
+        Largest absolute difference over the rms of the visibilities.
+    rms_error
+        Rms difference over the rms of the visibilities.
+    times_jd, frequencies
+        Where they were compared: at every combination of these (Julian date; Hz).
+    time_nodes, frequency_nodes
+        How many nodes the simulation has.
+    """
+
+    max_error: float
+    rms_error: float
+    times_jd: list[float]
+    frequencies: list[float]
+    time_nodes: int
+    frequency_nodes: int
+
+
+def plan_chunks(template: UVData, settings: SimulationSettings, smooth_in_frequency: bool) -> list[Chunk]:
+    """Split a simulation into chunks of as nearly as possible equal numbers of frequency nodes.
+
+    Parameters
+    ----------
+    template
+        The observation.
+    settings
+        Nodes and number of chunks; there are never more chunks than frequency nodes.
+    smooth_in_frequency
+        Whether sky and beam are smooth in frequency. If not (an EoR sky; a beam that is interpolated point to point),
+        every channel is simulated, and `Chunk.channels` says which a chunk needs of the sky.
+    """
+    grid = node_grid(template, settings.nodes, smooth_in_frequency)
+    count = min(settings.chunks, len(grid.frequencies))
+    edges = np.linspace(0, len(grid.frequencies), count + 1).round().astype(int).tolist()
+    return [Chunk(grid, slice(start, stop)) for start, stop in pairwise(edges)]
+
+
+def simulate_chunk(engine: Engine, sky: SkyModel, beam: BeamSource, template: UVData, chunk: Chunk) -> np.ndarray:
+    """Simulate a chunk at all integrations.
+
+    Sources above the horizon throughout are simulated at the time nodes and interpolated; those that rise or set are
+    steps in time, which no polynomial follows, and are simulated at every integration.
+
+    Parameters
+    ----------
+    engine
+        Any; see `calstudy.simulate.engine.make_engine`.
+    sky
+        For a sky given channel by channel, at least the chunk's channels.
+    beam
+        Of all antennas.
+    template
+        The whole observation.
+    chunk
+        From `plan_chunks` of the same template.
+
+    Returns
+    -------
+    (Ntimes, Nbls, Nf, Npols) complex128
+        Visibilities in Jy at all integrations and the chunk's frequency nodes.
+    """
+    grid, integrations = chunk.grid, integration_times(template)
+    if grid.at_integrations:
+        return engine.simulate(sky, beam, subset_template(template, integrations, chunk.frequencies))
+    times = np.concatenate([integrations, grid.times_jd])
+    always_up, crossing = split_by_horizon(sky, template.telescope.location, times)
+    logger.info("%d sources stay up, %d rise or set, of %d", len(always_up), len(crossing), sky.Ncomponents)
+    cube = np.zeros((len(integrations), template.Nbls, len(chunk.frequencies), template.Npols), dtype=np.complex128)
+    if len(always_up):
+        steady = sky.select(component_inds=always_up, inplace=False, run_check=False)
+        nodes = engine.simulate(steady, beam, subset_template(template, grid.times_jd, chunk.frequencies))
+        cube += grid.interpolate_times(nodes)
+        del steady
+    if len(crossing):
+        changing = sky.select(component_inds=crossing, inplace=False, run_check=False)
+        cube += engine.simulate(changing, beam, subset_template(template, integrations, chunk.frequencies))
+    return cube
+
+
+def assemble(chunks: list[Chunk], cubes: list[np.ndarray]) -> np.ndarray:
+    """Return the visibilities at all channels, (Ntimes, Nbls, Nfreqs, Npols), from the cubes of all chunks in order."""
+    return chunks[0].grid.interpolate_frequencies(np.concatenate(cubes, axis=2))
+
+
+def simulate_visibilities(
+    engine: Engine,
+    sky: SkyModel,
+    beam: BeamSource,
+    template: UVData,
+    settings: SimulationSettings,
+    smooth_in_frequency: bool,
+) -> np.ndarray:
+    """Simulate a whole observation here and now; see `plan_chunks`, `simulate_chunk` and `assemble`.
+
+    Returns
+    -------
+    (Ntimes, Nbls, Nfreqs, Npols) complex128
+        Visibilities in Jy.
+    """
+    chunks = plan_chunks(template, settings, smooth_in_frequency)
+    return assemble(chunks, [simulate_chunk(engine, sky, beam, template, chunk) for chunk in chunks])
+
+
+def check_interpolation(
+    engine: Engine,
+    sky: SkyModel,
+    beam: BeamSource,
+    template: UVData,
+    cube: np.ndarray,
+    grid: NodeGrid,
+    channels: slice = slice(None),
+    count: int = 2,
+) -> InterpolationCheck:
+    """Simulate a few integrations and channels directly and compare.
+
+    Parameters
+    ----------
+    engine, sky, beam, template
+        As for the simulation.
+    cube : (Ntimes, Nbls, Nfreqs, Npols)
+        Its result at all channels.
+    grid
+        Its nodes, `Chunk.grid`.
+    channels
+        Channels to choose from: those that the sky has, if it is given channel by channel.
+    count
+        How many integrations and how many channels: those farthest from nodes, near the ends where polynomials err
+        most.
+    """
+    times, frequencies = integration_times(template), template.freq_array
+    at_times = _farthest(times, grid.times_jd, np.arange(len(times)), count)
+    at_channels = _farthest(frequencies, grid.frequencies, np.arange(len(frequencies))[channels], count)
+    direct = engine.simulate(sky, beam, subset_template(template, times[at_times], frequencies[at_channels]))
+    errors = np.abs(cube[at_times][:, :, at_channels] - direct)
+    rms = np.sqrt(np.mean(np.abs(direct) ** 2))
+    return InterpolationCheck(
+        max_error=float(errors.max() / rms),
+        rms_error=float(np.sqrt(np.mean(errors**2)) / rms),
+        times_jd=times[at_times].tolist(),
+        frequencies=frequencies[at_channels].tolist(),
+        time_nodes=len(grid.times_jd),
+        frequency_nodes=len(grid.frequencies),
+    )
+
+
+def _farthest(samples: np.ndarray, nodes: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:
+    """Return the `count` candidates at which the polynomial that vanishes at the nodes is largest, ascending."""
+    offsets = np.abs(samples[candidates][:, None] - nodes) / max(np.ptp(nodes), np.finfo(float).tiny)
+    with np.errstate(divide="ignore"):
+        size = np.log(offsets).sum(axis=1)
+    return np.sort(candidates[np.argsort(size)[-count:]])

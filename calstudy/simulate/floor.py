@@ -1,0 +1,115 @@
+"""The delay floor: how much of a foreground simulation's power lies at delays where foregrounds cannot be.
+
+What is found beyond the horizon is made by the simulation (a beam that is not smooth in frequency, rounding,
+interpolation) or by the sidelobes of the taper. Levels are in amplitude decibel, 10 log10 of a brightness ratio, in
+which the paper puts its beam-interpolation artefacts at -45 dB and the 21 cm signal at -40 dB.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.constants import speed_of_light
+from scipy.signal import windows
+
+from calstudy.visibilities import baseline_vectors, to_cube
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+logger = logging.getLogger(__name__)
+
+Taper = Literal["blackman-harris", "dolph-chebyshev"]
+
+
+@dataclass(frozen=True)
+class DelayFloor:
+    """Power beyond horizon + buffer relative to the peak, per baseline length.
+
+    Attributes
+    ----------
+    edges : (Nbins + 1,) float
+        Edges of the bins in baseline length, m.
+    rms_db : (Nbins,) float
+        Rms beyond horizon + buffer over the largest rms at any delay, amplitude dB; NaN for an empty bin.
+    max_db : (Nbins,) float
+        The same for the delay with the largest rms beyond horizon + buffer.
+    buffer
+        Delay added to the horizon, s.
+    taper
+        Name of the taper.
+    """
+
+    edges: np.ndarray
+    rms_db: np.ndarray
+    max_db: np.ndarray
+    buffer: float
+    taper: str
+
+    @property
+    def worst_db(self) -> float:
+        """The highest of `max_db`, amplitude dB."""
+        return float(np.nanmax(self.max_db))
+
+
+def delay_floor(
+    foregrounds: UVData, buffer: float = 100e-9, taper: Taper = "blackman-harris", n_bins: int = 6
+) -> DelayFloor:
+    """Measure the delay floor of simulated foregrounds.
+
+    Parameters
+    ----------
+    foregrounds
+        Visibilities of foregrounds alone, equally spaced channels.
+    buffer
+        Delay beyond the horizon at which to start, s. The main lobe of the taper must have ended there: it reaches
+        4 / bandwidth for Blackman-Harris (130 ns for 30.72 MHz), 6 / bandwidth for Dolph-Chebyshev.
+    taper
+        `blackman-harris` has sidelobes of -46 dB here and shows what a power spectrum sees; `dolph-chebyshev` (-75 dB)
+        shows the simulation's own floor under them.
+    n_bins
+        Number of equal bins in baseline length.
+
+    Raises
+    ------
+    ValueError
+        If no delay is beyond horizon + buffer for the longest baseline.
+    """
+    cube = to_cube(foregrounds)
+    lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
+    width = float(np.diff(foregrounds.freq_array).mean())
+    window = (
+        windows.blackmanharris(cube.shape[2]) if taper == "blackman-harris" else windows.chebwin(cube.shape[2], 150)
+    )
+    spectrum = np.fft.fft(cube * window[:, None], axis=2)
+    power = np.mean(np.abs(spectrum) ** 2, axis=(0, 3))
+    delays = np.abs(np.fft.fftfreq(cube.shape[2], width))
+    beyond = delays > (lengths / speed_of_light + buffer)[:, None]
+    if not beyond.any(axis=1).all():
+        raise ValueError(f"no delay is beyond the horizon plus {buffer} s: the channels are too wide")
+    edges = np.linspace(0, lengths.max() * (1 + 1e-9), n_bins + 1)
+    bins = np.digitize(lengths, edges) - 1
+    levels = np.full((2, n_bins), np.nan)
+    for index in np.unique(bins):
+        members = bins == index
+        mean = power[members].mean(axis=0)
+        outside = beyond[members].all(axis=0)
+        ratios = np.array([mean[outside].mean(), mean[outside].max()]) / mean.max()
+        levels[:, index] = 5 * np.log10(np.maximum(ratios, np.finfo(float).tiny))
+    return DelayFloor(edges, *levels, buffer, taper)
+
+
+def warn_if_above(floor: DelayFloor, level_db: float) -> None:
+    """Log a warning if the floor reaches above a level (amplitude dB), such as that of the EoR asked for."""
+    if np.nanmax(floor.rms_db) > level_db:
+        worst = int(np.nanargmax(floor.rms_db))
+        logger.warning(
+            "the delay floor of the foregrounds is %.1f dB for baselines of %.0f-%.0f m, above the EoR level %.1f dB",
+            floor.rms_db[worst],
+            floor.edges[worst],
+            floor.edges[worst + 1],
+            level_db,
+        )

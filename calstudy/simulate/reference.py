@@ -1,0 +1,109 @@
+"""pyuvsim: the paper's simulator and the reference of the others.
+
+The engine runs serially, without MPI. In a program started with ``mpiexec -n 8 python program.py`` in which all ranks
+call `PyuvsimEngine.simulate` with the same arguments, each simulates its share and all get the whole.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import warnings
+
+import numpy as np
+from astropy import units
+from pyradiosky import SkyModel
+from pyuvdata import BeamInterface, UVData
+from pyuvdata.utils.pol import convert_feeds_to_pols
+from pyuvsim import BeamList
+from pyuvsim.simsetup import SkyModelData
+from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
+
+from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.visibilities import require_rectangular
+
+# How the launchers of MPICH, Open MPI and Slurm tell a process how many there are.
+RANK_COUNT_VARIABLES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE")
+
+
+class PyuvsimEngine:
+    """Every sky, beam and geometry that pyuvsim handles, one visibility after the other."""
+
+    name = "pyuvsim"
+
+    def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
+        """Return why this engine cannot do what is asked, or None if it can."""
+        available = _products(beam.at(template.freq_array[:1]))
+        missing = [int(number) for number in template.polarization_array if number not in available]
+        return f"the beam's feeds do not give polarization number {missing[0]}" if missing else None
+
+    def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:
+        """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`.
+
+        Raises
+        ------
+        ValueError
+            If the beam's feeds do not give a polarization of the template.
+        """
+        require_rectangular(template)
+        tabulated = beam.at(template.freq_array)
+        products = _products(tabulated)
+        columns = [products.index(number) for number in template.polarization_array]
+        beams = BeamList([BeamInterface(tabulated, beam_type="efield")])
+        cube = np.zeros((template.Nblts, template.Nfreqs, len(products)), dtype=np.complex128)
+        communicator = _communicator()
+        tasks = range(template.Nblts * template.Nfreqs)
+        share = tasks if communicator is None else _share(tasks, communicator.rank, communicator.size)
+        with warnings.catch_warnings():
+            # A 21 cm sky is a brightness difference.
+            warnings.filterwarnings("ignore", "Some Stokes I values are negative", UserWarning)
+            _run_tasks(share, _catalog(sky, template.freq_array), beams, template, cube)
+        if communicator is not None:
+            communicator.Allreduce(cube.copy(), cube)
+        return cube.reshape(template.Ntimes, template.Nbls, template.Nfreqs, -1)[..., columns]
+
+
+def _products(beam) -> list[int]:
+    """Return the polarization number of each element of pyuvsim's visibility vector."""
+    return convert_feeds_to_pols(feed_array=beam.feed_array, include_cross_pols=True).tolist()
+
+
+def _catalog(sky: SkyModel, frequencies: np.ndarray) -> SkyModelData:
+    # The steps pyuvsim takes at the start of a parallel run, on a copy, for they are in place.
+    sky = sky.copy()
+    without_frequency = sky.spectral_type == "flat" and sky.reference_frequency is None and sky.freq_array is None
+    if sky.spectral_type not in ("flat", "full") or (sky.component_type == "healpix" and without_frequency):
+        sky.at_frequencies(frequencies * units.Hz)
+    if sky.component_type == "healpix":
+        sky.healpix_to_point()
+    return SkyModelData(sky)
+
+
+def _run_tasks(tasks: range, catalog: SkyModelData, beams: BeamList, template: UVData, cube: np.ndarray) -> None:
+    """Fill the visibilities of some tasks in a cube (Nblts, Nfreqs, Nproducts).
+
+    `pyuvsim.run_uvdata_uvsim` needs MPI and prints; this is its loop, and gives the same bits.
+    """
+    use_bundled_earth_orientation()
+    engine = UVEngine()
+    for task in uvdata_to_task_iter(tasks, template, catalog, beams, None):
+        engine.set_task(task)
+        cube[task.uvdata_index] = engine.make_visibility()
+
+
+def _share(tasks: range, rank: int, count: int) -> range:
+    """Return a rank's share: a contiguous piece, so that few ranks work on one time and evaluate its beam."""
+    edges = np.linspace(0, len(tasks), count + 1).astype(int).tolist()
+    return tasks[edges[rank] : edges[rank + 1]]
+
+
+def _communicator():
+    """Return MPI's world communicator if a launcher started several ranks, or None."""
+    if all(int(os.environ.get(name, "1")) < 2 for name in RANK_COUNT_VARIABLES):
+        return None
+    from mpi4py import MPI
+
+    if not MPI.Is_initialized():
+        MPI.Init()
+        atexit.register(MPI.Finalize)
+    return MPI.COMM_WORLD

@@ -1,0 +1,79 @@
+"""A synthetic population of extragalactic radio sources that follows measured source counts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Franzen et al. (2019), 154 MHz: log10(S^2.5 dN/dS / (Jy^1.5/sr)) = Σ a_i (log10 S/Jy)^i, for 1 mJy < S < 75 Jy.
+COEFFICIENTS = (3.52, 0.307, -0.388, -0.0404, 0.0351, 0.00600)
+COUNTS_FREQUENCY = 154e6
+FAINTEST, BRIGHTEST = 1e-3, 75.0
+# GLEAM's wide band, and the mean spectral index with which the counts at 154 MHz agree with GLEAM there.
+FREQUENCY = 200e6
+SPECTRAL_INDEX = -0.8
+
+FULL_SKY = 4 * np.pi
+BINS_PER_DECADE = 20
+POINTS_PER_BIN = 50
+
+
+def differential_counts(flux: np.ndarray) -> np.ndarray:
+    """Return dN/dS at 200 MHz in 1/(Jy sr) for fluxes at 200 MHz in Jy (Franzen et al. 2019, scaled by ν^-0.8)."""
+    scale = (COUNTS_FREQUENCY / FREQUENCY) ** SPECTRAL_INDEX
+    flux_then = np.asarray(flux, dtype=float) * scale
+    return scale * 10 ** np.polyval(COEFFICIENTS[::-1], np.log10(flux_then)) * flux_then**-2.5
+
+
+def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray, np.random.Generator]]:
+    """Draw the fluxes of an all-sky population, in bins of flux.
+
+    Every bin has its own random stream: a population with another faint limit has the same bright sources.
+
+    Parameters
+    ----------
+    faint, bright
+        Range of fluxes at 200 MHz, in Jy.
+    seed
+        Seed of the population.
+
+    Returns
+    -------
+    list of tuple
+        For each bin the fluxes in Jy, and the random generator for whatever else the bin's sources need.
+    """
+    lowest, highest = (int(np.floor(np.log10(flux) * BINS_PER_DECADE)) for flux in (faint, bright))
+    population = []
+    for number in range(lowest, highest + 1):
+        edges = 10.0 ** np.linspace(number / BINS_PER_DECADE, (number + 1) / BINS_PER_DECADE, POINTS_PER_BIN + 1)
+        steps = np.diff(edges) * (differential_counts(edges[:-1]) + differential_counts(edges[1:])) / 2
+        cumulative = np.concatenate([[0.0], np.cumsum(steps)]) * FULL_SKY
+        # A spawn key must not be negative; bins below 1 Jy are.
+        generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number + 1000,)))
+        drawn = generator.uniform(0, cumulative[-1], generator.poisson(cumulative[-1]))
+        population.append((np.interp(drawn, cumulative, edges), generator))
+    return population
+
+
+def draw_population(faint: float, bright: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw an all-sky, isotropic population of sources between two flux limits.
+
+    Parameters
+    ----------
+    faint, bright
+        Range of fluxes at 200 MHz, in Jy; the counts are measured from 0.81 mJy to 61 Jy at this frequency.
+    seed
+        Seed of positions and fluxes.
+
+    Returns
+    -------
+    tuple of ndarray
+        Right ascension and declination in radians, flux at 200 MHz in Jy, each of shape (Nsources,).
+    """
+    parts = []
+    for flux, generator in draw_fluxes(faint, bright, seed):
+        right_ascension = generator.uniform(0, 2 * np.pi, len(flux))
+        declination = np.arcsin(generator.uniform(-1, 1, len(flux)))
+        kept = (flux >= faint) & (flux < bright)
+        parts.append((right_ascension[kept], declination[kept], flux[kept]))
+    right_ascension, declination, flux = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return right_ascension, declination, flux

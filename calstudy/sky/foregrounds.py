@@ -1,0 +1,204 @@
+"""The foreground sky: point sources from GLEAM, from a stand-in that needs no download, or from any catalogue."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import SkyCoord
+from pyradiosky import SkyModel
+
+from calstudy.errors import InputError
+from calstudy.sky import gleam
+from calstudy.sky import settings as section
+from calstudy.sky.catalogue import Catalogue, brightest, concatenate, read_gleam_table, to_sky_model
+from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL_INDEX, draw_population
+
+LOG = logging.getLogger(__name__)
+
+# G4Jy (White et al. 2020) is complete above about this flux at 200 MHz, south of +30° and away from the Galactic plane.
+COMPLETE_FLUX = 4.0
+COMPLETE_DECLINATION = np.deg2rad(30.0)
+COMPLETE_LATITUDE = np.deg2rad(10.0)
+BRIGHTEST_NOW = BRIGHTEST * (FREQUENCY / COUNTS_FREQUENCY) ** SPECTRAL_INDEX
+FREQUENCY_TOLERANCE = 1.0
+NOTHING = Catalogue(np.array(["none"]), np.zeros(1), np.array([-np.pi / 2]), np.zeros(1), np.array([SPECTRAL_INDEX]))
+
+
+@dataclass(frozen=True)
+class Foregrounds:
+    """The foreground sky.
+
+    Attributes
+    ----------
+    sky
+        Point components, brightest first; without foregrounds a single one of 0 Jy, for sky models cannot be empty.
+    stand_in
+        A sentence if the sky is not the paper's GLEAM catalogue, otherwise None.
+    """
+
+    sky: SkyModel
+    stand_in: str | None
+
+
+def make_foregrounds(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds:
+    """Return the point sources that the `sky.foregrounds` section asks for.
+
+    Parameters
+    ----------
+    settings
+        Any kind of foregrounds section.
+    frequencies
+        All channels in Hz, shape (Nfreqs,).
+
+    Raises
+    ------
+    InputError
+        If a catalogue is missing or cannot be used.
+    """
+    if isinstance(settings, section.NoSources):
+        return Foregrounds(to_sky_model(NOTHING, section.PointSources()), "foregrounds: none")
+    if isinstance(settings, section.GleamSources):
+        return _gleam(settings)
+    if isinstance(settings, section.FileSources):
+        return _from_file(settings, np.asarray(frequencies, dtype=float))
+    return _synthetic(settings)
+
+
+def _gleam(settings: section.GleamSources) -> Foregrounds:
+    path = gleam.default_path() if settings.path is None else settings.path
+    if not path.is_file():
+        raise InputError(
+            f"sky.foregrounds: the GLEAM catalogue is not at {path}: fetch it with `calstudy data fetch gleam`, "
+            "give its path, or use kind: g4jy-and-counts"
+        )
+    gleam.verify(path)
+    catalogue = read_gleam_table(path)
+    stand_in = None
+    if len(catalogue) < gleam.SOURCES:
+        stand_in = f"foregrounds: {len(catalogue)} of GLEAM's {gleam.SOURCES} sources, from {path.name}"
+    return Foregrounds(to_sky_model(catalogue.select(brightest(catalogue.flux, settings)), settings), stand_in)
+
+
+def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
+    """Real G4Jy components and, where they are not complete, a population drawn from source counts.
+
+    All real components are used. The population has the whole sky below 4 Jy (at 200 MHz), and north of +30° and
+    within 10° of the Galactic plane, where G4Jy has no sources, all fluxes. G4Jy is selected at 151 MHz and so
+    reaches below 4 Jy at 200 MHz: there each real component takes the place of the synthetic source next to it in
+    flux, which leaves the counts as measured. As in GLEAM itself, the brightest few radio sources (Cygnus A, Cassiopeia
+    A, Centaurus A, ...) and the Galaxy are missing.
+    """
+    real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))
+    synthetic = _population(settings)
+    covered = _in_g4jy_area(synthetic)
+    synthetic = synthetic.select(~covered | (synthetic.flux < COMPLETE_FLUX))
+    covered = np.flatnonzero(_in_g4jy_area(synthetic))
+    replaced = covered[_nearest(synthetic.flux[covered], real.flux[real.flux < COMPLETE_FLUX])]
+    synthetic = synthetic.select(np.setdiff1d(np.arange(len(synthetic)), replaced))
+    both = concatenate(real, synthetic)
+    chosen = brightest(both.flux, settings)
+    n_real = int((chosen < len(real)).sum())
+    stand_in = (
+        f"foregrounds: {n_real} real G4Jy components and {len(chosen) - n_real} synthetic sources drawn from the "
+        "counts of Franzen et al. (2019); GLEAM was not used"
+    )
+    LOG.info("%s", stand_in)
+    return Foregrounds(to_sky_model(both.select(chosen), settings), stand_in)
+
+
+def _population(settings: section.SyntheticSources) -> Catalogue:
+    right_ascension, declination, flux = draw_population(
+        min(settings.flux_limit, COMPLETE_FLUX), BRIGHTEST_NOW, settings.seed
+    )
+    order = np.argsort(-flux, kind="stable")
+    names = np.char.add("synthetic", np.arange(len(flux)).astype(str))
+    return Catalogue(names, right_ascension[order], declination[order], flux[order], np.full(len(flux), SPECTRAL_INDEX))
+
+
+def _in_g4jy_area(catalogue: Catalogue) -> np.ndarray:
+    directions = SkyCoord(catalogue.right_ascension, catalogue.declination, unit="rad", frame="icrs")
+    latitude = np.abs(directions.galactic.b.rad)
+    return (catalogue.declination < COMPLETE_DECLINATION) & (latitude >= COMPLETE_LATITUDE)
+
+
+def _nearest(available: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return indices into `available` of the values nearest to each of `wanted`, none of them twice."""
+    logarithm = np.log(available)
+    taken = []
+    for value in np.log(wanted[wanted >= available.min()]):
+        distance = np.abs(logarithm - value)
+        taken.append(int(distance.argmin()))
+        logarithm[taken[-1]] = np.inf
+    return np.array(taken, dtype=int)
+
+
+def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregrounds:
+    sky = _read(settings.path)
+    if sky.component_type != "point":
+        raise InputError(f"sky.foregrounds.path: {settings.path} holds a HEALPix map; a catalogue of points is needed")
+    at_centre = _at_frequency(sky, float(np.mean(frequencies)))
+    flux = at_centre.stokes[0, 0].to_value("Jy")
+    flux = np.where(np.isfinite(flux), flux, -np.inf)
+    if settings.spectrum == "flat":
+        # One flux for all channels: what the catalogue says of the middle of the band.
+        sky = SkyModel(
+            name=sky.name,
+            skycoord=sky.skycoord,
+            stokes=at_centre.stokes,
+            spectral_type="flat",
+            component_type="point",
+            history="calstudy foregrounds",
+        )
+    elif sky.spectral_type == "full" and not _has_frequencies(sky, frequencies):
+        raise InputError(
+            f"sky.foregrounds.path: {settings.path} tabulates fluxes at frequencies other than the channels; use "
+            "spectrum: flat"
+        )
+    chosen = brightest(flux, settings)
+    stand_in = f"foregrounds: {len(chosen)} sources of {settings.path.name}"
+    return Foregrounds(sky.select(component_inds=chosen, inplace=False), stand_in)
+
+
+def _at_frequency(sky: SkyModel, frequency: float) -> SkyModel:
+    """Return the catalogue at one frequency in Hz, or at the tabulated one next to it if it has no others."""
+    if sky.spectral_type == "flat":
+        return sky
+    if sky.spectral_type == "full":
+        tabulated = sky.freq_array.to_value("Hz")
+        frequency = tabulated[np.abs(tabulated - frequency).argmin()]
+    # Cubic interpolation between sub-bands, the default, needs four of them.
+    kind = "linear" if sky.spectral_type == "subband" and sky.Nfreqs < 4 else "cubic"
+    return sky.at_frequencies(np.array([frequency]) * units.Hz, inplace=False, freq_interp_kind=kind)
+
+
+def _has_frequencies(sky: SkyModel, frequencies: np.ndarray) -> bool:
+    tabulated = sky.freq_array.to_value("Hz")
+    return all(np.abs(tabulated - frequency).min() < FREQUENCY_TOLERANCE for frequency in frequencies)
+
+
+def _require_idl(path: Path) -> None:
+    """Raise ValueError unless a file begins as IDL save files do; scipy raises a bare Exception for others."""
+    with path.open("rb") as stream:
+        if stream.read(2) != b"SR":
+            raise ValueError("not an IDL save file")
+
+
+def _read(path: Path) -> SkyModel:
+    if not path.is_file():
+        raise InputError(f"sky.foregrounds.path: there is no file {path}")
+    try:
+        if path.suffix == ".sav":
+            _require_idl(path)
+            with warnings.catch_warnings():
+                # Names are not used here; pyradiosky numbers those that occur twice.
+                warnings.filterwarnings("ignore", message="Source IDs are not unique")
+                return SkyModel.from_fhd_catalog(str(path), expand_extended=False)
+        return SkyModel.from_file(str(path))
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"sky.foregrounds.path: {path} cannot be read as a catalogue ({error})") from error

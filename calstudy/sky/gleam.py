@@ -1,0 +1,94 @@
+"""The GLEAM extragalactic catalogue: where it is kept, fetching it, and proving that it is what it should be."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from pathlib import Path
+
+import pooch
+
+from calstudy.errors import InputError
+from calstudy.sky.catalogue import read_gleam_table
+
+LOG = logging.getLogger(__name__)
+
+# Hurley-Walker et al. (2017), second release.
+URL = (
+    "https://vizier.cds.unistra.fr/viz-bin/votable?-source=VIII/100/gleamegc&-out.max=unlimited"
+    "&-out=GLEAM&-out=RAJ2000&-out=DEJ2000&-out=Fintwide&-out=alpha"
+)
+FILE = "gleam_egc.vot"
+SOURCES = 307_455
+
+
+def default_directory() -> Path:
+    """Return where catalogues are kept on this machine."""
+    return Path(pooch.os_cache("calstudy"))
+
+
+def default_path() -> Path:
+    """Return where `fetch_gleam` puts the catalogue unless told otherwise."""
+    return default_directory() / FILE
+
+
+def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
+    """Download the GLEAM extragalactic catalogue from VizieR, or check the copy that is there.
+
+    VizieR writes the table anew for every request and publishes no hash of it. So the first download is accepted if it
+    has the columns needed and the 307,455 sources published; its SHA-256 is then kept beside it, and the copy must
+    have that hash ever after.
+
+    Parameters
+    ----------
+    directory
+        Where to put it, `default_directory` by default; made if need be.
+    progress
+        Whether to show a progress bar.
+
+    Raises
+    ------
+    InputError
+        If the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
+    """
+    directory = default_directory() if directory is None else directory
+    path = directory / FILE
+    if path.is_file() and hash_file(path).is_file():
+        verify(path)
+        return path
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        # `known_hash=None` makes pooch accept an existing file as it is: one that was never proved goes first.
+        path.unlink(missing_ok=True)
+        pooch.retrieve(URL, known_hash=None, fname=FILE, path=directory, progressbar=progress)
+    except (OSError, ValueError) as error:
+        raise InputError(f"GLEAM cannot be downloaded from VizieR to {directory} ({error})") from error
+    try:
+        found = len(read_gleam_table(path))
+    except InputError:
+        path.unlink()
+        raise
+    if found != SOURCES:
+        path.unlink()
+        raise InputError(f"the download from VizieR holds {found} sources, GLEAM has {SOURCES}: try again")
+    hash_file(path).write_text(f"{_sha256(path)}  {FILE}\n")
+    return path
+
+
+def verify(path: Path) -> None:
+    """Raise InputError if a fetched catalogue has changed since; a user's own file, without a hash, is not checked."""
+    if hash_file(path).is_file() and hash_file(path).read_text().split()[:1] != [_sha256(path)]:
+        raise InputError(
+            f"{path} has changed since it was downloaded: remove it and {hash_file(path).name}, "
+            "and run `calstudy data fetch gleam`"
+        )
+
+
+def hash_file(path: Path) -> Path:
+    """Return the file beside a fetched catalogue that holds its SHA-256."""
+    return path.with_name(path.name + ".sha256")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,80 @@
+"""The `sky` section of an experiment file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from calstudy.schema import Section, choice
+from calstudy.units import FluxDensity, PowerDensity
+
+
+class PointSources(Section):
+    """What every catalogue of point sources shares."""
+
+    flux_limit: FluxDensity = Field(0.05, ge=0, description="Keep sources brighter than this.")
+    spectrum: Literal["flat", "catalogue"] = Field(
+        "flat", description="One flux for all channels as in the paper, or the catalogue's own spectral indices."
+    )
+    count: int | None = Field(None, ge=1, description="Keep only the brightest `count` sources (all by default).")
+
+
+class GleamSources(PointSources):
+    """The GLEAM extragalactic catalogue (Hurley-Walker et al. 2017, VizieR VIII/100)."""
+
+    kind: Literal["gleam"]
+    path: Path | None = Field(
+        None, strict=False, description="Catalogue file; by default the one that `calstudy data fetch gleam` stores."
+    )
+
+
+class SyntheticSources(PointSources):
+    """Real bright G4Jy components (White et al. 2020) plus a faint population from counts (Franzen et al. 2019)."""
+
+    kind: Literal["g4jy-and-counts"] = "g4jy-and-counts"
+    flux_limit: FluxDensity = Field(
+        0.05, ge=0.001, description="Keep sources brighter than this; the counts are measured down to 1 mJy."
+    )
+    seed: int = Field(1, ge=0, description="Seed of the synthetic population's positions and fluxes.")
+
+
+class FileSources(PointSources):
+    """Any catalogue that pyradiosky reads: SkyH5, VOTable, FHD .sav, pyradiosky text."""
+
+    kind: Literal["file"]
+    path: Path = Field(strict=False)
+
+
+class NoSources(Section):
+    """No foregrounds."""
+
+    kind: Literal["none"]
+
+
+Foregrounds = Annotated[
+    GleamSources | SyntheticSources | FileSources | NoSources,
+    Field(discriminator="kind"),
+    choice("kind", "g4jy-and-counts"),
+]
+
+
+class Eor(Section):
+    """A Gaussian random 21 cm brightness with a known power spectrum, as a HEALPix map per channel."""
+
+    spectrum: Literal["flat", "power-law"] = "flat"
+    amplitude: PowerDensity = Field(
+        12482.356, gt=0, description="P(k), or P at `pivot_k` for a power law (paper §Simulations)."
+    )
+    index: float = Field(0.0, ge=-3.5, le=1.0, description="P(k) = amplitude (k / pivot)^index; only for a power law.")
+    pivot_k: float = Field(0.1, gt=0, description="Pivot of the power law, in 1/Mpc (no h).")
+    nside: Literal[16, 32, 64, 128, 256] = Field(256, description="HEALPix resolution.")
+    seed: int = Field(2, ge=0)
+
+
+class SkySettings(Section):
+    """The foregrounds and the 21 cm signal."""
+
+    foregrounds: Foregrounds = SyntheticSources()
+    eor: Eor = Eor()

@@ -1,0 +1,203 @@
+"""From UVData to UVCal and back: conventions, flags, records, and inputs left alone."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from astropy.coordinates import EarthLocation
+from conftest import FREQUENCIES, HEX, make_toy, scattered
+from pyuvdata import Telescope, UVData
+from pyuvdata.utils import ECEF_from_ENU, uvcalibrate
+
+from calstudy.calibrate.calamity import calibrate
+from calstudy.calibrate.problem import gain_products
+from calstudy.calibrate.settings import BasisSettings, CalibrationSettings, FirstOrderSettings, GaussNewtonSettings
+from calstudy.visibilities import antenna_pairs, from_cube, to_cube
+
+SETTINGS = CalibrationSettings(basis=BasisSettings(min_delay="50 ns", buffer="50 ns"))
+SITE = EarthLocation.from_geodetic(116.67, -26.7, 377.8)
+
+
+def make_uvdata(toy, n_times=3, polarizations=(-5,), skip=2):
+    """Wrap a toy as UVData with antenna numbers that are not their indices; times differ by a little noise."""
+    numbers = 10 + 2 * np.arange(len(toy.positions))
+    ecef = ECEF_from_ENU(toy.positions, center_loc=SITE) - np.array([axis.to_value("m") for axis in SITE.geocentric])
+    telescope = Telescope.new(
+        name="toy",
+        location=SITE,
+        antenna_positions=ecef,
+        antenna_numbers=numbers,
+        antenna_names=[f"ant{number}" for number in numbers],
+        instrument="toy",
+        feed_array=["x", "y"],
+        feed_angle=[np.pi / 2, 0.0],
+        mount_type="fixed",
+        update_from_known=False,
+    )
+    uvd = UVData.new(
+        freq_array=FREQUENCIES,
+        polarization_array=np.array(polarizations),
+        times=2459000.5 + np.arange(n_times) * 2 / 86400,
+        antpairs=numbers[toy.antennas],
+        do_blt_outer=True,
+        time_axis_faster_than_bls=False,
+        integration_time=2.0,
+        channel_width=float(np.diff(FREQUENCIES)[0]),
+        telescope=telescope,
+        vis_units="Jy",
+        pol_convention="sum",
+        update_telescope_from_known=False,
+    )
+    rng = np.random.default_rng(12)
+    cube = np.repeat(toy.visibilities[None, :, :, None], n_times, 0).repeat(len(polarizations), 3)
+    cube = cube * (1 + 1e-4 * rng.standard_normal((n_times, 1, 1, len(polarizations))))
+    uvd = from_cube(uvd, cube)
+    uvd.flag_array[:] = False
+    uvd.nsample_array[:] = 1
+    return uvd
+
+
+@pytest.fixture(scope="module")
+def data(toy):
+    return make_uvdata(toy)
+
+
+@pytest.fixture(scope="module")
+def result(data):
+    return calibrate(data, SETTINGS)
+
+
+def test_products_follow_pyuvdatas_conventions(data, result):
+    gains = result.gains
+    assert gains.gain_convention == "divide"
+    assert gains.gain_array.shape == (8, 64, 3, 1)
+    assert not gains.flag_array.any()
+    gains.check()
+    calibrated = uvcalibrate(data, gains, inplace=False)
+    expected = to_cube(result.model) + to_cube(result.residual)
+    assert np.abs(to_cube(calibrated) - expected).max() < 1e-10 * np.abs(expected).max()
+
+
+def test_residual_is_at_the_noise(toy, result):
+    truth, noise = toy.foregrounds, np.sqrt(np.mean(np.abs(toy.noise) ** 2))
+    residual = to_cube(result.residual)[..., 0]
+    assert np.sqrt(np.mean(np.abs(residual) ** 2)) < noise
+    products = gain_products(result.gains.gain_array[:, :, 0, 0], toy.antennas)
+    true_products = gain_products(toy.gains, toy.antennas)
+    error = products * to_cube(result.model)[0, :, :, 0] - true_products * truth
+    assert np.sqrt(np.mean(np.abs(error) ** 2)) < noise
+
+
+def test_records_tell_each_solve(data, result):
+    assert [record.integration for record in result.solutions] == [0, 1, 2]
+    assert {record.status for record in result.solutions} == {"converged"}
+    summary = json.loads(json.dumps(result.summary()))
+    assert summary["by_status"] == {"converged": 3}
+    assert all(record["last_loss"] < record["first_loss"] for record in summary["records"])
+
+
+def test_inputs_are_not_mutated(toy):
+    data, sky = make_uvdata(toy, 1), make_uvdata(toy, 1)
+    data.flag_array[0, 5] = True
+    data.data_array[0, 5] = np.nan
+    before, sky_before = data.copy(), sky.copy()
+    calibrate(data, SETTINGS, sky)
+    assert np.array_equal(data.data_array, before.data_array, equal_nan=True)
+    assert np.array_equal(data.flag_array, before.flag_array)
+    assert sky == sky_before
+
+
+def test_flags_are_carried_and_have_no_influence(toy):
+    data = make_uvdata(toy, 3)
+    pairs = antenna_pairs(data)
+    flags = data.flag_array.reshape(3, -1, 64)
+    flags[1] = True
+    flags[:, (pairs == 14).any(1)] = True
+    flags[:, :, 7] = True
+    flags[0, 4, 30:35] = True
+    spoiled = data.copy()
+    spoiled.data_array[spoiled.flag_array] = 1e6
+    spoiled.data_array[0, 7] = np.nan
+    result, again = calibrate(data, SETTINGS), calibrate(spoiled, SETTINGS)
+    assert np.array_equal(result.gains.gain_array, again.gains.gain_array)
+    assert np.array_equal(result.model.data_array, again.model.data_array)
+    assert np.array_equal(result.residual.data_array, again.residual.data_array)
+    assert [record.status for record in result.solutions] == ["converged", "skipped", "converged"]
+    assert "flagged" in result.solutions[1].message
+    assert np.array_equal(result.residual.flag_array, data.flag_array)
+    gain_flags = result.gains.flag_array[..., 0]
+    dead = list(result.gains.ant_array).index(14)
+    assert gain_flags[:, :, 1].all() and gain_flags[dead].all() and gain_flags[:, 7].all()
+    assert not np.delete(np.delete(gain_flags[:, :, [0, 2]], 7, 1), dead, 0).any()
+
+
+def test_sky_model_sets_the_scale(toy, data):
+    truth = from_cube(data, np.repeat(toy.foregrounds[None, :, :, None], 3, 0))
+    louder = from_cube(data, 4 * to_cube(truth))
+    result = calibrate(data, SETTINGS, truth)
+    quadruple = calibrate(data, SETTINGS, louder)
+    assert np.allclose(quadruple.gains.gain_array, result.gains.gain_array / 2, rtol=1e-5)
+    total, expected = to_cube(result.model).sum(), to_cube(truth).sum()
+    assert total.real * expected.real + total.imag * expected.imag == pytest.approx(abs(total) ** 2, rel=1e-3)
+
+
+def test_polarizations_are_solved_independently(toy, result):
+    both = make_uvdata(toy, 1, polarizations=(-5, -6))
+    solved = calibrate(both, SETTINGS)
+    assert [record.polarization for record in solved.solutions] == [-5, -6]
+    assert list(solved.gains.jones_array) == [-5, -6]
+    alone = calibrate(both.select(polarizations=[-6], inplace=False), SETTINGS)
+    assert np.allclose(alone.gains.gain_array[..., 0], solved.gains.gain_array[..., 1], rtol=1e-12)
+
+
+def test_redundant_modelling_of_a_perfect_hexagon():
+    toy = make_toy(HEX, noise=1e-3)
+    settings = SETTINGS.model_copy(update={"calibrator": "calamity-redundant"})
+    result = calibrate(make_uvdata(toy, 2), settings)
+    model = to_cube(result.model)[0, :, :, 0]
+    same = np.linalg.norm(toy.vectors - toy.vectors[0], axis=1) < 0.1
+    assert same.sum() > 1
+    assert np.array_equal(model[same], np.broadcast_to(model[0], model[same].shape))
+    assert {record.status for record in result.solutions} == {"converged"}
+
+
+def test_autocorrelations_are_left_out_unless_asked_for():
+    toy = make_toy(scattered(6), autos=True)
+    data = make_uvdata(toy, 1)
+    assert calibrate(data, SETTINGS).model.Nbls == 15
+    result = calibrate(data, SETTINGS.model_copy(update={"autos": True}))
+    assert result.model.Nbls == 21
+    noise = np.sqrt(np.mean(np.abs(toy.noise) ** 2))
+    assert np.sqrt(np.mean(np.abs(result.residual.data_array) ** 2)) < noise
+
+
+def test_not_converging_is_recorded_not_raised(data):
+    settings = SETTINGS.model_copy(update={"solver": GaussNewtonSettings(max_steps=1)})
+    result = calibrate(data, settings)
+    assert {record.status for record in result.solutions} == {"max-steps"}
+    assert not result.gains.flag_array.any()
+
+
+def test_adamax_is_one_setting_away(data):
+    settings = SETTINGS.model_copy(update={"solver": FirstOrderSettings(name="adamax", max_steps=100)})
+    ticks = []
+    result = calibrate(data, settings, progress=lambda done, total: ticks.append((done, total)))
+    assert ticks == [(1, 3), (2, 3), (3, 3)]
+    assert all(record.n_steps == 100 for record in result.solutions)
+
+
+def test_bad_data_are_refused_in_one_sentence(toy, data):
+    broken = data.copy()
+    broken.data_array[3, 4] = np.nan
+    with pytest.raises(ValueError, match="1 unflagged visibilities are not finite, the first on baseline"):
+        calibrate(broken, SETTINGS)
+    with pytest.raises(ValueError, match="sky model must have"):
+        calibrate(data, SETTINGS, make_uvdata(toy, 2))
+    with pytest.raises(ValueError, match="no autocorrelations"):
+        calibrate(data, SETTINGS.model_copy(update={"autos": True}))
+    crossed = data.copy()
+    crossed.polarization_array = np.array([-7])
+    with pytest.raises(ValueError, match="polarizations: xy"):
+        calibrate(crossed, SETTINGS)

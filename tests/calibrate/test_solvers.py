@@ -1,0 +1,214 @@
+"""Solvers reach the same minimum, reproduce noiseless data, and say when they did not converge."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import make_toy, scattered
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_calibration_loss import redundant_structure
+
+from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
+from calstudy.calibrate.solvers.first_order import FirstOrder
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton
+from calstudy.calibrate.solvers.interface import solve, solve_warm
+
+
+def in_the_span(toy):
+    """The foregrounds as the basis can hold them exactly."""
+    foregrounds = toy.foregrounds.copy()
+    for bucket in toy.basis.buckets:
+        foregrounds[bucket.members] = foregrounds[bucket.members] @ bucket.vectors @ bucket.vectors.T
+    return foregrounds
+
+
+def product_error(problem, solution):
+    """Largest difference between g g* F and the data where they are used, relative to the data's rms."""
+    used = problem.weights > 0
+    data = problem.visibilities[used]
+    fitted = (gain_products(solution.gains, problem.structure.antennas) * solution.model)[used]
+    return np.abs(fitted - data).max() / np.sqrt(np.mean(np.abs(data) ** 2))
+
+
+@pytest.fixture(scope="module")
+def converged(toy):
+    problem = toy.problem()
+    return problem, solve(problem, GaussNewton(tolerance=1e-5, max_steps=200))
+
+
+def test_gauss_newton_converges(converged):
+    _, solution = converged
+    assert solution.status == "converged", solution.message
+    assert (np.diff(solution.loss_history) <= 0).all()
+    assert solution.n_steps == solution.loss_history.size - 1
+
+
+def test_adamax_descends_to_the_same_minimum(converged):
+    problem, best = converged
+    adamax = solve(problem, FirstOrder(learning_rate=1e-3, max_steps=6000, precision="double"))
+    assert best.loss_history[-1] < adamax.loss_history.min() < 1.02 * best.loss_history[-1]
+    ratio = gain_products(adamax.gains / best.gains, problem.structure.antennas) * adamax.model / best.model
+    assert np.median(np.abs(ratio - 1)) < 1e-3
+
+
+def test_noiseless_data_are_reproduced(quiet):
+    antennas = quiet.antennas
+    problem = quiet.problem(visibilities=gain_products(quiet.gains, antennas) * in_the_span(quiet))
+    solution = solve(problem, GaussNewton(max_steps=500))
+    assert solution.status == "converged", solution.message
+    assert product_error(problem, solution) < 1e-6
+
+
+def test_solution_at_the_truth_is_exact(quiet):
+    problem = quiet.problem(
+        visibilities=gain_products(quiet.gains, quiet.antennas) * in_the_span(quiet), initial_gains=quiet.gains
+    )
+    assert product_error(problem, solve(problem, GaussNewton())) < 1e-10
+    assert product_error(problem, solve(problem, FirstOrder(max_steps=1))) < 1e-5
+    assert product_error(problem, solve(problem, FirstOrder(max_steps=1, precision="double"))) < 1e-10
+
+
+@pytest.mark.parametrize(
+    "solver", [GaussNewton(max_steps=1), FirstOrder(max_steps=1), FirstOrder(max_steps=70)], ids=lambda s: repr(s)[:20]
+)
+def test_not_converging_is_a_status_with_a_sentence(toy, solver):
+    solution = solve(toy.problem(), solver)
+    assert solution.status == "max-steps"
+    assert "not converged" in solution.message
+    assert solution.n_steps == solver.max_steps
+    assert solution.usable
+
+
+def test_divergence_is_reported_as_failure(toy):
+    solution = solve(toy.problem(), FirstOrder("sgd", learning_rate=1e9, max_steps=100))
+    assert solution.status == "failed"
+    assert not solution.usable
+    assert "not finite" in solution.message
+
+
+def test_best_parameters_are_kept(toy):
+    problem = toy.problem(prior="none")
+    solution = solve(problem, FirstOrder(learning_rate=0.05, max_steps=120, precision="double"))
+    residual = problem.visibilities - gain_products(solution.gains, toy.antennas) * solution.model
+    assert np.sum(problem.weights * np.abs(residual) ** 2) == pytest.approx(solution.loss_history.min(), rel=1e-9)
+    assert solution.loss_history.min() < solution.loss_history[-1]
+
+
+def test_warm_start_needs_fewer_steps_for_the_same_minimum(toy):
+    problem, solver = toy.problem(), GaussNewton()
+    cold, warm = solve_warm(problem, solver)
+    other = make_toy(scattered(8), seed=2)
+    moved = CalibrationProblem(
+        problem.structure,
+        problem.visibilities + 1e-3 * other.foregrounds,
+        problem.weights,
+        problem.initial_gains,
+    )
+    again = solve_warm(moved, solver, warm)[0]
+    fresh = solve(moved, solver)
+    assert again.status == fresh.status == "converged"
+    assert again.n_steps < fresh.n_steps
+    assert again.loss_history[-1] == pytest.approx(fresh.loss_history[-1], rel=2e-2)
+
+
+@pytest.mark.parametrize("solver", [GaussNewton(), FirstOrder(max_steps=20)], ids=lambda s: type(s).__name__)
+def test_flagged_samples_have_no_influence(toy, solver):
+    rng = np.random.default_rng(11)
+    flags = rng.random(toy.foregrounds.shape) < 0.1
+    flags[:, 20] = True
+    flags[3] = True
+    flags[:, 40:46] = True
+    flags[(toy.antennas == 5).any(1)] = True
+    structure, weights = toy.structure, flag_weights(flags)
+    clean = solve(toy.problem(structure, weights=weights), solver)
+    spoiled = np.where(flags, rng.choice([np.nan, 1e9, -3j], flags.shape), toy.visibilities)
+    dirty = solve(toy.problem(structure, weights=weights, visibilities=spoiled), solver)
+    assert np.array_equal(clean.gains, dirty.gains)
+    assert np.array_equal(clean.model, dirty.model)
+    assert clean.usable and clean.loss_history[-1] < 0.1 * clean.loss_history[0]
+
+
+@pytest.mark.parametrize(
+    "solver", [GaussNewton(max_steps=300), FirstOrder(max_steps=3000)], ids=lambda s: type(s).__name__
+)
+def test_redundant_models_are_recovered(hexagon, solver):
+    per_baseline = hexagon.structure
+    structure = redundant_structure(hexagon)
+    foregrounds = in_the_span(hexagon)
+    turned = (structure.antennas[:, 0] != per_baseline.antennas[:, 0])[:, None]
+    foregrounds = np.where(turned, foregrounds.conj(), foregrounds)
+    problem = hexagon.problem(structure, visibilities=gain_products(hexagon.gains, structure.antennas) * foregrounds)
+    solution = solve(problem, solver)
+    limit = 1e-6 if isinstance(solver, GaussNewton) else 3e-3
+    assert product_error(problem, solution) < limit
+    models = np.where(structure.conjugated[:, None], solution.model.conj(), solution.model)
+    for group in range(structure.basis.n_models):
+        members = models[structure.groups == group]
+        assert np.array_equal(members, np.broadcast_to(members[0], members.shape))
+
+
+@given(
+    scale=st.floats(0.1, 10),
+    phase=st.lists(st.floats(-np.pi, np.pi), min_size=64, max_size=64),
+    prior=st.sampled_from(["sum", "post-hoc"]),
+)
+@settings(max_examples=30, deadline=None)
+def test_degeneracies_do_not_touch_data_and_are_always_fixed_alike(scale, phase, prior):
+    toy = make_toy(scattered(4))
+    problem = toy.problem(prior=prior)
+    gains, model = fix_degeneracies(toy.gains, toy.foregrounds, problem)
+    moved_gains = toy.gains / np.sqrt(scale) * np.exp(1j * np.array(phase))
+    again_gains, again_model = fix_degeneracies(moved_gains, toy.foregrounds * scale, problem)
+    products = gain_products(gains, toy.antennas)
+    assert np.allclose(products * model, gain_products(toy.gains, toy.antennas) * toy.foregrounds, rtol=1e-12, atol=0)
+    residual = toy.visibilities / products - model
+    again = toy.visibilities / gain_products(again_gains, toy.antennas) - again_model
+    assert np.abs(residual - again).max() < 1e-11 * np.abs(model).max()
+    assert np.allclose(gains, again_gains, rtol=1e-11, atol=0)
+
+
+def test_residual_does_not_know_where_the_solver_drifted(converged):
+    """Gains of the solver before fixing, moved along the nulls, give the same loss."""
+    problem, solution = converged
+    drifted = solution.gains * 1.3 * np.exp(2j * np.linspace(0, 1, 64))
+    moved = CalibrationProblem(problem.structure, problem.visibilities, problem.weights, drifted, prior="none")
+    again = solve(moved, GaussNewton(max_steps=1))
+    assert again.loss_history[0] == pytest.approx(solution.loss_history[-1], rel=1e-9)
+
+
+def test_fixed_gains_have_the_phase_of_the_reference(toy):
+    fixed = fix_phase(toy.gains * np.exp(1j * np.linspace(0, 9, 64)), np.ones_like(toy.gains))
+    assert np.abs(fixed.sum(0).imag).max() < 1e-12
+    assert fixed.sum(0).real.min() > 0
+
+
+def test_sum_prior_is_at_its_minimum(converged):
+    problem, solution = converged
+
+    def prior(scale):
+        return abs(scale * np.sum(problem.weights * solution.model) - problem.prior_target) ** 2
+
+    assert prior(1) <= min(prior(0.999), prior(1.001))
+    opposite = CalibrationProblem(
+        problem.structure, problem.visibilities, problem.weights, problem.initial_gains, -solution.model
+    )
+    assert solve(opposite, GaussNewton(max_steps=3)).status == "failed"
+
+
+def test_bad_problems_are_refused_in_one_sentence(toy):
+    with pytest.raises(ValueError, match="weights"):
+        toy.problem(weights=-np.ones(toy.foregrounds.shape))
+    with pytest.raises(ValueError, match="visibilities: not finite"):
+        toy.problem(visibilities=np.full(toy.foregrounds.shape, np.nan))
+    with pytest.raises(ValueError, match="nothing to calibrate"):
+        toy.problem(weights=np.zeros(toy.foregrounds.shape))
+    with pytest.raises(ValueError, match="initial_gains"):
+        toy.problem(initial_gains=np.zeros(toy.gains.shape))
+    with pytest.raises(ValueError, match="visibilities: shape"):
+        toy.problem(visibilities=toy.visibilities[1:])
+    with pytest.raises(ValueError, match="prior"):
+        toy.problem(prior="sky")
+    with pytest.raises(ValueError, match="groups"):
+        FitStructure(toy.antennas, 8, toy.basis, np.zeros(28, int), np.zeros(28, bool))

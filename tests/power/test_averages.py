@@ -1,0 +1,291 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from astropy import constants
+from hera_pspec import grouping
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calstudy.instrument.settings import HexLayout, MwaLayout
+from calstudy.power import cosmology as c
+from calstudy.power import delay, errors
+from calstudy.power.estimate import estimate_power
+from calstudy.power.settings import KBins, PowerSettings
+from calstudy.power.spectra import DelaySpectra, delay_spectra
+from calstudy.power.spherical import make_bin_edges, outside_wedge, spherical_average
+from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
+from calstudy.power.wedge import WedgeSpectrum, cylindrical_average
+from calstudy.visibilities import baseline_vectors
+
+pytestmark = pytest.mark.filterwarnings("ignore:The Telescope.x_orientation attribute is deprecated:DeprecationWarning")
+
+SETTINGS = PowerSettings(bins=KBins(max="2.0 h/Mpc", width="0.1 h/Mpc"))
+FREQUENCY, WIDTH, OMEGA_PP = 182e6, 80e3, 0.07
+
+
+def make_spectra(power, vectors, n_pairs=None, taper="blackman-harris", n_polarizations=1):
+    cosmo, tau = c.make_cosmology("Planck15"), delay.delays(power.shape[1], WIDTH)
+    return DelaySpectra(
+        power=power,
+        vectors=vectors,
+        n_pairs=np.ones(len(vectors), dtype=int) if n_pairs is None else n_pairs,
+        n_polarizations=n_polarizations,
+        delay=tau,
+        k_perp=c.k_perpendicular(cosmo, np.linalg.norm(vectors, axis=1), FREQUENCY),
+        k_parallel=c.k_parallel(cosmo, tau, FREQUENCY),
+        frequency=FREQUENCY,
+        omega_pp=OMEGA_PP,
+        taper=taper,
+    )
+
+
+def white_delay_spectra(rng, shape, taper):
+    """Tapered delay spectra of unit-variance noise: mean power one at each delay."""
+    noise = (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
+    window = delay.make_taper(taper, shape[-1])
+    return np.fft.fftshift(np.fft.fft(noise * window, axis=-1), axes=-1) / np.sqrt(np.sum(window**2))
+
+
+def cross_group(even, odd):
+    """Mean over i != j of conj(even_i) odd_j; arrays of shape (..., n, Nd)."""
+    n = even.shape[-2]
+    total = even.conj().sum(axis=-2) * odd.sum(axis=-2) - (even.conj() * odd).sum(axis=-2)
+    return total / (n * (n - 1))
+
+
+@pytest.fixture(
+    scope="module", params=[MwaLayout(kind="mwa-compact-minredundant", count=7), HexLayout(kind="hex", side=2)]
+)
+def estimated(request, observe, white, beam):
+    template, rng = observe(request.param, n_channels=24), np.random.default_rng(8)
+    return estimate_power(white(template, rng), white(template, rng), beam, SETTINGS)
+
+
+def test_spherical_average_equals_hera_pspec(estimated):
+    mine = spherical_average(delay_spectra(estimated, SETTINGS), SETTINGS, exclude_wedge=False)
+    theirs = grouping.spherical_average(estimated, mine.k, np.diff(mine.bin_edges))
+    filled = mine.n_modes > 0
+    assert filled.sum() > 3
+    # Baselines of a group differ by centimetres, so that modes next to an edge may change bins.
+    np.testing.assert_allclose(mine.power[filled], theirs.data_array[0][0, filled, 0], rtol=1e-9)
+
+
+def test_units_are_baselines_or_groups(estimated):
+    spectra = delay_spectra(estimated, SETTINGS)
+    assert spectra.n_pairs.sum() == estimated.Nblpairs
+    assert np.mean(spectra.power * spectra.n_pairs[:, None]) * len(spectra.n_pairs) / estimated.Nblpairs == (
+        pytest.approx(estimated.data_array[0].mean(), rel=1e-9)
+    )
+    lengths = np.repeat(spectra.length, spectra.n_pairs)
+    np.testing.assert_allclose(np.sort(lengths), np.sort(estimated.get_blpair_seps()), atol=1e-3)
+    np.testing.assert_allclose(spectra.k_parallel, estimated.get_kparas(0), rtol=1e-6)
+
+
+def test_flagged_baselines_are_left_out(observe, white, beam):
+    template, rng = (
+        observe(MwaLayout(kind="mwa-compact-minredundant", count=5), n_channels=16),
+        np.random.default_rng(9),
+    )
+    even, odd = white(template, rng), white(template, rng)
+    even.flag_array[3] = True
+    spectra = delay_spectra(estimate_power(even, odd, beam, SETTINGS), SETTINGS)
+    assert len(spectra.n_pairs) == template.Nbls - 1
+    removed = np.linalg.norm(baseline_vectors(template)[3])
+    assert np.abs(spectra.length - removed).min() > 0.01
+    even.flag_array[:] = True
+    with pytest.raises(ValueError, match="all pairs of baselines are flagged"):
+        delay_spectra(estimate_power(even, odd, beam, SETTINGS), SETTINGS)
+
+
+@given(
+    n_units=st.integers(1, 12),
+    n_delays=st.integers(4, 40),
+    seed=st.integers(0, 999),
+    buffer=st.floats(0, 5e-6),
+)
+def test_averages_of_a_constant_are_that_constant(n_units, n_delays, seed, buffer):
+    rng = np.random.default_rng(seed)
+    vectors, n_pairs = rng.normal(size=(n_units, 3)) * 50, rng.integers(1, 9, n_units)
+    spectra = make_spectra(np.full((n_units, n_delays), 3.0 - 2.0j), vectors, n_pairs)
+    settings = PowerSettings(wedge_buffer=f"{buffer} s")
+    outside, everything = (spherical_average(spectra, settings, exclude_wedge=e) for e in (True, False))
+    for spectrum in (outside, everything):
+        filled = spectrum.n_modes > 0
+        np.testing.assert_allclose(spectrum.power[filled], 3.0 - 2.0j)
+        assert np.isnan(spectrum.power[~filled]).all()
+        assert ((spectrum.sample_modes > 0) == filled).all()
+        assert (spectrum.sample_modes <= spectrum.n_modes * (1 + 1e-9)).all()
+    assert (outside.n_modes <= everything.n_modes).all()
+    assert (
+        outside.n_modes.sum()
+        == outside_wedge(spectra, buffer)[
+            np.hypot(spectra.k_perp[:, None], spectra.k_parallel) <= everything.bin_edges[-1]
+        ].sum()
+    )
+    for folded in (True, False):
+        np.testing.assert_allclose(cylindrical_average(spectra, settings, folded).power, 3.0 - 2.0j)
+
+
+def test_the_wedge_mask_is_the_horizon_plus_the_buffer():
+    vectors = np.array([[30.0, 0, 0], [0, 90.0, 0]])
+    spectra = make_spectra(np.ones((2, 384), dtype=complex), vectors)
+    mask = outside_wedge(spectra, 100e-9)
+    for row, length in zip(mask, (30.0, 90.0), strict=True):
+        edge = length / constants.c.value + 100e-9
+        assert np.abs(spectra.delay[row]).min() > edge
+        assert np.abs(spectra.delay[~row]).max() <= edge
+
+
+def test_bins_reach_the_maximum():
+    edges = make_bin_edges(KBins())
+    assert edges.size == 86 and edges[-1] == pytest.approx(3.4)
+    assert make_bin_edges(KBins(max="1.0 h/Mpc", width="0.3 h/Mpc"))[-1] == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize("n_delays", [15, 16])
+def test_folding_averages_opposite_delays(n_delays):
+    rng = np.random.default_rng(1)
+    power = rng.normal(size=(6, n_delays)) + 1j * rng.normal(size=(6, n_delays))
+    spectra = make_spectra(power, rng.normal(size=(6, 3)) * 20)
+    flat, folded = (cylindrical_average(spectra, SETTINGS, f) for f in (False, True))
+    assert folded.delay[0] == 0 and folded.k_parallel[0] == 0
+    zero = n_delays // 2
+    np.testing.assert_allclose(folded.power[:, 0], flat.power[:, zero])
+    np.testing.assert_allclose(folded.power[:, 3], (flat.power[:, zero + 3] + flat.power[:, zero - 3]) / 2)
+    np.testing.assert_allclose(folded.delay[3], flat.delay[zero + 3])
+    if n_delays % 2 == 0:
+        np.testing.assert_allclose(folded.power[:, -1], flat.power[:, 0])
+    assert (np.diff(flat.baseline_length) > 0).all()
+    assert ((flat.bin_edges[:, 0] <= flat.baseline_length) & (flat.baseline_length < flat.bin_edges[:, 1])).all()
+    np.testing.assert_allclose(flat.horizon_delay, flat.baseline_length / constants.c.value)
+
+
+@pytest.mark.parametrize("taper", ["blackman-harris", "none"])
+@pytest.mark.parametrize("n", [1, 4])
+def test_noise_errors_equal_the_scatter(taper, n):
+    """Noise only: baselines with themselves (n = 1), or groups of n with the others of the group."""
+    rng, n_units, n_delays, n_trials = np.random.default_rng(21), 5, 48, 1500
+    vectors = rng.normal(size=(n_units, 3)) * 30
+    shape = (n_trials, n_units, n, n_delays)
+    even, odd = (white_delay_spectra(rng, shape, taper) for _ in range(2))
+    power = (even.conj() * odd)[:, :, 0] if n == 1 else cross_group(even, odd)
+    n_pairs = np.full(n_units, 1 if n == 1 else n * (n - 1))
+    trials = [spherical_average(make_spectra(p, vectors, n_pairs, taper), SETTINGS, exclude_wedge=True) for p in power]
+    values = np.array([trial.power.real for trial in trials])[:, trials[0].n_modes > 0]
+    levels = [errors.noise_level(make_spectra(p, vectors, n_pairs, taper)) for p in power]
+    assert np.sqrt(np.mean(np.square(levels))) == pytest.approx(np.sqrt(0.5), rel=0.01)
+    predicted = errors.with_errors(trials[0], noise=np.sqrt(0.5)).error[trials[0].n_modes > 0]
+    # 1500 trials give each standard deviation to 2 %.
+    np.testing.assert_allclose(values.std(axis=0), predicted, rtol=0.07)
+    assert np.mean(values.std(axis=0) / predicted) == pytest.approx(1.0, abs=0.015)
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_sample_variance_equals_the_scatter(n):
+    """Signal only, the same in all baselines of a group: crossing more of them does not help."""
+    rng, n_units, n_delays, n_trials = np.random.default_rng(22), 5, 48, 1500
+    vectors = rng.normal(size=(n_units, 3)) * 300
+    signal = white_delay_spectra(rng, (n_trials, n_units, n_delays), "blackman-harris")
+    power = np.abs(signal) ** 2 + 0j
+    n_pairs = np.full(n_units, 1 if n == 1 else n * (n - 1))
+    settings = PowerSettings(bins=KBins(min="1.5 h/Mpc", max="6.0 h/Mpc", width="0.5 h/Mpc"))
+    trials = [spherical_average(make_spectra(p, vectors, n_pairs), settings, False) for p in power]
+    values = np.array([trial.power.real for trial in trials])
+    expected = dataclasses.replace(trials[0], power=np.ones_like(trials[0].power))
+    predicted = errors.with_errors(expected, signal=expected)
+    filled = predicted.n_modes > 0
+    np.testing.assert_allclose(predicted.noise_error[filled], 0)
+    np.testing.assert_allclose(values.mean(axis=0)[filled], 1.0, rtol=0.05)
+    assert np.mean(values.std(axis=0)[filled] / predicted.error[filled]) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("n", [1, 5])
+@pytest.mark.parametrize("noise,low,high", [(0.0, 0.98, 1.02), (1e3, 0.98, 1.02), (1.0, 1.02, 1.25)])
+def test_the_sum_of_errors_is_right_in_the_limits_and_conservative_between(n, noise, low, high):
+    """One mode of signal power 1 and noise power `noise`, of a baseline or of a group of n."""
+    rng, n_trials = np.random.default_rng(23), 50000
+    signal = white_delay_spectra(rng, (n_trials, 1, 4), "none")
+    even, odd = (signal + np.sqrt(noise) * white_delay_spectra(rng, (n_trials, n, 4), "none") for _ in range(2))
+    power = (even.conj() * odd)[:, 0] if n == 1 else cross_group(even, odd)
+    products = 1 if n == 1 else n * (n - 1)
+    predicted = 1.0 + noise * np.sqrt(0.5 / products)
+    assert low <= predicted / power.real.std() <= high
+
+
+def test_signal_of_neighbouring_baselines_is_not_counted_twice():
+    """The scatter over white skies seen through a Gaussian beam by baselines a few metres apart."""
+    rng, n_trials, n_delays, sigma = np.random.default_rng(24), 1200, 8, np.sqrt(OMEGA_PP / np.pi)
+    vectors = np.array([[40, 0, 0], [41, 0, 0], [42.5, 1, 0], [-41.5, -1.5, 0], [60, 3, 0]], dtype=float)
+    axis = np.linspace(-4 * sigma, 4 * sigma, 33)
+    sky = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    response = np.exp(-0.5 * (sky**2).sum(axis=1) / sigma**2) * np.exp(
+        2j * np.pi * FREQUENCY / constants.c.value * vectors[:, :2] @ sky.T
+    )
+    response /= np.sqrt((np.abs(response) ** 2).sum(axis=1, keepdims=True))
+    brightness = rng.normal(size=(sky.shape[0], n_delays * n_trials))
+    visibilities = (response @ brightness).reshape(len(vectors), n_trials, n_delays)
+    power = np.abs(np.fft.fft(visibilities, axis=-1)) ** 2 / n_delays + 0j
+    settings = PowerSettings(bins=KBins(max="20.0 h/Mpc", width="20.0 h/Mpc"))
+    trials = [
+        spherical_average(make_spectra(power[:, t], vectors, taper="none"), settings, False) for t in range(n_trials)
+    ]
+    scatter = np.std([trial.power.real for trial in trials])
+    expected = dataclasses.replace(trials[0], power=np.ones(1, dtype=complex))
+    assert scatter / errors.with_errors(expected, signal=expected).error[0] == pytest.approx(1.0, abs=0.06)
+    assert trials[0].sample_modes[0] < 0.75 * trials[0].n_modes[0]
+
+
+def test_polarizations_share_the_signal_not_the_noise():
+    spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
+    two = dataclasses.replace(spectra, n_polarizations=2)
+    bins = np.zeros((3, 16), dtype=int)
+    np.testing.assert_allclose(errors.noise_modes(two, bins, 1), 2 * errors.noise_modes(spectra, bins, 1))
+    np.testing.assert_allclose(errors.sample_modes(two, bins, 1), errors.sample_modes(spectra, bins, 1))
+
+
+def test_errors_need_the_same_bins():
+    spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
+    first = spherical_average(spectra, SETTINGS, False)
+    other = spherical_average(spectra, PowerSettings(), False)
+    assert np.isnan(first.error).all()
+    with pytest.raises(ValueError, match="other bins"):
+        errors.with_errors(first, signal=other)
+
+
+def test_noise_power_from_visibilities_has_its_known_level(observe, white, beam):
+    """sigma_N = P_N / sqrt(2) with P_N from the standard deviation of the visibilities, groups or not."""
+    template = observe(HexLayout(kind="hex", side=3), n_channels=32)
+    cosmo, z = c.make_cosmology("Planck15"), c.redshift(template.freq_array.mean())
+    omega_pp = beam.solid_angles(template.freq_array, "xx")[1].mean()
+    kelvin = 2 * 0.5e-26 * (constants.c.value / template.freq_array.mean()) ** 2 / constants.k_B.value
+    volume = c.transverse_scale(cosmo, z) ** 2 * c.radial_scale(cosmo, z) * cosmo.h**3
+    p_noise = 1e6 * volume / omega_pp * WIDTH * (7.0 * kelvin) ** 2
+    for pairs in ("same-baseline", "redundant-group"):
+        rng, settings = np.random.default_rng(31), PowerSettings(pairs=pairs)
+        uvp = estimate_power(white(template, rng, 7.0), white(template, rng, 7.0), beam, settings)
+        level = errors.noise_level(delay_spectra(uvp, settings))
+        assert level == pytest.approx(p_noise / np.sqrt(2), rel=0.08)
+
+
+def test_tables_come_back(tmp_path):
+    rng = np.random.default_rng(2)
+    spectra = make_spectra(rng.normal(size=(6, 16)) + 0j, rng.normal(size=(6, 3)) * 20)
+    spherical = errors.with_errors(spherical_average(spectra, SETTINGS, True), noise=2.0)
+    wedge = cylindrical_average(spectra, SETTINGS)
+    for name, spectrum in (("s.h5", spherical), ("w.h5", wedge)):
+        save_spectrum(tmp_path / name, spectrum)
+        back = load_spectrum(tmp_path / name, type(spectrum))
+        for item in dataclasses.fields(spectrum):
+            np.testing.assert_array_equal(getattr(back, item.name), getattr(spectrum, item.name))
+        assert type(back) is type(spectrum)
+    assert load_spectrum(tmp_path / "s.h5", type(spherical)).wedge_excluded is True
+    with pytest.raises(ValueError, match="holds 'SphericalSpectrum', expected 'WedgeSpectrum'"):
+        load_spectrum(tmp_path / "s.h5", WedgeSpectrum)
+    write_csv(tmp_path / "s.csv", spherical)
+    lines = (tmp_path / "s.csv").read_text().splitlines()
+    assert lines[0].startswith("k [h/Mpc],power real [mK2 h-3 Mpc3]") and len(lines) == spherical.k.size + 1
+    row = np.array(lines[5].split(","), dtype=float)
+    np.testing.assert_array_equal(row[:2], [spherical.k[4], spherical.power.real[4]])

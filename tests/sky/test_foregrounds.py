@@ -1,0 +1,214 @@
+"""Foreground skies: counts, spectra, cuts, and what happens to files that cannot be used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.table import Table
+from pydantic import ValidationError
+from pyradiosky import SkyModel
+from scipy.integrate import quad
+
+from calstudy.errors import InputError
+from calstudy.sky import gleam
+from calstudy.sky import settings as section
+from calstudy.sky.counts import differential_counts
+from calstudy.sky.foregrounds import make_foregrounds
+
+FREQUENCIES = 167.075e6 + 80e3 * np.arange(384)
+
+
+@pytest.fixture(scope="module")
+def synthetic():
+    return make_foregrounds(section.SyntheticSources(flux_limit="100 mJy"), FREQUENCIES)
+
+
+def flux(sky):
+    return sky.stokes[0, 0].to_value("Jy")
+
+
+def write_gleam(path, rows=6, **columns):
+    """A table with the columns of the GLEAM catalogue."""
+    table = {
+        "GLEAM": [f"J{row}" for row in range(rows)],
+        "RAJ2000": np.linspace(0, 300, rows),
+        "DEJ2000": np.linspace(-80, 20, rows),
+        "Fintwide": 0.02 * 2.0 ** np.arange(rows),
+        "alpha": np.where(np.arange(rows) == 4, np.nan, -0.5),
+    }
+    Table(table | columns).write(path, **({"format": "votable"} if path.suffix == ".vot" else {}))
+    return path
+
+
+@pytest.mark.parametrize(("faint", "bright"), [(0.1, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, 1.6), (1.6, 4.0)])
+def test_stand_in_sky_has_the_measured_counts(synthetic, faint, bright):
+    mean = 4 * np.pi * quad(differential_counts, faint, bright)[0]
+    found = ((flux(synthetic.sky) >= faint) & (flux(synthetic.sky) < bright)).sum()
+    assert abs(found / mean - 1) < 0.05
+
+
+def test_stand_in_sky_holds_the_real_bright_sources(synthetic):
+    """3C 123 (206 Jy at 178 MHz, index -0.7) and 3C 273 (about 70 Jy), where they are."""
+    names = synthetic.sky.name.astype(str)
+    assert (np.char.startswith(names, "GLEAM") | np.char.startswith(names, "J")).sum() == 1894
+    for position, jansky in ((SkyCoord("04h37m04.4s +29d40m14s"), 190.0), (SkyCoord("12h29m06.7s +02d03m09s"), 70.0)):
+        near = synthetic.sky.skycoord.separation(position) < 1 * units.arcmin
+        assert flux(synthetic.sky)[near].sum() == pytest.approx(jansky, rel=0.15)
+
+
+def test_stand_in_is_announced(synthetic):
+    assert "1894 real G4Jy components" in synthetic.stand_in
+    assert "Franzen" in synthetic.stand_in
+
+
+def test_bright_synthetic_sources_are_only_where_g4jy_is_not(synthetic):
+    made_up = np.char.startswith(synthetic.sky.name.astype(str), "synthetic") & (flux(synthetic.sky) >= 4)
+    directions = synthetic.sky.skycoord[made_up]
+    assert made_up.sum() > 500
+    assert ((directions.dec.deg >= 30) | (np.abs(directions.galactic.b.deg) < 10)).all()
+
+
+def test_brightest_sources_and_the_same_ones_with_a_fainter_limit(synthetic):
+    few = make_foregrounds(section.SyntheticSources(flux_limit="100 mJy", count=300), FREQUENCIES).sky
+    np.testing.assert_array_equal(few.name, synthetic.sky.name[:300])
+    assert (np.diff(flux(few)) <= 0).all()
+
+
+def test_spectra(synthetic):
+    assert synthetic.sky.spectral_type == "flat"
+    real = make_foregrounds(section.SyntheticSources(flux_limit="2 Jy", spectrum="catalogue"), FREQUENCIES).sky
+    assert real.spectral_type == "spectral_index"
+    assert (real.reference_frequency == 200e6 * units.Hz).all()
+    assert np.isfinite(real.spectral_index).all()
+    assert np.median(real.spectral_index) == pytest.approx(-0.8, abs=0.05)
+
+
+def test_counts_are_not_extrapolated():
+    with pytest.raises(ValidationError, match="flux_limit"):
+        section.SyntheticSources(flux_limit="0.5 mJy")
+
+
+def test_no_foregrounds_is_a_dark_sky():
+    nothing = make_foregrounds(section.NoSources(kind="none"), FREQUENCIES)
+    assert nothing.sky.Ncomponents == 1
+    assert (nothing.sky.stokes.value == 0).all()
+
+
+@pytest.mark.parametrize("name", ["gleam.vot", "gleam.fits"])
+def test_gleam_file(tmp_path, name):
+    path = write_gleam(tmp_path / name)
+    sky = make_foregrounds(section.GleamSources(kind="gleam", path=path), FREQUENCIES)
+    np.testing.assert_allclose(flux(sky.sky), [0.64, 0.32, 0.16, 0.08])
+    np.testing.assert_allclose(sky.sky.skycoord.dec.deg, [20, 0, -20, -40], atol=1e-9)
+    assert "6 of GLEAM's 307455" in sky.stand_in
+    spectra = make_foregrounds(section.GleamSources(kind="gleam", path=path, spectrum="catalogue"), FREQUENCIES).sky
+    np.testing.assert_allclose(spectra.spectral_index, [-0.5, -0.8, -0.5, -0.5])
+
+
+def test_gleam_file_without_a_column(tmp_path):
+    path = tmp_path / "gleam.fits"
+    Table({"RAJ2000": [1.0], "DEJ2000": [1.0], "alpha": [0.0]}).write(path)
+    with pytest.raises(InputError, match="lacks GLEAM/Name, Fintwide/int_flux_wide"):
+        make_foregrounds(section.GleamSources(kind="gleam", path=path), FREQUENCIES)
+
+
+def test_missing_gleam_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(gleam, "default_directory", lambda: tmp_path)
+    with pytest.raises(InputError, match="calstudy data fetch gleam"):
+        make_foregrounds(section.GleamSources(kind="gleam"), FREQUENCIES)
+
+
+def test_too_high_a_flux_limit(tmp_path):
+    path = write_gleam(tmp_path / "gleam.fits")
+    with pytest.raises(InputError, match=r"sky\.foregrounds\.flux_limit"):
+        make_foregrounds(section.GleamSources(kind="gleam", path=path, flux_limit="5 Jy"), FREQUENCIES)
+
+
+def point_sky(spectrum):
+    stokes = np.zeros((4, 1, 3)) * units.Jy
+    stokes[0, 0] = [3.0, 1.0, 0.01] * units.Jy
+    return SkyModel(
+        name=["a", "b", "c"],
+        skycoord=SkyCoord([10, 20, 30], [-30, -40, -50], unit="deg", frame="icrs"),
+        stokes=stokes,
+        component_type="point",
+        **spectrum,
+    )
+
+
+def test_skyh5_catalogue_with_spectral_indices(tmp_path):
+    path = tmp_path / "sky.skyh5"
+    index = {
+        "spectral_type": "spectral_index",
+        "spectral_index": np.array([-1.0, 2.0, 0.0]),
+        "reference_frequency": np.full(3, 100e6) * units.Hz,
+    }
+    point_sky(index).write_skyh5(path)
+    flat = make_foregrounds(section.FileSources(kind="file", path=path), FREQUENCIES)
+    centre = FREQUENCIES.mean() / 100e6
+    np.testing.assert_allclose(flux(flat.sky), [centre**2, 3 / centre])
+    assert flat.sky.spectral_type == "flat"
+    assert "sky.skyh5" in flat.stand_in
+    kept = make_foregrounds(section.FileSources(kind="file", path=path, spectrum="catalogue"), FREQUENCIES).sky
+    np.testing.assert_array_equal(kept.spectral_index, [2.0, -1.0])
+
+
+def test_catalogue_at_other_frequencies_is_refused(tmp_path):
+    path = tmp_path / "sky.skyh5"
+    stokes = np.zeros((4, 2, 1)) * units.Jy
+    stokes[0] = 1 * units.Jy
+    sky = SkyModel(
+        name=["a"],
+        skycoord=SkyCoord([10], [-30], unit="deg", frame="icrs"),
+        stokes=stokes,
+        component_type="point",
+        spectral_type="subband",
+        freq_array=np.array([100e6, 190e6]) * units.Hz,
+        freq_edge_array=np.array([[80e6, 120e6], [120e6, 220e6]]) * units.Hz,
+    )
+    sky.write_skyh5(path)
+    assert make_foregrounds(section.FileSources(kind="file", path=path), FREQUENCIES).sky.spectral_type == "flat"
+    full = point_sky({"spectral_type": "full", "freq_array": np.array([150e6]) * units.Hz})
+    full.write_skyh5(path, clobber=True)
+    with pytest.raises(InputError, match="frequencies other than the channels"):
+        make_foregrounds(section.FileSources(kind="file", path=path, spectrum="catalogue"), FREQUENCIES)
+
+
+@pytest.mark.parametrize("name", ["none.skyh5", "wrong.skyh5", "wrong.sav", "wrong.vot"])
+def test_unusable_catalogues_are_refused(tmp_path, name):
+    for wrong in ("wrong.skyh5", "wrong.sav", "wrong.vot"):
+        (tmp_path / wrong).write_text("not a catalogue")
+    with pytest.raises(InputError, match=name):
+        make_foregrounds(section.FileSources(kind="file", path=tmp_path / name), FREQUENCIES)
+
+
+def test_fetched_gleam_is_proved_and_then_held_to_its_hash(tmp_path, monkeypatch):
+    def download(url, known_hash, fname, path, progressbar):
+        assert "VIII/100" in url
+        return str(write_gleam(Path(path) / fname))
+
+    monkeypatch.setattr(gleam.pooch, "retrieve", download)
+    with pytest.raises(InputError, match="6 sources, GLEAM has 307455"):
+        gleam.fetch_gleam(tmp_path, progress=False)
+    assert not (tmp_path / gleam.FILE).exists()
+    monkeypatch.setattr(gleam, "SOURCES", 6)
+    path = gleam.fetch_gleam(tmp_path, progress=False)
+    assert gleam.fetch_gleam(tmp_path, progress=False) == path
+    path.write_text(path.read_text().replace("J3", "J9"))
+    with pytest.raises(InputError, match="has changed"):
+        gleam.fetch_gleam(tmp_path, progress=False)
+    with pytest.raises(InputError, match="has changed"):
+        make_foregrounds(section.GleamSources(kind="gleam", path=path), FREQUENCIES)
+
+
+def test_failed_download_is_one_sentence(tmp_path, monkeypatch):
+    def download(*args, **kwargs):
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(gleam.pooch, "retrieve", download)
+    with pytest.raises(InputError, match="cannot be downloaded"):
+        gleam.fetch_gleam(tmp_path)

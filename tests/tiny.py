@@ -1,0 +1,26 @@
+"""The chain at the smallest size that has a window outside the wedge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+TINY: dict[str, Any] = {
+    "name": "tiny",
+    "instrument": {
+        "layout": {"kind": "hex", "side": 2, "spacing": "14 m"},
+        "beam": "gaussian",
+        "channels": {"first": "170 MHz", "width": "400 kHz", "count": 32},
+        "times": {"integration": "10 s", "count": 2},
+    },
+    "sky": {"foregrounds": {"kind": "g4jy-and-counts", "count": 100}, "eor": {"nside": 16}},
+    "corruption": {"noise": {"factor": 2}},
+    "simulation": {"chunks": 2},
+    "calibration": {"chunks": 2},
+    "power": {"pairs": "same-baseline", "bins": {"width": "0.1 h/Mpc", "max": "0.8 h/Mpc"}},
+}
+
+
+def tiny(folder: Path) -> dict[str, Any]:
+    """Return the tiny experiment with its store and runs in `folder`."""
+    return {**TINY, "outputs": {"store": str(folder / "store"), "runs": str(folder / "runs")}}
