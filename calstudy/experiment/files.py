@@ -126,7 +126,7 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
             raise ExperimentError(
                 [
                     f"sky.foregrounds: GLEAM is not on this machine (looked for {default_path()}); get it with "
-                    "'calstudy data fetch gleam', name a file of yours under sky.foregrounds.path, or use g4jy-and-counts"
+                    "'calstudy data fetch gleam', give a file under sky.foregrounds.path, or use 'g4jy-and-counts'"
                 ]
             )
     for path, section, field in _input_files(experiment):

@@ -114,8 +114,8 @@ class GriddedBeam:
     Attributes
     ----------
     fit_error
-        Largest difference of a Jones component from the tabulated one, over all tabulated directions and frequencies
-        of the band, relative to the zenith; what part of it is the table's own scatter, only a smooth fit can show.
+        Largest difference of a Jones component from the tabulated one within the band, relative to the zenith
+        (`TabulatedBeam`).
     """
 
     def __init__(self, table: TabulatedBeam, name: str, stand_in: str | None) -> None:

@@ -31,6 +31,9 @@ POWER_UNIT = "mK2 h-3 Mpc3"
 
 HERA_TAPERS = {"blackman-harris": "blackmanharris", "hann": "hann", "tukey": "tukey", "none": "none"}
 
+LARGEST_ANTENNA_NUMBER = 899
+"""hera_pspec writes the numbers of four antennas, plus 100, into the twelve digits of one integer."""
+
 Baseline = tuple[int, int]
 
 
@@ -60,9 +63,14 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
     Raises
     ------
     ValueError
-        If groups are asked for and no two baselines are redundant.
+        If groups are asked for and no two baselines are redundant, or an antenna number is too large for hera_pspec.
     """
     baselines = [(int(a), int(b)) for a, b in antenna_pairs(uvd)]
+    if antenna_pairs(uvd).max() > LARGEST_ANTENNA_NUMBER:
+        raise ValueError(
+            f"antenna number {antenna_pairs(uvd).max()} is too large for hera_pspec, allowed: 0 to "
+            f"{LARGEST_ANTENNA_NUMBER}"
+        )
     same = Pairs(baselines, baselines, redundant=False)
     if settings.pairs == "same-baseline":
         return same

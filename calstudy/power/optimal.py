@@ -27,6 +27,13 @@ class DiagonalPSpecData(PSpecData):
         self._weights: dict[tuple, np.ndarray] = {}
         self._normalized: tuple | None = None
 
+    def validate_pol(self, dsets: tuple[int, int], pol_pair: tuple[int, int]) -> bool:
+        """Return whether both data sets have these polarizations, given as integers.
+
+        hera_pspec's own test reads the telescope's ``x_orientation``, which pyuvdata has deprecated.
+        """
+        return all(pol in self.dsets[dset].polarization_array for dset, pol in zip(dsets, pol_pair, strict=True))
+
     def I(self, key: tuple) -> np.ndarray:  # noqa: E743
         """Return the identity (Nfreqs, Nfreqs), one for all baselines."""
         return self._shared(("identity", self.spw_Nfreqs), lambda: np.identity(self.spw_Nfreqs))

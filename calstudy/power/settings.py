@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from calstudy.schema import Section
 from calstudy.units import Delay, Length, Wavenumber
@@ -16,6 +16,12 @@ class KBins(Section):
     min: Wavenumber = Field(0.0, ge=0)
     max: Wavenumber = Field(3.4, gt=0)
     width: Wavenumber = Field(0.04, gt=0)
+
+    @model_validator(mode="after")
+    def _ascend(self) -> Self:
+        if self.max <= self.min:
+            raise ValueError(f"max ({self.max} h/Mpc) must be larger than min ({self.min} h/Mpc)")
+        return self
 
 
 class PowerSettings(Section):

@@ -124,7 +124,7 @@ def test_override_values_are_yaml():
     ],
 )
 def test_broken_yaml_is_one_sentence_with_the_line(text, told):
-    with pytest.raises(InputError, match="file.yaml") as caught:
+    with pytest.raises(InputError, match=r"file\.yaml") as caught:
         parse_yaml(text, "file.yaml")
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)

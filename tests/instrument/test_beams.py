@@ -193,7 +193,7 @@ def test_band_between_two_tabulated_frequencies(embedded):
 
 def test_few_tabulated_frequencies_limit_the_interpolation(tmp_path, embedded):
     path = tmp_path / "beam.beamfits"
-    embedded.at(np.array([166e6, 183e6, 200e6])).write_beamfits(path)
+    embedded.at(np.array([166e6, 182.5e6, 199e6])).write_beamfits(path)
     assert make_beam(section.FileBeam(kind="beamfits", path=path, interpolation="linear")).fit_error < 1e-12
     with pytest.raises(InputError, match="cubic needs 4 tabulated frequencies"):
         make_beam(section.FileBeam(kind="beamfits", path=path, interpolation="cubic"))

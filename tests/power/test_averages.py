@@ -20,8 +20,6 @@ from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.power.wedge import WedgeSpectrum, cylindrical_average
 from calstudy.visibilities import baseline_vectors
 
-pytestmark = pytest.mark.filterwarnings("ignore:The Telescope.x_orientation attribute is deprecated:DeprecationWarning")
-
 SETTINGS = PowerSettings(bins=KBins(max="2.0 h/Mpc", width="0.1 h/Mpc"))
 FREQUENCY, WIDTH, OMEGA_PP = 182e6, 80e3, 0.07
 
@@ -142,6 +140,8 @@ def test_the_wedge_mask_is_the_horizon_plus_the_buffer():
 def test_bins_reach_the_maximum():
     edges = make_bin_edges(KBins())
     assert edges.size == 86 and edges[-1] == pytest.approx(3.4)
+    with pytest.raises(ValueError, match=r"max \(0.5 h/Mpc\) must be larger than min \(1.0 h/Mpc\)"):
+        KBins(min="1.0 h/Mpc", max="0.5 h/Mpc")
     assert make_bin_edges(KBins(max="1.0 h/Mpc", width="0.3 h/Mpc"))[-1] == pytest.approx(1.2)
 
 

@@ -17,8 +17,6 @@ from calstudy.power.spectra import delay_spectra
 from calstudy.power.spherical import spherical_average
 from calstudy.visibilities import antenna_pairs, baseline_vectors, from_cube
 
-pytestmark = pytest.mark.filterwarnings("ignore:The Telescope.x_orientation attribute is deprecated:DeprecationWarning")
-
 GOLOMB = GolombLayout(kind="golomb", count=5, spacing="14 m")
 
 
@@ -27,6 +25,7 @@ def two(template, white, seed=1):
     return white(template, rng), white(template, rng)
 
 
+@pytest.mark.filterwarnings("ignore:The Telescope.x_orientation attribute is deprecated:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:Casting complex values to real:numpy.exceptions.ComplexWarning:hera_pspec")
 @pytest.mark.parametrize("taper", ["blackman-harris", "hann", "tukey", "none"])
 @pytest.mark.parametrize("flagged", [False, True])
@@ -139,8 +138,8 @@ def test_flat_power_comes_back_within_one_percent(observe, beam, tabulate):
 def test_normalization_is_exact_over_the_whole_band(observe, beam, tabulate, taper, tolerance):
     """Visibilities of the variance that flat P(k) gives at each frequency, with beam and scales evolving.
 
-    Each baseline is rescaled to its expected tapered variance, so that no sampling error is left in the mean over delays
-    but that of the frequency evolution.
+    Each baseline is rescaled to its expected tapered variance, so that the mean over delays has no sampling error left
+    but that of the evolution with frequency.
     """
     template = observe(MwaLayout(kind="mwa-compact-minredundant", count=16), n_channels=96, width=320e3)
     frequencies, cosmo, power = template.freq_array, c.make_cosmology("Planck15"), 12482.356
@@ -243,6 +242,10 @@ def test_bad_data_are_refused(observe, white, beam):
     kelvin.vis_units = "K str"
     with pytest.raises(ValueError, match=r"odd data are in 'K str', expected 'Jy'"):
         estimate_power(even, kelvin, beam, PowerSettings())
+    numbers = even.copy()
+    numbers.ant_2_array = numbers.ant_2_array + 900
+    with pytest.raises(ValueError, match=r"antenna number 904 is too large .* 0 to 899"):
+        make_pairs(numbers, PowerSettings())
     fewer = white(observe(GOLOMB, n_channels=16), np.random.default_rng(0))
     with pytest.raises(ValueError, match="differ in freq_array"):
         estimate_power(even, fewer, beam, PowerSettings())
