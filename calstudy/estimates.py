@@ -15,7 +15,7 @@ from calstudy.tasks import Task
 
 LIBRARIES_MEMORY = 0.8e9
 COMPLEX128, COMPLEX64 = 16, 8
-GLEAM_SOURCES = 283_000
+SOURCES = 546_000
 TIME_NODES, FREQUENCY_NODES = 16, 96
 PAPER_SAMPLES = 630 * 384
 ADAMAX_STEP = 3e-3
@@ -93,7 +93,7 @@ def _simulate_chunk(task: Task) -> Cost:
     if task.settings["component"] == "eor":
         sources, channels = 6 * sky["nside"] ** 2, size.channels
     else:
-        sources = min(sky.get("count") or GLEAM_SOURCES, GLEAM_SOURCES) / 2
+        sources = min(sky.get("count") or SOURCES, SOURCES) / 2
         channels = min(size.channels, FREQUENCY_NODES) if nodes else size.channels
     pieces = min(task.settings["simulation"]["chunks"], size.channels)
     engine = SIMULATION_RATES[task.settings["simulation"]["engine"]]

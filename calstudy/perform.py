@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -16,6 +18,8 @@ from calstudy.resources import Usage
 from calstudy.stages.registry import STAGES, Job
 from calstudy.store import Product, Store
 from calstudy.tasks import Task
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,21 +63,39 @@ def perform(order: Order) -> Product:
     Raises
     ------
     InputError
-        If an input vanished or was damaged, the stage refuses its input, or the store is full.
+        If an input vanished or was damaged, the stage refuses a value, or the store cannot be written.
     """
     store = Store(order.store)
     try:
         with store.lock(order.stage, order.key):
             existing = store.verify(order.stage, order.key)
             return existing if existing is not None else _make(order, store)
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
-            raise InputError(
-                f"outputs.store = {str(store.root)!r}: {order.stage} ({order.label}) could not be written "
-                f"({error.strerror}); make room or choose another folder with --set outputs.store=DIR, and run again: "
-                "finished products are kept"
-            ) from None
+    except InputError:
         raise
+    except (OSError, RuntimeError) as error:
+        reason = _unwritable(error)
+        if reason is None:
+            raise
+        raise InputError(
+            f"outputs.store = {str(store.root)!r}: {order.stage} ({order.label}) could not be written ({reason}); make "
+            "room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
+        ) from None
+    except ValueError as error:
+        logger.exception("%s (%s)", order.stage, order.label)
+        raise InputError(f"{order.stage} ({order.label}): {error}") from None
+
+
+def _unwritable(error: OSError | RuntimeError) -> str | None:
+    """Return in words why a file could not be written, or None if that is not what happened.
+
+    HDF5 reports a failed write as a RuntimeError or an OSError without errno, with the number in its message.
+    """
+    number = getattr(error, "errno", None)
+    if number is None and (found := re.search(r"errno = (\d+)", str(error))):
+        number = int(found[1])
+    if number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM):
+        return os.strerror(number)
+    return None
 
 
 def _make(order: Order, store: Store) -> Product:

@@ -45,6 +45,7 @@ def make_uvcal(data: UVData, numbers: np.ndarray, gains: np.ndarray, flags: np.n
     row = np.searchsorted(numbers, uvcal.ant_array)
     uvcal.gain_array = gains[row]
     uvcal.flag_array = flags[row]
+    uvcal.gain_scale, uvcal.pol_convention = data.vis_units, data.pol_convention
     return uvcal
 
 

@@ -41,6 +41,8 @@ class FitTensors:
     ----------
     first, second
         Antennas of each baseline, shape (Nbls,), int32.
+    shared
+        Whether any baselines share a model.
     model_index
         Model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model.
     slices
@@ -67,8 +69,8 @@ class FitTensors:
         self.n_models = structure.basis.n_models
         self.first = tf.constant(pairs_sorted[:, 0], tf.int32)
         self.second = tf.constant(pairs_sorted[:, 1], tf.int32)
-        shared = self.n_models < self.n_baselines
-        self.model_index = tf.constant(position[self._order], tf.int32) if shared else None
+        self.shared = self.n_models < self.n_baselines
+        self.model_index = tf.constant(position[self._order], tf.int32) if self.shared else None
         ends = np.cumsum([bucket.members.size for bucket in buckets])
         self.slices = [(int(end - bucket.members.size), int(end)) for bucket, end in zip(buckets, ends, strict=True)]
         self.bases = [bucket.vectors for bucket in buckets]

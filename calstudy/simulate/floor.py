@@ -65,10 +65,10 @@ def delay_floor(
     foregrounds
         Visibilities of foregrounds alone, equally spaced channels.
     buffer
-        Delay beyond the horizon at which to start, s. The main lobe of the taper must have ended there: it reaches
-        4 / bandwidth for Blackman-Harris (130 ns for 30.72 MHz), 6 / bandwidth for Dolph-Chebyshev.
+        Delay beyond the horizon at which to start, s. Before 4 / bandwidth (130 ns for 30.72 MHz) for Blackman-Harris,
+        8 / bandwidth (250 ns) for Dolph-Chebyshev, one still sees the taper's main lobe.
     taper
-        `blackman-harris` has sidelobes of -46 dB here and shows what a power spectrum sees; `dolph-chebyshev` (-75 dB)
+        `blackman-harris` has sidelobes of -46 dB here and shows what a power spectrum sees; `dolph-chebyshev` (-100 dB)
         shows the simulation's own floor under them.
     n_bins
         Number of equal bins in baseline length.
@@ -82,7 +82,7 @@ def delay_floor(
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
     width = float(np.diff(foregrounds.freq_array).mean())
     window = (
-        windows.blackmanharris(cube.shape[2]) if taper == "blackman-harris" else windows.chebwin(cube.shape[2], 150)
+        windows.blackmanharris(cube.shape[2]) if taper == "blackman-harris" else windows.chebwin(cube.shape[2], 200)
     )
     spectrum = np.fft.fft(cube * window[:, None], axis=2)
     power = np.mean(np.abs(spectrum) ** 2, axis=(0, 3))

@@ -3,7 +3,8 @@
 Each step solves the damped normal equations of the reduced problem (see `calstudy.calibrate.projection`) by
 preconditioned conjugate gradients, with the damping tied to the loss, so that it vanishes towards the minimum. The
 first two steps use the antenna blocks of each channel as preconditioner, later ones the channel blocks of each antenna,
-which also predict how much the loss can still fall: the criterion of convergence.
+which also predict how much the loss can still fall: the criterion of convergence. Where baselines share models, the
+couplings between antennas remain the strong ones, and the antenna blocks of each channel are used throughout.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import tensorflow as tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.projection import Projection, Projector
-from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
+from calstudy.calibrate.solvers.conjugate_gradients import Operator, conjugate_gradients
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.solvers.preconditioners import (
     antenna_blocks,
@@ -63,34 +64,29 @@ class Kernels:
         self.factors = tf.function(antenna_factors)
         self.predicted_decrease = tf.function(self._predicted_decrease)
 
-    def _damped_hessian(self, eta: tf.Tensor, projection: Projection, diagonal: tf.Tensor) -> tf.Tensor:
-        return self.projector.hessian_product(eta, projection) + diagonal * eta
-
     def _channel_step(self, projection: Projection, damping: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
-        diagonal = damping * antenna_degrees(self.projector, projection)
+        """Return eta, and the decrease of the loss that its quadratic model promises."""
         factors = channel_factors(self.projector, projection, damping)
-        return conjugate_gradients(
-            lambda eta: self._damped_hessian(eta, projection, diagonal),
-            lambda values: solve_channels(factors, values),
-            tf.cast(projection.descent, tf.float32),
-            tf.constant(CG_TOLERANCE),
-            tf.constant(CG_CHANNEL_ITERATIONS),
-        )
+        eta, _ = self._solve(projection, damping, lambda values: solve_channels(factors, values), CG_CHANNEL_ITERATIONS)
+        return eta, pairs.inner_product(tf.cast(projection.descent, tf.float32), eta)
 
     def _antenna_step(
         self, projection: Projection, factors: tf.Tensor, damping: tf.Tensor
-    ) -> tuple[tf.Tensor, tf.Tensor, tf.Tensor]:
-        """Return eta, the iterations it took, and the decrease of the loss that its quadratic model promises."""
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return eta, and the iterations it took."""
+        return self._solve(projection, damping, lambda values: solve_antennas(factors, values), CG_ANTENNA_ITERATIONS)
+
+    def _solve(
+        self, projection: Projection, damping: tf.Tensor, preconditioner: Operator, iterations: int
+    ) -> tuple[tf.Tensor, tf.Tensor]:
         diagonal = damping * antenna_degrees(self.projector, projection)
-        descent = tf.cast(projection.descent, tf.float32)
-        eta, iterations = conjugate_gradients(
-            lambda values: self._damped_hessian(values, projection, diagonal),
-            lambda values: solve_antennas(factors, values),
-            descent,
+        return conjugate_gradients(
+            lambda eta: self.projector.hessian_product(eta, projection) + diagonal * eta,
+            preconditioner,
+            tf.cast(projection.descent, tf.float32),
             tf.constant(CG_TOLERANCE),
-            tf.constant(CG_ANTENNA_ITERATIONS),
+            tf.constant(iterations),
         )
-        return eta, iterations, pairs.inner_product(descent, eta)
 
     def _blocks(self, projection: Projection) -> tuple[tf.Tensor, tf.Tensor]:
         blocks = antenna_blocks(self.projector, projection)
@@ -116,13 +112,6 @@ class AntennaPreconditioner(NamedTuple):
     factors: tf.Tensor
 
 
-class Memory(NamedTuple):
-    """What the next integration takes over, see `GaussNewtonState`."""
-
-    preconditioner: AntennaPreconditioner | None
-    correction: float
-
-
 @dataclass(frozen=True, eq=False)
 class GaussNewtonState:
     """One point of the iteration; losses are relative to the weighted square of the data.
@@ -133,9 +122,6 @@ class GaussNewtonState:
         Factor on the damping; grows tenfold whenever a step did not lower the loss.
     preconditioner
         The antenna blocks, once they are in use.
-    correction
-        The largest ratio so far, at least one, of the decrease that a step was to bring to what the antenna blocks
-        alone had predicted: with couplings between antennas the loss falls further.
     predicted
         Decrease of the loss that is predicted for the next step; infinite while unknown.
     """
@@ -150,7 +136,6 @@ class GaussNewtonState:
     n_accepted: int = 0
     boost: float = 1.0
     preconditioner: AntennaPreconditioner | None = None
-    correction: float = 1.0
     predicted: float = math.inf
 
     @property
@@ -186,43 +171,37 @@ class GaussNewton:
         state = GaussNewtonState(
             kernels, data, weights, total * data.scale**2, gains, projection, (float(projection.loss),)
         )
-        if warm is not None and warm.memory is not None:
-            state = replace(state, preconditioner=warm.memory.preconditioner, correction=warm.memory.correction)
+        if warm is not None:
+            state = replace(state, preconditioner=warm.memory)
         return self._prepared(state)
 
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
         """Try one damped step, and keep it if it lowers the loss."""
-        state, eta = self._increment(state)
-        gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))
-        trial = state.kernels.project(gains, state.data.visibilities, state.weights)
-        loss = float(trial.loss)
-        # Written so that a loss that is not a number is refused as well.
-        if not loss <= state.history[-1]:
-            state = replace(state, history=(*state.history, state.history[-1]), boost=10 * state.boost)
-        else:
-            state = replace(
-                state,
-                gains=gains,
-                projection=trial,
-                history=(*state.history, loss),
-                n_accepted=state.n_accepted + 1,
-                boost=1.0,
-            )
-        return self._prepared(state)
-
-    def _increment(self, state: GaussNewtonState) -> tuple[GaussNewtonState, tf.Tensor]:
-        """Return eta of the next step, and the state with what its solution tells about the preconditioner."""
         kernels, preconditioner = state.kernels, state.preconditioner
         damping = tf.constant(state.damping, tf.float32)
         if preconditioner is None:
-            return state, kernels.channel_step(state.projection, damping)[0]
-        eta, iterations, decrease = kernels.antenna_step(state.projection, preconditioner.factors, damping)
-        if state.boost == 1:
-            ratio = float(decrease) / (state.predicted / state.correction)
-            state = replace(state, correction=max(state.correction, ratio))
-        if int(iterations) > CG_REFRESH:
-            state = replace(state, preconditioner=None)
-        return state, eta
+            eta, promised = kernels.channel_step(state.projection, damping)
+        else:
+            eta, iterations = kernels.antenna_step(state.projection, preconditioner.factors, damping)
+            if int(iterations) > CG_REFRESH:
+                preconditioner = None
+        gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))
+        trial = kernels.project(gains, state.data.visibilities, state.weights)
+        loss = float(trial.loss)
+        # Written so that a loss that is not a number is refused as well.
+        if not loss <= state.history[-1]:
+            return self._prepared(replace(state, history=(*state.history, state.history[-1]), boost=10 * state.boost))
+        state = replace(
+            state,
+            gains=gains,
+            projection=trial,
+            history=(*state.history, loss),
+            n_accepted=state.n_accepted + 1,
+            boost=1.0,
+            preconditioner=preconditioner,
+        )
+        # Group models leave no slow directions, so that the next step will bring less than this one did.
+        return replace(state, predicted=float(promised)) if kernels.tensors.shared else self._prepared(state)
 
     def terminate(self, state: GaussNewtonState) -> Verdict | None:
         """Judge convergence by the decrease of the loss that the next step is predicted to bring."""
@@ -251,14 +230,14 @@ class GaussNewton:
         model = state.kernels.tensors.unload(state.projection.model, state.data.scale)
         return Estimate(pairs.to_complex(state.gains), model)
 
-    def memory(self, state: GaussNewtonState) -> Memory:
+    def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
         """Return the antenna blocks, which hardly change from one integration to the next."""
-        return Memory(state.preconditioner, state.correction)
+        return state.preconditioner
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
-        """Bring the preconditioner up to date with the state, and predict the decrease of the next step."""
+        """Bring the antenna blocks up to date with the state, and let them predict the decrease of the next step."""
         preconditioner = state.preconditioner
-        if preconditioner is None and state.n_accepted < CHANNEL_STEPS:
+        if state.kernels.tensors.shared or (preconditioner is None and state.n_accepted < CHANNEL_STEPS):
             return state
         damping = max(state.damping, PRECONDITIONER_DAMPING)
         ratio = preconditioner.damping / damping if preconditioner else math.inf
@@ -270,5 +249,6 @@ class GaussNewton:
         # A boosted damping shrinks the prediction without bringing the minimum any closer.
         if state.boost > 1:
             return state
-        decrease = float(state.kernels.predicted_decrease(state.projection, preconditioner.factors))
-        return replace(state, predicted=state.correction * decrease)
+        return replace(
+            state, predicted=float(state.kernels.predicted_decrease(state.projection, preconditioner.factors))
+        )
