@@ -19,13 +19,6 @@ SOURCES = 546_000
 TIME_NODES, FREQUENCY_NODES = 16, 96
 PAPER_SAMPLES = 630 * 384
 ADAMAX_STEP = 3e-3
-SIMULATION_RATES = {
-    "auto": (2e-7, 2e-10),
-    "dense": (2e-7, 2e-10),
-    "fftvis": (4e-6, 0.0),
-    "pyuvsim": (1e-6, 1.4e-8),
-}
-"""Seconds per source above the horizon, channel and time: a constant part, and one per antenna squared."""
 
 
 @dataclass(frozen=True)
@@ -85,22 +78,31 @@ def _instrument(task: Task) -> Mapping[str, Any]:
     return next(found for found in map(_instrument, task.inputs.values()) if found)
 
 
+def _engine_seconds(engine: str, sources: float, slots: float, antennas: int) -> float:
+    """Return the seconds an engine takes for all-sky `sources` at `slots` combinations of time and frequency."""
+    if engine == "pyuvsim":
+        return 2.8e-8 * sources * slots * antennas**2 / 2
+    if engine == "fftvis":
+        return 1.8e-5 * sources * slots
+    above_horizon = sources / 2
+    return 1.1 * above_horizon * slots * (2e-8 + 0.9e-9 * antennas + 0.87e-10 * antennas**2) + 4.5e-6 * sources
+
+
 def _simulate_chunk(task: Task) -> Cost:
-    instrument, sky = _instrument(task), task.settings["sky"]
-    size = _size(instrument)
-    nodes = task.settings["simulation"]["nodes"]["enabled"]
-    times = min(size.times, TIME_NODES) if nodes else size.times
+    size, sky = _size(_instrument(task)), task.settings["sky"]
+    simulation = task.settings["simulation"]
+    nodes = simulation["nodes"]["enabled"]
+    times, channels = (min(size.times, TIME_NODES) if nodes else size.times), size.channels
     if task.settings["component"] == "eor":
-        sources, channels = 6 * sky["nside"] ** 2, size.channels
+        sources, spectral = 12 * sky["nside"] ** 2, size.channels / simulation["chunks"]
     else:
-        sources = min(sky.get("count") or SOURCES, SOURCES) / 2
+        sources, spectral = min(sky.get("count") or SOURCES, SOURCES), 1
         channels = min(size.channels, FREQUENCY_NODES) if nodes else size.channels
-    pieces = min(task.settings["simulation"]["chunks"], size.channels)
-    engine = SIMULATION_RATES[task.settings["simulation"]["engine"]]
-    slots = times * channels / pieces
-    seconds = 8 + slots * sources * (engine[0] + engine[1] * size.antennas**2)
-    disk = size.samples / pieces * COMPLEX128 * (channels / size.channels)
-    return Cost(seconds, LIBRARIES_MEMORY + 400 * sources + 3 * disk, disk)
+    pieces = min(simulation["chunks"], size.channels)
+    seconds = _engine_seconds(simulation["engine"], sources, times * channels / pieces, size.antennas)
+    disk = size.samples / size.channels * channels / pieces * COMPLEX128
+    memory = LIBRARIES_MEMORY + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
+    return Cost(6 + seconds, memory, disk)
 
 
 def _simulate(task: Task) -> Cost:
@@ -141,7 +143,7 @@ def _average(task: Task) -> Cost:
 
 def _power(task: Task) -> Cost:
     size = _size(_instrument(task))
-    return Cost(15, 2.5e9, size.baselines * size.channels * COMPLEX128)
+    return Cost(6, 1.6e9, 2 * size.baselines * size.channels * COMPLEX128)
 
 
 ESTIMATES: Mapping[str, Callable[[Task], Cost]] = {

@@ -100,6 +100,11 @@ class Graph:
         self.experiment = experiment
         self._sections = experiment.model_dump(mode="json")
 
+    @property
+    def sections(self) -> Mapping[str, Any]:
+        """The whole experiment as JSON-able settings, section by section."""
+        return self._sections
+
     def _section(self, *names: str) -> dict[str, Any]:
         return {name: self._sections[name] for name in names}
 
@@ -215,16 +220,9 @@ class Graph:
     @cached_property
     def figures(self) -> list[Task]:
         """The figures asked for."""
-        tasks = []
-        for name in self.experiment.outputs.figures:
-            inputs = {} if name == "layout" else {"spectra": self.spectra}
-            settings = {"figure": name, "notes": list(self.footnotes)}
-            if name == "layout":
-                settings["layout"] = self._sections["instrument"]["layout"]
-            else:
-                settings["wedge_buffer"] = self.experiment.power.wedge_buffer
-            tasks.append(Task("figure", name, settings, inputs))
-        return tasks
+        from calstudy.figure_tasks import figure_task
+
+        return [figure_task(self, name) for name in self.experiment.outputs.figures]
 
     @cached_property
     def footnotes(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -45,15 +45,3 @@ class Solution:
     def usable(self) -> bool:
         """Whether gains and model are an estimate at all."""
         return self.status in ("converged", "max-steps", "stalled")
-
-    def summary(self) -> dict[str, Any]:
-        """Return status, steps, first and last loss and seconds, as plain JSON types."""
-        losses = self.loss_history
-        return {
-            "status": self.status,
-            "message": self.message,
-            "n_steps": self.n_steps,
-            "first_loss": float(losses[0]) if losses.size else None,
-            "last_loss": float(losses[-1]) if losses.size else None,
-            "seconds": self.seconds,
-        }

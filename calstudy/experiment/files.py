@@ -137,7 +137,20 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
             faults.append(f"{path} = {str(target)!r}: no such file (looked for {file})")
     if faults:
         raise ExperimentError(faults)
-    return Experiment.model_validate(resolved)
+    resolved_experiment = Experiment.model_validate(resolved)
+    _require_inspected_antennas(resolved_experiment)
+    return resolved_experiment
+
+
+def _require_inspected_antennas(experiment: Experiment) -> None:
+    from calstudy.estimates import antenna_count
+
+    count = antenna_count(experiment.instrument.layout.model_dump())
+    highest = max(place for pair in experiment.outputs.inspect.pairs for place in pair)
+    if highest >= count:
+        raise ExperimentError(
+            [f"outputs.inspect: names antenna {highest}, but the layout has {count} antennas, counted from 0"]
+        )
 
 
 def validate(data: Mapping[str, Any], base: Path) -> Experiment:

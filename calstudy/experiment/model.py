@@ -16,9 +16,14 @@ from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.settings import SkySettings
 
 Component = Literal["foregrounds", "eor", "noise"]
-FigureName = Literal["layout", "wedge", "spherical"]
+FigureName = Literal["layout", "gains", "model", "data", "baselines", "wedge", "spherical", "reflections"]
 FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
     "layout": (),
+    "gains": ("residual",),
+    "model": ("residual", "noise"),
+    "data": ("residual", "noise"),
+    "baselines": ("residual", "noise"),
+    "reflections": (),
     "wedge": ("uncorrupted", "uncalibrated", "residual", "eor", "noise"),
     "spherical": ("eor",),
 }
@@ -53,10 +58,44 @@ def _paper_variants() -> dict[str, Variant]:
     }
 
 
+Pair = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], Field(strict=False)]
+
+
+class Inspection(Section):
+    """What the figures of single gains and baselines show; antennas are counted from 0 in the order of the layout."""
+
+    antennas: Pair = Field((0, 1), description="Two antennas; the model and data figures show their baseline.")
+    integration: int = Field(0, ge=0)
+    realization: Literal["even", "odd"] = "even"
+    baselines: Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)] | None = Field(
+        None, description="Baselines of the `baselines` figure, such as [[0, 1], [0, 5]]; null: four, short to long."
+    )
+
+    @property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """All pairs of antennas that are named."""
+        return (self.antennas, *(self.baselines or ()))
+
+    @model_validator(mode="after")
+    def _pairs_are_baselines(self) -> Inspection:
+        if any(first == second for first, second in self.pairs):
+            raise fault("", "names an antenna twice in a pair: two different ones make a baseline")
+        return self
+
+
 class Outputs(Section):
     """What is drawn, and where products and run folders go."""
 
-    figures: Annotated[tuple[FigureName, ...], Field(strict=False)] = ("layout", "wedge", "spherical")
+    figures: Annotated[tuple[FigureName, ...], Field(strict=False)] = (
+        "layout",
+        "gains",
+        "model",
+        "data",
+        "baselines",
+        "wedge",
+        "spherical",
+    )
+    inspect: Inspection = Inspection()
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all experiments.")
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
 
@@ -97,6 +136,24 @@ class Experiment(Section):
             missing = [name for name in FIGURE_VARIANTS[figure] if name not in self.variants]
             if missing:
                 raise fault("outputs.figures", f"asks for {figure!r}, which needs the variant(s) {', '.join(missing)}")
+        return self
+
+    @model_validator(mode="after")
+    def _inspected_data_exist(self) -> Experiment:
+        needing = [figure for figure in self.outputs.figures if "residual" in FIGURE_VARIANTS[figure]]
+        residual = self.variants.get("residual")
+        complete = residual and residual.gains and residual.calibrate and "foregrounds" in residual.components
+        if needing and residual and not complete:
+            raise fault(
+                "variants.residual",
+                f"must have foregrounds, gains: true and calibrate: true for the figure {needing[0]!r}",
+            )
+        count = self.instrument.times.count
+        if self.outputs.inspect.integration >= count:
+            raise fault(
+                "outputs.inspect.integration",
+                f"{self.outputs.inspect.integration} is not among the {count} integrations, counted from 0",
+            )
         return self
 
     @model_validator(mode="after")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,9 +12,10 @@ import h5py
 import numpy as np
 
 from calstudy.power.spherical import SphericalSpectrum
+from calstudy.power.transfer import TransferFunction, TransferMap
 from calstudy.power.wedge import WedgeSpectrum
 
-Spectrum = TypeVar("Spectrum", SphericalSpectrum, WedgeSpectrum)
+Spectrum = TypeVar("Spectrum", SphericalSpectrum, WedgeSpectrum, TransferFunction, TransferMap)
 
 CSV_COLUMNS = {
     "k [h/Mpc]": lambda s: s.k,
@@ -27,7 +29,19 @@ CSV_COLUMNS = {
 }
 
 
-def save_spectrum(path: Path, spectrum: SphericalSpectrum | WedgeSpectrum) -> None:
+TRANSFER_COLUMNS = {
+    "k [h/Mpc]": lambda t: t.k,
+    "k from [h/Mpc]": lambda t: t.bin_edges[:-1],
+    "k to [h/Mpc]": lambda t: t.bin_edges[1:],
+    "transfer": lambda t: t.transfer,
+    "transfer error": lambda t: t.transfer_error,
+    "coherence": lambda t: t.coherence,
+    "coherence error": lambda t: t.coherence_error,
+    "baselines or groups": lambda t: t.n_samples,
+}
+
+
+def save_spectrum(path: Path, spectrum: Spectrum) -> None:
     """Write every field as an HDF5 data set of its name with the attribute ``unit``, replacing the file."""
     with h5py.File(path, "w") as file:
         file.attrs["kind"] = type(spectrum).__name__
@@ -54,8 +68,17 @@ def load_spectrum(path: Path, kind: type[Spectrum]) -> Spectrum:
 
 def write_csv(path: Path, spectrum: SphericalSpectrum) -> None:
     """Write a spherical spectrum as CSV, one row per bin of |k|, units in the header."""
-    columns = [values(spectrum) for values in CSV_COLUMNS.values()]
+    write_columns(path, {name: values(spectrum) for name, values in CSV_COLUMNS.items()})
+
+
+def write_transfer_csv(path: Path, transfer: TransferFunction) -> None:
+    """Write a transfer function as CSV, one row per bin of |k|, units in the header."""
+    write_columns(path, {name: values(transfer) for name, values in TRANSFER_COLUMNS.items()})
+
+
+def write_columns(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write arrays of equal length as CSV, by the names of their columns."""
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(CSV_COLUMNS)
-        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+        writer.writerow(columns)
+        writer.writerows(zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True))

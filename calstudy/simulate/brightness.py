@@ -8,6 +8,8 @@ from astropy_healpix import nside_to_pixel_area
 from pyradiosky import SkyModel
 from pyradiosky.utils import jy_to_ksr
 
+from calstudy.errors import InputError
+
 
 def is_polarized(sky: SkyModel) -> bool:
     """Return whether any component has Stokes Q, U or V."""
@@ -34,7 +36,7 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray:
 
     Raises
     ------
-    ValueError
+    InputError
         If a spectral index is not a number, a `full` sky has not one of the frequencies, or a `subband` sky does not
         span them.
     """
@@ -51,13 +53,13 @@ def _stokes_values(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray:
         return values
     if sky.spectral_type == "spectral_index":
         if np.isnan(sky.spectral_index).any():
-            raise ValueError("the spectral index of a component of the sky is not a number, give it a value or drop it")
+            raise InputError("the spectral index of a component of the sky is not a number, give it a value or drop it")
         return values * (frequencies[:, None] / sky.reference_frequency.to_value("Hz")) ** sky.spectral_index
     available = sky.freq_array.to_value("Hz")
     nearest = np.abs(available - frequencies[:, None]).argmin(axis=1)
     missing = np.abs(available[nearest] - frequencies) > sky.freq_tol.to_value("Hz")
     if missing.any():
-        raise ValueError(f"the sky is given channel by channel and has none at {frequencies[missing][0]} Hz")
+        raise InputError(f"the sky is given channel by channel and has none at {frequencies[missing][0]} Hz")
     return values[nearest]
 
 

@@ -172,7 +172,7 @@ def check_interpolation(
     cube: np.ndarray,
     grid: NodeGrid,
     channels: slice = slice(None),
-    count: int = 2,
+    count: int = 3,
 ) -> InterpolationCheck:
     """Simulate a few integrations and channels directly and compare.
 
@@ -187,8 +187,7 @@ def check_interpolation(
     channels
         Channels to choose from: those that the sky has, if it is given channel by channel.
     count
-        How many integrations and how many channels: those farthest from nodes, near the ends where polynomials err
-        most.
+        How many integrations and how many channels, spread over the observation, each as far from nodes as can be.
     """
     times, frequencies = integration_times(template), template.freq_array
     at_times = _farthest(times, grid.times_jd, np.arange(len(times)), count)
@@ -207,8 +206,9 @@ def check_interpolation(
 
 
 def _farthest(samples: np.ndarray, nodes: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:
-    """Return the `count` candidates at which the polynomial that vanishes at the nodes is largest, ascending."""
-    offsets = np.abs(samples[candidates][:, None] - nodes) / max(np.ptp(nodes), np.finfo(float).tiny)
+    """Return one candidate from each of `count` stretches, where the polynomial with roots at the nodes is largest."""
+    offsets = np.abs(samples[candidates][:, None] - nodes) / (np.ptp(samples) or 1.0)
     with np.errstate(divide="ignore"):
         size = np.log(offsets).sum(axis=1)
-    return np.sort(candidates[np.argsort(size)[-count:]])
+    stretches = np.array_split(np.arange(len(candidates)), min(count, len(candidates)))
+    return candidates[[stretch[np.argmax(size[stretch])] for stretch in stretches]]

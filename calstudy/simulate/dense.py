@@ -21,6 +21,7 @@ from pyradiosky import SkyModel
 from pyuvdata import UVData
 from scipy.constants import speed_of_light
 
+from calstudy.errors import InputError
 from calstudy.simulate.brightness import is_polarized, stokes_i
 from calstudy.simulate.directions import SourceTracks
 from calstudy.simulate.nodes import integration_times
@@ -55,7 +56,7 @@ class DenseEngine:
             return "the dense engine does not handle a polarized sky"
         try:
             feeds = polarization_feeds(template)
-        except ValueError as error:
+        except InputError as error:
             return f"the dense engine does not handle it: {error}"
         return refusal(beam.at(template.freq_array[:1]), feeds)
 
@@ -64,13 +65,13 @@ class DenseEngine:
 
         Raises
         ------
-        ValueError
+        InputError
             If the sky is polarized, a polarization is not xx or yy, or the beam is not of the kind
             `calstudy.simulate.patterns.power_pattern` takes.
         """
         require_rectangular(template)
         if is_polarized(sky):
-            raise ValueError("the dense engine does not handle a polarized sky")
+            raise InputError("the dense engine does not handle a polarized sky")
         frequencies, feeds = template.freq_array, polarization_feeds(template)
         pattern = power_pattern(beam.at(frequencies), frequencies, feeds)
         flux = stokes_i(sky, frequencies)
@@ -121,11 +122,11 @@ class DenseEngine:
 
 
 def polarization_feeds(template: UVData) -> list[str]:
-    """Return the feed of each polarization; raises ValueError for cross-hand or circular ones."""
+    """Return the feed of each polarization; raises InputError for cross-hand or circular ones."""
     feeds = {-5: "x", -6: "y"}
     unknown = [int(number) for number in template.polarization_array if int(number) not in feeds]
     if unknown:
-        raise ValueError(f"polarization number {unknown[0]} is not xx (-5) or yy (-6)")
+        raise InputError(f"polarization number {unknown[0]} is not xx (-5) or yy (-6)")
     return [feeds[int(number)] for number in template.polarization_array]
 
 

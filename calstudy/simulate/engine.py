@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from calstudy.errors import InputError
+
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVBeam, UVData
@@ -60,7 +62,7 @@ class FastestEngine:
         self._engines = engines
 
     def choose(self, sky: SkyModel, beam: BeamSource, template: UVData) -> Engine:
-        """Return the engine that will be used; raises ValueError with every engine's reason if none can."""
+        """Return the engine that will be used; raises InputError with every engine's reason if none can."""
         reasons = []
         for engine in self._engines:
             reason = engine.refusal(sky, beam, template)
@@ -69,13 +71,13 @@ class FastestEngine:
                 return engine
             logger.info("not simulating with %s: %s", engine.name, reason)
             reasons.append(f"{engine.name}: {reason}")
-        raise ValueError("no engine handles this simulation; " + "; ".join(reasons))
+        raise InputError("no engine handles this simulation; " + "; ".join(reasons))
 
     def refusal(self, sky: SkyModel, beam: BeamSource, template: UVData) -> str | None:
         """Return why none of the engines can do what is asked, or None if one can."""
         try:
             self.choose(sky, beam, template)
-        except ValueError as error:
+        except InputError as error:
             return str(error)
         return None
 

@@ -9,6 +9,7 @@ from fftvis.wrapper import simulate_vis
 from pyradiosky import SkyModel
 from pyuvdata import BeamInterface, UVBeam, UVData
 
+from calstudy.errors import InputError
 from calstudy.instrument.telescope import use_bundled_earth_orientation
 from calstudy.simulate.brightness import is_polarized, stokes_i
 from calstudy.simulate.nodes import integration_times
@@ -52,13 +53,13 @@ class FftvisEngine:
 
         Raises
         ------
-        ValueError
+        InputError
             If the sky is polarized, a polarization is not linear, or the beam has not feeds x and y.
         """
         require_rectangular(template)
         reason = self.refusal(sky, beam, template)
         if reason:
-            raise ValueError(reason)
+            raise InputError(reason)
         coordinates = (
             sky.skycoord if sky.component_type == "point" else SkyCoord(*sky.get_lon_lat(), frame=sky.hpx_frame)
         )

@@ -9,6 +9,8 @@ import numpy as np
 from pyuvdata import BeamInterface, UVBeam
 from pyuvdata.analytic_beam import AnalyticBeam
 
+from calstudy.errors import InputError
+
 # Pixels by which pyuvdata extends a beam in azimuth so that its splines see it wrap.
 AZIMUTH_EXTENSION = 3
 
@@ -27,18 +29,18 @@ def power_pattern(beam: UVBeam | AnalyticBeam, frequencies: np.ndarray, feeds: l
 
     Raises
     ------
-    ValueError
+    InputError
         If the beam is not an E-field beam with these feeds, or is a tabulated one that is not peak-normalized, not on a
         regular grid in azimuth and zenith angle, or not at these frequencies.
     """
     reason = refusal(beam, feeds)
     if reason:
-        raise ValueError(reason)
+        raise InputError(reason)
     if isinstance(beam, UVBeam):
         if beam.freq_array.shape != frequencies.shape or not np.allclose(
             beam.freq_array, frequencies, rtol=0, atol=1.0
         ):
-            raise ValueError("the beam is not tabulated at the frequencies to be simulated")
+            raise InputError("the beam is not tabulated at the frequencies to be simulated")
         return SplinePattern(beam, feeds)
     return AnalyticPattern(beam, frequencies, feeds)
 

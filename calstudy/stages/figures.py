@@ -1,4 +1,4 @@
-"""Stage `figure`: from spectra and layouts to pictures, with the arrays that they show."""
+"""Stage `figure`: from products to pictures, with the arrays that they show."""
 
 from __future__ import annotations
 
@@ -7,24 +7,29 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from pydantic import TypeAdapter
 
+from calstudy.figures.baselines import draw_baselines
+from calstudy.figures.data import draw_data
+from calstudy.figures.domains import in_two_domains
+from calstudy.figures.gains import draw_gains
 from calstudy.figures.layouts import LayoutPanel, draw_layouts
+from calstudy.figures.model import draw_model
+from calstudy.figures.reflections import draw_reflections
 from calstudy.figures.save import figure_arrays, save_figure
 from calstudy.figures.spherical import SphericalColumn, draw_spherical
 from calstudy.figures.wedge import WedgePanels, draw_wedge
-from calstudy.instrument.layouts import make_layout
-from calstudy.instrument.settings import Layout
 from calstudy.power.spherical import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.power.wedge import WedgeSpectrum
+from calstudy.stages.inspection import inspect_baselines, inspect_data, inspect_gains, inspect_model
 from calstudy.stages.registry import Job
+from calstudy.stages.selection import layout_of, read_gains
 
 SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eor", "noise")
 
 
 def _layout(job: Job) -> tuple[Figure, Any]:
-    layout = make_layout(TypeAdapter(Layout).validate_python(job.settings["layout"]))
+    layout = layout_of(job.settings)
     panel = LayoutPanel(title=layout.name, numbers=layout.numbers, enu=layout.enu)
     return draw_layouts([panel], stand_ins=job.settings["notes"]), panel
 
@@ -49,7 +54,42 @@ def _spherical(job: Job) -> tuple[Figure, Any]:
     return draw_spherical(columns, stand_ins=job.settings["notes"]), {"all_modes": columns[0], "excised": columns[1]}
 
 
-FIGURES = {"layout": _layout, "wedge": _wedge, "spherical": _spherical}
+def _gains(job: Job) -> tuple[Figure, Any]:
+    comparison = inspect_gains(job)
+    return draw_gains(comparison, stand_ins=job.settings["notes"]), comparison
+
+
+def _model(job: Job) -> tuple[Figure, Any]:
+    comparison = inspect_model(job)
+    return draw_model(comparison, stand_ins=job.settings["notes"]), comparison
+
+
+def _data(job: Job) -> tuple[Figure, Any]:
+    comparison = inspect_data(job)
+    return draw_data(comparison, stand_ins=job.settings["notes"]), comparison
+
+
+def _baselines(job: Job) -> tuple[Figure, Any]:
+    spectra = inspect_baselines(job)
+    return draw_baselines(spectra, stand_ins=job.settings["notes"]), spectra
+
+
+def _reflections(job: Job) -> tuple[Figure, Any]:
+    gains = read_gains(job.inputs["gains"])
+    shown = in_two_domains(gains.frequency, gains.values[0])
+    return draw_reflections(shown, stand_ins=job.settings["notes"]), shown
+
+
+FIGURES = {
+    "layout": _layout,
+    "gains": _gains,
+    "model": _model,
+    "data": _data,
+    "baselines": _baselines,
+    "wedge": _wedge,
+    "spherical": _spherical,
+    "reflections": _reflections,
+}
 
 
 def draw(job: Job) -> Mapping[str, Any]:

@@ -55,5 +55,9 @@ STAGES: Mapping[str, Stage] = {
     "average": Stage("power", "average", 1),
     "power": Stage("power", "estimate", 1),
     "spectra": Stage("power", "spectra", 1),
+    "agreement": Stage("agreement", "measure", 1),
+    "claims": Stage("claims", "evaluate", 1),
+    "combined-claims": Stage("claims", "evaluate_combined", 1),
     "figure": Stage("figures", "draw", 1),
+    "combined-figure": Stage("combined_figures", "draw", 1),
 }

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 SPEED_OF_LIGHT = 299792458.0
 SMOOTH_SPECTRA = ("flat", "spectral_index")
 # Width of the main lobe of each taper, in units of 1 / bandwidth: what the floor must start beyond.
-MAIN_LOBES = {"blackman-harris": 4, "dolph-chebyshev": 6}
+MAIN_LOBES = {"blackman-harris": 4, "dolph-chebyshev": 8}
 CHECKED = 2
 """Integrations, and channels, at which interpolated visibilities are compared with directly simulated ones."""
 

@@ -75,7 +75,9 @@ def test_products_follow_pyuvdatas_conventions(data, result):
     assert gains.gain_array.shape == (8, 64, 3, 1)
     assert not gains.flag_array.any()
     gains.check()
-    calibrated = uvcalibrate(data, gains, inplace=False)
+    raw = data.copy()
+    raw.vis_units, raw.pol_convention = "uncalib", None
+    calibrated = uvcalibrate(raw, gains, inplace=False)
     expected = to_cube(result.model) + to_cube(result.residual)
     assert np.abs(to_cube(calibrated) - expected).max() < 1e-10 * np.abs(expected).max()
 
@@ -95,7 +97,9 @@ def test_records_tell_each_solve(data, result):
     assert {record.status for record in result.solutions} == {"converged"}
     summary = json.loads(json.dumps(result.summary()))
     assert summary["by_status"] == {"converged": 3}
-    assert all(record["last_loss"] < record["first_loss"] for record in summary["records"])
+    first, *warm = summary["records"]
+    assert first["last_loss"] < 1e-3 * first["first_loss"]
+    assert all(record["last_loss"] <= record["first_loss"] < 2 * first["last_loss"] for record in warm)
 
 
 def test_inputs_are_not_mutated(toy):
@@ -199,5 +203,5 @@ def test_bad_data_are_refused_in_one_sentence(toy, data):
         calibrate(data, SETTINGS.model_copy(update={"autos": True}))
     crossed = data.copy()
     crossed.polarization_array = np.array([-7])
-    with pytest.raises(ValueError, match="polarizations: xy"):
+    with pytest.raises(ValueError, match="polarizations: en; calibration takes xx, yy"):
         calibrate(crossed, SETTINGS)

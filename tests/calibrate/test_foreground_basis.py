@@ -48,7 +48,7 @@ def test_autocorrelations_get_the_minimum_delay():
     ("length", "frequencies", "settings", "match"),
     [
         (400.0, FREQUENCIES, BASIS, "fills all 64 channels of 400 kHz"),
-        (280.0, FREQUENCIES, BASIS, "fills all 64 channels"),
+        (340.0, FREQUENCIES, BASIS, "fills all 64 channels"),
         (30.0, np.delete(FREQUENCIES, 20), BASIS, "evenly spaced"),
         (30.0, FREQUENCIES[:1], BASIS, "evenly spaced"),
         (0.0, FREQUENCIES, BasisSettings(min_delay="0 ns", buffer="0 ns"), "half-width is 0 s"),

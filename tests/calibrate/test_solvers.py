@@ -59,7 +59,7 @@ def test_noiseless_data_are_reproduced(quiet):
     problem = quiet.problem(visibilities=gain_products(quiet.gains, antennas) * in_the_span(quiet))
     solution = solve(problem, GaussNewton(max_steps=500))
     assert solution.status == "converged", solution.message
-    assert product_error(problem, solution) < 1e-6
+    assert product_error(problem, solution) < 1e-5
 
 
 def test_solution_at_the_truth_is_exact(quiet):
@@ -91,7 +91,7 @@ def test_divergence_is_reported_as_failure(toy):
 
 def test_best_parameters_are_kept(toy):
     problem = toy.problem(prior="none")
-    solution = solve(problem, FirstOrder(learning_rate=0.05, max_steps=9, precision="double"))
+    solution = solve(problem, FirstOrder(learning_rate=0.3, max_steps=6, precision="double"))
     assert solution.loss_history.min() < solution.loss_history[-1]
     residual = problem.visibilities - gain_products(solution.gains, toy.antennas) * solution.model
     assert np.sum(problem.weights * np.abs(residual) ** 2) == pytest.approx(solution.loss_history.min(), rel=1e-9)
@@ -142,7 +142,7 @@ def test_redundant_models_are_recovered(hexagon, solver):
     foregrounds = np.where(turned, foregrounds.conj(), foregrounds)
     problem = hexagon.problem(structure, visibilities=gain_products(hexagon.gains, structure.antennas) * foregrounds)
     solution = solve(problem, solver)
-    limit = 1e-6 if isinstance(solver, GaussNewton) else 3e-3
+    limit = 1e-5 if isinstance(solver, GaussNewton) else 3e-3
     assert product_error(problem, solution) < limit
     models = np.where(structure.conjugated[:, None], solution.model.conj(), solution.model)
     for group in range(structure.basis.n_models):

@@ -90,7 +90,8 @@ class Kernels:
 
     def loss(self, parameters: Parameters, data: FitData) -> tf.Tensor:
         """Return the likelihood, plus the sum prior where the problem has it."""
-        model = self.tensors.to_baselines(foreground_model(parameters.coefficients, self.bases))
+        real, imaginary = foreground_model(parameters.coefficients, self.bases)
+        model = self.tensors.to_baselines(real, axis=0), self.tensors.to_baselines(imaginary, axis=0)
         value = likelihood(self.tensors, parameters.gains, model, data.visibilities, data.weights)
         return value + sum_prior(self.tensors, model, data.weights, data.target) if self._with_prior else value
 
@@ -220,7 +221,7 @@ class FirstOrder:
 
     def estimate(self, state: FirstOrderState) -> Estimate:
         """Return the best gains and foregrounds seen."""
-        model = foreground_model(state.best.coefficients, state.kernels.bases)
+        model = tf.stack(foreground_model(state.best.coefficients, state.kernels.bases))
         return Estimate(pairs.to_complex(state.best.gains), state.kernels.tensors.unload(model, state.scale))
 
     def memory(self, state: FirstOrderState) -> None:

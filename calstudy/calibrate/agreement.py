@@ -1,0 +1,237 @@
+"""How far gains, foreground models and their products agree with the truth of a simulation (paper §Simulation Results).
+
+Every number has the scatter over the antennas, baselines or integrations that it was measured on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.constants import speed_of_light
+
+from calstudy.calibrate.alignment import align
+from calstudy.power.delay import channel_width, delay_transform, delays
+
+TAPER = "blackman-harris"
+MAIN_LOBE = 4
+"""Half-width of the taper's main lobe, in units of 1 / bandwidth."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A number and how much it scatters.
+
+    Attributes
+    ----------
+    value
+        Median, or what the name says.
+    scatter
+        Half the width of the central 68 %.
+    count
+        How many values there are.
+    over
+        What they belong to.
+    """
+
+    value: float
+    scatter: float
+    count: int
+    over: str
+
+    @classmethod
+    def of(cls, values: np.ndarray, over: str) -> Measurement:
+        """Return the median and the scatter of finite values of any shape."""
+        low, median, high = np.quantile(np.ravel(values), [0.16, 0.5, 0.84])
+        return cls(float(median), float(high - low) / 2, int(np.size(values)), over)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulated measurement consists of; visibilities (Ntimes, Nbls, Nfreqs) complex, in Jy.
+
+    Attributes
+    ----------
+    gains
+        True gains, constant in time, (Nants, Nfreqs).
+    foregrounds, noise
+        F and N without gains.
+    data
+        The measurement, gains included.
+    """
+
+    gains: np.ndarray
+    foregrounds: np.ndarray
+    noise: np.ndarray
+    data: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What calibration made of it.
+
+    Attributes
+    ----------
+    gains
+        (Ntimes, Nants, Nfreqs).
+    model, residual
+        Intrinsic foregrounds and calibrated residual R, (Ntimes, Nbls, Nfreqs), in Jy.
+    """
+
+    gains: np.ndarray
+    model: np.ndarray
+    residual: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Baselines:
+    """Where and how the baselines measure.
+
+    Attributes
+    ----------
+    antennas
+        Rows of the two antennas among the gains, (Nbls, 2).
+    lengths
+        |b| in m, (Nbls,).
+    frequency
+        Channel centres, Hz, (Nfreqs,).
+    buffer
+        Added to the horizon delay to find what is outside the wedge, s.
+    """
+
+    antennas: np.ndarray
+    lengths: np.ndarray
+    frequency: np.ndarray
+    buffer: float
+
+    @cached_property
+    def delay(self) -> np.ndarray:
+        """Ascending delays, s, (Ndelays,)."""
+        return delays(self.frequency.size, channel_width(self.frequency))
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Which delays lie within the horizon, (Nbls, Ndelays)."""
+        return np.abs(self.delay) <= self.lengths[:, None] / speed_of_light
+
+    @property
+    def outside(self) -> np.ndarray:
+        """Which delays lie beyond horizon and buffer, or the main lobe of the taper if that is wider."""
+        lobe = MAIN_LOBE / (channel_width(self.frequency) * self.frequency.size)
+        return np.abs(self.delay) > self.lengths[:, None] / speed_of_light + max(self.buffer, lobe)
+
+    def products(self, gains: np.ndarray) -> np.ndarray:
+        """Return g_a g_b* of every baseline for gains (..., Nants, Nfreqs)."""
+        first, second = self.antennas.T
+        return gains[..., first, :] * gains[..., second, :].conj()
+
+    def delay_power(self, spectra: np.ndarray) -> np.ndarray:
+        """Return |V~|^2 averaged over integrations, (Nbls, Ndelays), of spectra (Ntimes, Nbls, Nfreqs)."""
+        power = np.zeros(spectra.shape[1:])
+        for integration in spectra:
+            power += np.abs(delay_transform(integration, self.frequency, TAPER)) ** 2
+        return power / len(spectra)
+
+
+def measure_agreement(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
+    """Measure a fit against the truth.
+
+    Returns
+    -------
+    Measurements by name. Ratios are of rms amplitudes; "aligned" means free of the phases and the scale that no fit can
+    know (`calstudy.calibrate.alignment`), "raw" as fitted. Names that end in "outside" or "inside" refer to delays
+    beyond or within the horizon of each baseline; those that no baseline has are left out.
+    """
+    found = _gains(truth, fit, baselines) | _models(truth, fit) | _products(truth, fit, baselines)
+    return found | _residuals(truth, fit, baselines)
+
+
+def _rms(values: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
+    return np.sqrt(np.mean(values.real**2 + values.imag**2, axis=axis))
+
+
+def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
+    aligned = np.stack([align(gains, truth.gains)[0] for gains in fit.gains])
+    size = _rms(truth.gains, axis=1)
+    power = [
+        np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
+        for values in (aligned - truth.gains, truth.gains[None])
+    ]
+    by_delay = np.sqrt(power[0] / power[1])
+    return {
+        "gains_aligned": Measurement.of(_rms(aligned - truth.gains, axis=2) / size, "antennas and integrations"),
+        "gains_raw": Measurement.of(_rms(fit.gains - truth.gains, axis=2) / size, "antennas and integrations"),
+        "gains_by_delay": Measurement.of(by_delay, "delays"),
+        "gains_worst_delay": Measurement(float(by_delay.max()), 0.0, by_delay.size, "delays"),
+    }
+
+
+def _models(truth: Truth, fit: Fit) -> dict[str, Measurement]:
+    scales = np.array([align(gains, truth.gains)[1] for gains in fit.gains])
+    size = _rms(truth.foregrounds, axis=(0, 2))
+    aligned = fit.model / scales[:, None, None] ** 2 - truth.foregrounds
+    error = _rms(aligned, axis=(0, 2))
+    return {
+        "model_aligned": Measurement.of(error / size, "baselines"),
+        "model_raw": Measurement.of(_rms(fit.model - truth.foregrounds, axis=(0, 2)) / size, "baselines"),
+        "model_over_noise": Measurement.of(error / _rms(truth.noise, axis=(0, 2)), "baselines"),
+    }
+
+
+def _products(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
+    difference = truth.data - baselines.products(fit.gains) * fit.model
+    noise = baselines.products(truth.gains) * truth.noise
+    ratio = np.sqrt(baselines.delay_power(difference).mean(axis=0) / baselines.delay_power(noise).mean(axis=0))
+    error = _rms(difference, axis=(0, 2))
+    return {
+        "product_over_noise": Measurement.of(error / _rms(noise, axis=(0, 2)), "baselines"),
+        "product_over_data": Measurement.of(error / _rms(truth.data, axis=(0, 2)), "baselines"),
+        "product_worst_delay": Measurement(float(ratio.max()), 0.0, ratio.size, "delays"),
+        **_correction(truth, fit, baselines),
+    }
+
+
+def _correction(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
+    """The gain-correction ratio beyond the wedge, over the noise relative to the foregrounds."""
+    outside = baselines.outside
+    used = outside.any(axis=1)
+    if not used.any():
+        return {}
+    ratio = baselines.products(truth.gains) / baselines.products(fit.gains) - 1
+    relative_noise = truth.noise / _rms(truth.foregrounds, axis=(0, 2))[:, None]
+    power = [_masked_mean(baselines.delay_power(values), outside)[used] for values in (ratio, relative_noise)]
+    return {"correction_over_noise_outside": Measurement.of(np.sqrt(power[0] / power[1]), "baselines")}
+
+
+def _residuals(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
+    data, residual, noise = (baselines.delay_power(values) for values in (truth.data, fit.residual, truth.noise))
+    found = {}
+    for name, above, below, mask in (
+        ("residual_over_noise_outside", residual, noise, baselines.outside),
+        ("residual_over_noise_inside", residual, noise, baselines.inside),
+        ("data_over_residual_outside", data, residual, baselines.outside),
+        ("data_over_noise_outside", data, noise, baselines.outside),
+    ):
+        used = mask.any(axis=1)
+        if used.any():
+            ratio = _masked_mean(above, mask)[used] / _masked_mean(below, mask)[used]
+            found[name] = Measurement.of(np.sqrt(ratio), "baselines")
+    return found
+
+
+def _masked_mean(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Mean over the marked delays of each baseline; zero where none is marked."""
+    return np.sum(values, axis=1, where=mask) / np.maximum(mask.sum(axis=1), 1)
+
+
+def as_json(measurements: Mapping[str, Measurement]) -> dict[str, Any]:
+    """Return measurements as plain JSON types."""
+    return {name: asdict(measurement) for name, measurement in measurements.items()}
+
+
+def from_json(values: Mapping[str, Any]) -> dict[str, Measurement]:
+    """Return what `as_json` was given."""
+    return {name: Measurement(**value) for name, value in values.items()}

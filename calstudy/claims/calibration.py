@@ -1,0 +1,148 @@
+"""Claims on gains, foreground models, their products and single baselines (paper §Simulation Results)."""
+
+from __future__ import annotations
+
+from calstudy.claims.statement import Above, Below, Finding, Source, Within
+from calstudy.claims.study import Study
+
+RESULTS = Source("Simulation Results", ("minimally_redundant",))
+FACTOR_OF_TWO = "the paper's 'similar', 'about' and 'roughly' are read as within a factor of two"
+
+
+def _median(study: Study, name: str) -> Finding:
+    """Return the median over antennas or baselines, with their scatter as its uncertainty."""
+    found = study.measured(name)
+    return Finding(found.value, found.scatter)
+
+
+GAINS = "our fitted gains do not agree particularly well with the true gains, only on the ≲ 20 % level on all delays"
+GAINS_CAPTION = "their residuals are on the order of 10 %"
+
+
+@RESULTS.states(
+    GAINS, "rms of g - ĝ over rms of g, free of phase and scale that no fit can know; median", Below(0.2), "≲ 20 %"
+)
+def gains_within_20_percent(study: Study) -> Finding:
+    return _median(study, "gains_aligned")
+
+
+@RESULTS.states(GAINS, "the same, gains as fitted from a start at unity", Below(0.2), "≲ 20 %")
+def gains_within_20_percent_raw(study: Study) -> Finding:
+    return _median(study, "gains_raw")
+
+
+@RESULTS.states(
+    GAINS, "the same in delay (Blackman-Harris), over all antennas; median of all delays", Below(0.2), "≲ 20 %"
+)
+def gains_within_20_percent_at_typical_delay(study: Study) -> Finding:
+    return _median(study, "gains_by_delay")
+
+
+@RESULTS.states(GAINS, "the same in delay, at the worst of all delays", Below(0.2), "≲ 20 % on all delays")
+def gains_within_20_percent_at_every_delay(study: Study) -> Finding:
+    return _median(study, "gains_worst_delay")
+
+
+@RESULTS.states(
+    GAINS_CAPTION, "rms of g - ĝ over rms of g, free of phase and scale; median", Within(0.05, 0.2), FACTOR_OF_TWO
+)
+def gains_of_order_10_percent(study: Study) -> Finding:
+    return _median(study, "gains_aligned")
+
+
+MODEL = "the residual is on the order of ≈ 10-20 % and significantly exceeds the level of the thermal noise"
+
+
+@RESULTS.states(
+    MODEL, "rms of F - F̂ over rms of F, on the scale of the true gains; median", Within(0.05, 0.4), FACTOR_OF_TWO
+)
+def model_of_order_10_to_20_percent(study: Study) -> Finding:
+    return _median(study, "model_aligned")
+
+
+@RESULTS.states(MODEL, "the same, model as fitted; median", Within(0.05, 0.4), FACTOR_OF_TWO)
+def model_of_order_10_to_20_percent_raw(study: Study) -> Finding:
+    return _median(study, "model_raw")
+
+
+@RESULTS.states(MODEL, "rms of F - F̂ over rms of N; median", Above(2), "more than 'similar', a factor of two")
+def model_error_exceeds_noise(study: Study) -> Finding:
+    return _median(study, "model_over_noise")
+
+
+PRODUCT = "our visibility model is accurate at the 0.1 % level and at a similar level to the thermal noise at all delays"
+
+
+@RESULTS.states(
+    "the products of the gains and foregrounds are identical to within the uncertainties from thermal noise",
+    "rms of V - ĝĝ*F̂ over rms of the noise in V; median",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+)
+def product_at_noise(study: Study) -> Finding:
+    return _median(study, "product_over_noise")
+
+
+@RESULTS.states(
+    PRODUCT, "rms of V - ĝĝ*F̂ over that of the noise, at the worst delay", Below(2), "at all delays; " + FACTOR_OF_TWO
+)
+def product_at_noise_at_every_delay(study: Study) -> Finding:
+    return _median(study, "product_worst_delay")
+
+
+@RESULTS.states(PRODUCT, "rms of V - ĝĝ*F̂ over rms of V; median", Below(0.002), "0.1 %; " + FACTOR_OF_TWO)
+def product_at_tenth_of_percent(study: Study) -> Finding:
+    return _median(study, "product_over_data")
+
+
+@RESULTS.states(
+    "while fitted gains and foregrounds alone only agree at the 10 % level, our visibility model is accurate at the "
+    "0.1 % level",
+    "relative error of the gains over that of the product",
+    Above(10),
+    "10 % over 0.1 % is a hundred; an order of magnitude is asked for",
+)
+def product_far_better_than_gains(study: Study) -> Finding:
+    gains, product = study.measured("gains_aligned"), study.measured("product_over_data")
+    ratio = gains.value / product.value
+    return Finding(ratio, ratio * product.scatter / product.value)
+
+
+@RESULTS.states(
+    "the gain correction ratio is smooth at the level of the thermal noise fluctuations",
+    "rms beyond the wedge of g_a g_b*/(ĝ_a ĝ_b*) - 1 over that of N / rms(F); median",
+    Below(2),
+    FACTOR_OF_TWO,
+)
+def correction_is_smooth(study: Study) -> Finding:
+    return _median(study, "correction_over_noise_outside")
+
+
+@RESULTS.states(
+    "outside of the wedge, the RMS amplitudes of our calibrated residuals are reasonably consistent with thermal noise",
+    "rms over time of R over that of N, delays outside the wedge; median",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+)
+def residual_at_noise_outside_wedge(study: Study) -> Finding:
+    return _median(study, "residual_over_noise_outside")
+
+
+@RESULTS.states(
+    "there is a noticeable reduction in amplitude inside of the wedge",
+    "rms over time of R over that of N, delays inside the wedge; median",
+    Below(1, 2),
+    "a reduction is noticeable if it exceeds twice the scatter over baselines",
+)
+def residual_reduced_inside_wedge(study: Study) -> Finding:
+    return _median(study, "residual_over_noise_inside")
+
+
+@RESULTS.states(
+    "R̃ is orders of magnitude lower than the injected gain features",
+    "rms over time of V over that of R, delays outside the wedge; median",
+    Above(100),
+    "orders of magnitude are two at least",
+)
+def residual_far_below_gain_features(study: Study) -> Finding:
+    return _median(study, "data_over_residual_outside")

@@ -1,0 +1,315 @@
+r"""Signal loss: how much of the EoR power survives a calibration (paper §Conclusion: loss must be accounted for).
+
+The same foregrounds, noise and gains are calibrated twice, with the EoR S in the data and without, which leaves the
+residuals R_with = R_0 + D and R_without = R_0. Their difference D is the response of the residual to the signal: what
+the foreground model and the gains have not absorbed of S. The power of the residual is then
+
+    <R_with* R_with> = <R_0* R_0> + <D* D> + 2 Re <R_0* D>,
+
+and the last term has no mean, for S is independent of noise and foregrounds. So P^D is the unbiased part of P^R that
+the signal is responsible for, and
+
+    T(k) = P^D / P^S
+
+is the transfer function P^R / P^S without what is in P^R even when there is no signal. It beats the difference of the
+two powers, P^{R_with} - P^{R_without}, by the whole of that last term, in which noise and foreground residuals scatter:
+in D they cancel, up to the change of the gains (S / F, 1e-4) times the noise. T is still made of even times odd, so that
+what is left of the noise in D gives no bias.
+
+The *coherence* is the cross power with the signal, C(k) = Re <S* D> / P^S. If a calibration projects (D = M S with
+M = M* = M^2) and S is white, <D* D> = <S* M* M S> = <S* M S>: both are equal, and are the fraction of the mode outside
+of what the fit can absorb. T > C tells of signal that was moved from other modes; T < C^2 is impossible.
+
+Numerator and denominator hold the same sky, so that most of the sample variance cancels. What remains is estimated
+from the scatter of independent samples within a bin, taking each baseline or redundant group as one sample (it is one
+patch of the uv plane, whose delays share the taper): for sums x_i of P^D and y_i of P^S over n samples,
+
+    T = sum x_i / sum y_i,   var T = n / (n - 1) sum (x_i - T y_i)^2 / (sum y_i)^2
+
+(the estimator of a ratio from clusters, Cochran 1977, section 6.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy import constants
+
+from calstudy.power.spherical import outside_wedge
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+    from calstudy.power.spectra import DelaySpectra
+    from calstudy.power.spherical import SphericalSpectrum
+
+BANDS = (0.1, 0.2, 0.3, 0.5, 1.0)
+"""Edges in h/Mpc of the wide bins in which studies are compared."""
+
+
+@dataclass(frozen=True)
+class TransferFunction:
+    """T and C in Nk bins of |k|. Bins without signal hold NaN; errors are NaN where a bin has a single sample.
+
+    Attributes
+    ----------
+    k, bin_edges
+        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
+    transfer, transfer_error
+        T = P^D / P^S and its standard deviation, (Nk,).
+    coherence, coherence_error
+        C = Re <S* D> / P^S and its standard deviation, (Nk,).
+    signal
+        Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,).
+    n_samples
+        Baselines, or redundant groups, in each bin, (Nk,) int.
+    """
+
+    k: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    transfer: np.ndarray = field(metadata={"unit": ""})
+    transfer_error: np.ndarray = field(metadata={"unit": ""})
+    coherence: np.ndarray = field(metadata={"unit": ""})
+    coherence_error: np.ndarray = field(metadata={"unit": ""})
+    signal: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    n_samples: np.ndarray = field(metadata={"unit": ""})
+
+
+@dataclass(frozen=True)
+class TransferMap:
+    """T and C in Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
+
+    Attributes
+    ----------
+    baseline_length, k_perp
+        Mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
+    bin_edges
+        Lower and upper edge of each bin, (Nb, 2), m.
+    delay, k_parallel
+        (Nd,) ascending, s and h/Mpc.
+    transfer, transfer_error, coherence, coherence_error
+        As in `TransferFunction`, (Nb, Nd). A baseline's two signs of the delay are two samples.
+    horizon_delay
+        |b|/c, the edge of the wedge, (Nb,), s.
+    """
+
+    baseline_length: np.ndarray = field(metadata={"unit": "m"})
+    bin_edges: np.ndarray = field(metadata={"unit": "m"})
+    k_perp: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    delay: np.ndarray = field(metadata={"unit": "s"})
+    k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    transfer: np.ndarray = field(metadata={"unit": ""})
+    transfer_error: np.ndarray = field(metadata={"unit": ""})
+    coherence: np.ndarray = field(metadata={"unit": ""})
+    coherence_error: np.ndarray = field(metadata={"unit": ""})
+    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
+
+
+@dataclass(frozen=True)
+class Injection:
+    """Delay spectra of an injected signal and of what became of it, for the same units and delays.
+
+    Attributes
+    ----------
+    signal
+        S x S.
+    response
+        D x D.
+    cross
+        S x D.
+    """
+
+    signal: DelaySpectra
+    response: DelaySpectra
+    cross: DelaySpectra
+
+    def __post_init__(self) -> None:
+        for name in ("response", "cross"):
+            if getattr(self, name).power.shape != self.signal.power.shape:
+                raise ValueError(
+                    f"the {name} has {getattr(self, name).power.shape} units and delays, expected those of the signal, "
+                    f"{self.signal.power.shape}"
+                )
+
+
+def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
+    """Return D, the difference of two residuals of the same noise, with and without the signal in the data.
+
+    Parameters
+    ----------
+    with_signal, without_signal
+        Of the same baselines, times, channels and polarizations. Not mutated. What is flagged in either is flagged.
+
+    Raises
+    ------
+    ValueError
+        If they are of different shape.
+    """
+    if with_signal.data_array.shape != without_signal.data_array.shape:
+        raise ValueError(
+            f"the residuals have shapes {with_signal.data_array.shape} with the signal and "
+            f"{without_signal.data_array.shape} without, expected the same"
+        )
+    response = with_signal.copy()
+    response.data_array = with_signal.data_array - without_signal.data_array
+    response.flag_array = with_signal.flag_array | without_signal.flag_array
+    return response
+
+
+def spherical_transfer(injection: Injection, edges: Sequence[float], buffer: float, inside: bool) -> TransferFunction:
+    """Return T in bins of |k|, outside or inside the wedge.
+
+    Parameters
+    ----------
+    injection
+        Spectra of signal and response.
+    edges
+        Bin edges, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
+    buffer
+        Modes with |tau| <= |b|/c + buffer (s) are inside the wedge.
+    inside
+        Which modes to average.
+    """
+    limits = np.asarray(edges, dtype=float)
+    signal = injection.signal
+    bins = np.searchsorted(limits, np.hypot(signal.k_perp[:, None], signal.k_parallel), side="left") - 1
+    bins[(bins >= limits.size - 1) | (outside_wedge(signal, buffer) == inside)] = -1
+    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
+    transfer, coherence = (
+        _ratio(numerator, signal, bins, samples, limits.size - 1) for numerator in (injection.response, injection.cross)
+    )
+    return TransferFunction(
+        k=(limits[1:] + limits[:-1]) / 2,
+        bin_edges=limits,
+        transfer=transfer.value,
+        transfer_error=transfer.error,
+        coherence=coherence.value,
+        coherence_error=coherence.error,
+        signal=transfer.total,
+        n_samples=transfer.n_samples,
+    )
+
+
+def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap:
+    """Return T in bins of baseline length, `length_bin` m wide, and delay."""
+    signal = injection.signal
+    lengths, row = np.unique(np.floor(signal.length / length_bin).astype(int), return_inverse=True)
+    spacing = signal.delay[1] - signal.delay[0]
+    step = np.rint(signal.delay / spacing).astype(int)
+    column = np.abs(step)
+    bins = row[:, None] * (column.max() + 1) + column
+    samples = 2 * np.arange(row.size)[:, None] + (step < 0)
+    shape = (lengths.size, column.max() + 1)
+    transfer, coherence = (
+        _ratio(numerator, signal, bins, samples, lengths.size * shape[1])
+        for numerator in (injection.response, injection.cross)
+    )
+    pairs = np.bincount(row, signal.n_pairs)
+    length = np.bincount(row, signal.n_pairs * signal.length) / pairs
+    return TransferMap(
+        baseline_length=length,
+        bin_edges=np.column_stack([lengths, lengths + 1]) * length_bin,
+        k_perp=np.bincount(row, signal.n_pairs * signal.k_perp) / pairs,
+        delay=spacing * np.arange(shape[1]),
+        k_parallel=np.bincount(column, np.abs(signal.k_parallel)) / np.bincount(column),
+        transfer=transfer.value.reshape(shape),
+        transfer_error=transfer.error.reshape(shape),
+        coherence=coherence.value.reshape(shape),
+        coherence_error=coherence.error.reshape(shape),
+        horizon_delay=length / constants.c.value,
+    )
+
+
+@dataclass(frozen=True)
+class _Ratio:
+    value: np.ndarray
+    error: np.ndarray
+    total: np.ndarray
+    n_samples: np.ndarray
+
+
+def _ratio(
+    numerator: DelaySpectra, signal: DelaySpectra, bins: np.ndarray, samples: np.ndarray, n_bins: int
+) -> _Ratio:
+    """Return the ratio of sums in each bin, with the error that the scatter of the samples gives it.
+
+    `bins` (-1: left out) and `samples` number the modes, (Nu, Nd) each.
+    """
+    used = bins >= 0
+    weights = np.broadcast_to(signal.n_pairs[:, None], bins.shape)[used]
+    labels = np.stack([bins[used], samples[used]])
+    (owner, _), index = np.unique(labels, axis=1, return_inverse=True)
+    x, y = (np.bincount(index, weights * part.power.real[used]) for part in (numerator, signal))
+    n_samples = np.bincount(owner, minlength=n_bins)
+    total = np.bincount(owner, y, minlength=n_bins)
+    value = np.divide(np.bincount(owner, x, n_bins), total, out=np.full(n_bins, np.nan), where=total != 0)
+    scatter = np.bincount(owner, (x - value[owner] * y) ** 2, minlength=n_bins)
+    variance = np.full(n_bins, np.nan)
+    known = (n_samples > 1) & (total != 0)
+    variance[known] = (n_samples / np.maximum(n_samples - 1, 1) * scatter)[known] / total[known] ** 2
+    return _Ratio(value, np.sqrt(variance), total, n_samples)
+
+
+def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
+    """Return the transfer function of several injections together, such as EoR skies of different seeds.
+
+    Each enters with its signal's power, as if its modes were further modes of one injection, and errors add up as those
+    of independent skies.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or their bins differ.
+    """
+    if not transfers:
+        raise ValueError("no transfer function to pool, expected at least one")
+    first = transfers[0]
+    if any(not np.array_equal(other.bin_edges, first.bin_edges) for other in transfers):
+        raise ValueError("the transfer functions have different bins, expected the same")
+    signal = np.stack([item.signal for item in transfers])
+    total = signal.sum(axis=0)
+    weights = np.divide(signal, total, out=np.full_like(signal, np.nan), where=total != 0)
+
+    def mean(name: str) -> np.ndarray:
+        return _sum_present(weights * np.stack([getattr(item, name) for item in transfers]))
+
+    def error(name: str) -> np.ndarray:
+        return np.sqrt(_sum_present((weights * np.stack([getattr(item, name) for item in transfers])) ** 2))
+
+    return replace(
+        first,
+        transfer=mean("transfer"),
+        transfer_error=error("transfer_error"),
+        coherence=mean("coherence"),
+        coherence_error=error("coherence_error"),
+        signal=total,
+        n_samples=np.sum([item.n_samples for item in transfers], axis=0),
+    )
+
+
+def _sum_present(values: np.ndarray) -> np.ndarray:
+    """Sum over the first axis, leaving out NaN; NaN where there is nothing else."""
+    return np.where(np.isnan(values).all(axis=0), np.nan, np.nansum(values, axis=0))
+
+
+def correct(spectrum: SphericalSpectrum, transfer: TransferFunction) -> tuple[np.ndarray, np.ndarray]:
+    """Return P^R / T and its standard deviation, (Nk,) each, in the unit of the spectrum.
+
+    Errors of P^R and T are independent: (sigma / P)^2 adds. NaN where T is not above five times its error, for there is
+    nothing left to be corrected there.
+
+    Raises
+    ------
+    ValueError
+        If the bins differ.
+    """
+    if not np.array_equal(spectrum.bin_edges, transfer.bin_edges):
+        raise ValueError("spectrum and transfer function have different bins, expected the same")
+    known = transfer.transfer > 5 * transfer.transfer_error
+    factor = np.where(known, transfer.transfer, np.nan)
+    power = spectrum.power.real / factor
+    error = np.hypot(spectrum.error, power * transfer.transfer_error) / factor
+    return power, error
