@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calstudy import __version__
+from calstudy import __version__, ranks
 from calstudy.errors import ExperimentError, InputError
 
 app = typer.Typer(
@@ -35,6 +35,10 @@ Set = Annotated[
     typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set calibration.basis.buffer='200 ns'."),
 ]
 Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
+MaxMemory = Annotated[
+    str | None,
+    typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
+]
 Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster instead.")]
 
 
@@ -57,30 +61,38 @@ def run(
     scale: Scale = None,
     overrides: Set = None,
     workers: Workers = None,
+    max_memory: MaxMemory = None,
     scheduler: Scheduler = None,
 ) -> None:
     """Run an experiment: simulate, corrupt, calibrate, measure power spectra, draw figures.
 
     Products that are in the store already are not made again; an interrupted run is resumed by the same command.
     """
+    from calstudy.capacity import fit
     from calstudy.experiment.files import load
-    from calstudy.plans import choose_workers, show_result
+    from calstudy.plans import show_result
     from calstudy.runs import run as run_experiment
 
     console = Console(soft_wrap=True, highlight=False)
-    experiment = load(file, scale, overrides or ())
-    count = choose_workers(experiment, workers)
+    experiment, count = fit(load(file, scale, overrides or ()), workers, max_memory)
     show_result(run_experiment(experiment, count, scheduler, console), console)
 
 
 @app.command()
-def plan(file: File, scale: Scale = None, overrides: Set = None, workers: Workers = None) -> None:
+def plan(
+    file: File,
+    scale: Scale = None,
+    overrides: Set = None,
+    workers: Workers = None,
+    max_memory: MaxMemory = None,
+) -> None:
     """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
+    from calstudy.capacity import fit
     from calstudy.experiment.files import load
-    from calstudy.plans import choose_workers, show_plan
+    from calstudy.plans import show_plan
 
-    experiment = load(file, scale, overrides or ())
-    show_plan(experiment, choose_workers(experiment, workers), Console(highlight=False))
+    experiment, count = fit(load(file, scale, overrides or ()), workers, max_memory)
+    show_plan(experiment, count, Console(highlight=False))
 
 
 @app.command()
@@ -108,8 +120,12 @@ def fetch(
 def main() -> None:
     """Run the command line; a user's mistake ends with sentences on standard error and exit status 2."""
     logging.getLogger().addHandler(logging.NullHandler())
+    if ranks.is_helper():
+        ranks.serve()
+        return
     try:
-        app()
+        with ranks.leading():
+            app()
     except ExperimentError as error:
         for sentence in error.faults:
             typer.echo(f"calstudy: {sentence}", err=True)

@@ -146,6 +146,11 @@ def _power(task: Task) -> Cost:
     return Cost(6, 1.6e9, 2 * size.baselines * size.channels * COMPLEX128)
 
 
+def _agreement(task: Task) -> Cost:
+    samples = _size(_instrument(task)).samples
+    return Cost(2 + samples * 4e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
+
+
 ESTIMATES: Mapping[str, Callable[[Task], Cost]] = {
     "simulate-chunk": _simulate_chunk,
     "simulate": _simulate,
@@ -157,7 +162,15 @@ ESTIMATES: Mapping[str, Callable[[Task], Cost]] = {
     "average": _average,
     "power": _power,
     "spectra": lambda task: Cost(10, disk=5e6),
+    "difference": lambda task: Cost(1, disk=_size(_instrument(task)).baselines * 1e4),
+    "transfer": lambda task: Cost(4, disk=1e6),
+    "transfer-figure": lambda task: Cost(3, disk=1e6),
+    "sweep": lambda task: Cost(3, disk=1e6),
+    "agreement": _agreement,
+    "claims": lambda task: Cost(1, disk=1e5),
+    "combined-claims": lambda task: Cost(1, disk=1e5),
     "figure": lambda task: Cost(3, disk=1e6),
+    "combined-figure": lambda task: Cost(3, disk=1e6),
 }
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from calstudy import ranks
 from calstudy.errors import InputError
 from calstudy.perform import Order, perform
 from calstudy.resources import cores
@@ -192,6 +193,8 @@ def execute(
     from distributed import KilledWorker, as_completed
 
     products: dict[str, Product] = {}
+    if ranks.count() > 1:
+        return _execute_here(tasks, store, done)
     if not tasks:
         return products
     with _client(crew) as client:
@@ -207,6 +210,15 @@ def execute(
                 ) from None
             products[task.key] = product
             done(task, product)
+    return products
+
+
+def _execute_here(tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None]) -> dict[str, Product]:
+    """Make products one after the other in the main thread, where MPI may be used."""
+    products = {}
+    for task in tasks:
+        products[task.key] = perform(Order.of(task, store))
+        done(task, products[task.key])
     return products
 
 

@@ -53,6 +53,7 @@ FIGURE_SETTINGS: Mapping[str, Callable[[Graph], dict[str, Any]]] = {
     "baselines": _inspected_baselines,
     "wedge": _wedge_buffer,
     "spherical": _wedge_buffer,
+    "spherical-excised": _wedge_buffer,
     "reflections": _nothing,
 }
 
@@ -100,5 +101,6 @@ FIGURE_INPUTS: Mapping[str, Callable[[Graph], dict[str, Task]]] = {
     "baselines": _baselines,
     "wedge": _spectra,
     "spherical": _spectra,
+    "spherical-excised": _spectra,
     "reflections": _true_gains,
 }

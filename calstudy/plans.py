@@ -12,18 +12,10 @@ from calstudy.estimates import LIBRARIES_MEMORY, Cost, estimate
 from calstudy.execution import schedule
 from calstudy.experiment.model import Experiment
 from calstudy.progress import duration
-from calstudy.resources import cores, free_memory
+from calstudy.resources import free_memory
 from calstudy.runs import Run, run_folder
 from calstudy.store import Store
 from calstudy.tasks import Graph, Task
-
-
-def choose_workers(experiment: Experiment, wanted: int | None) -> int:
-    """Return the number of worker processes: what is wanted, or one per core as far as the free memory goes."""
-    if wanted is not None:
-        return wanted
-    largest = max(estimate(task).memory for task in Graph(experiment).tasks)
-    return max(1, min(cores(), int(free_memory() // largest)))
 
 
 def _by_stage(tasks: Sequence[Task]) -> dict[str, list[Task]]:

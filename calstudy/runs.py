@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,7 +23,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.progress import report
 from calstudy.provenance import git_commit, machine, package_versions, seeds
 from calstudy.store import Product, Store, digest_json
-from calstudy.tasks import Graph, Task
+from calstudy.tasks import Graph, Task, unique
 
 logger = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
@@ -66,12 +66,13 @@ def run_folder(experiment: Experiment) -> Path:
 
     The same experiment has the same folder; a changed one never overwrites it.
     """
-    content = experiment.model_dump(mode="json", exclude={"outputs": {"store", "runs"}, "scales": True})
+    content = experiment.model_dump(mode="json", exclude={"outputs": {"store", "runs"}, "scales": True, "simulation": {"chunks"}})
     return experiment.outputs.runs.expanduser().resolve() / f"{experiment.name}-{digest_json(content)[:8]}"
 
 
-def _open_folder(folder: Path) -> None:
-    known = {"figures", "tables", MANIFEST, "experiment.yaml", "run.log"}
+def open_folder(folder: Path) -> None:
+    """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
+    known = {"figures", "tables", "claims.json", "claims.md", MANIFEST, "experiment.yaml", "run.log"}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in folder.iterdir() if path.name not in known)
@@ -85,7 +86,8 @@ def _open_folder(folder: Path) -> None:
 
 
 @contextmanager
-def _log_to(path: Path) -> Iterator[None]:
+def log_to(path: Path) -> Iterator[None]:
+    """Append what calstudy logs, and warnings, to a file."""
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root, package = logging.getLogger(), logging.getLogger("calstudy")
@@ -102,14 +104,14 @@ def _log_to(path: Path) -> Iterator[None]:
         handler.close()
 
 
-def _write(path: Path, text: str) -> None:
+def write(path: Path, text: str) -> None:
     """Write a text file so that it is there whole or not at all."""
     partial = path.with_name(f".{path.name}-{uuid4().hex}")
     partial.write_text(text, encoding="utf-8")
     partial.replace(path)
 
 
-def _publish(products: list[Product], folder: Path) -> None:
+def publish(products: list[Product], folder: Path) -> None:
     """Copy the files of products into a folder of the run, each whole or not at all."""
     folder.mkdir(exist_ok=True)
     for product in products:
@@ -148,6 +150,63 @@ def _manifest(experiment: Experiment, graph: Graph, products: dict[str, Product]
     }
 
 
+def make(
+    targets: Sequence[Task], store: Store, crew: Crew, console: Console
+) -> tuple[dict[str, Product], tuple[Task, ...]]:
+    """Make products and all that they need, as far as it is not in the store, and tell how it goes.
+
+    Returns
+    -------
+    products
+        By key: those that were made or looked at, and all others behind them that are still in the store.
+    made
+        The tasks whose products were made.
+    """
+    plan = schedule(targets, store)
+    for task in plan.damaged:
+        message = f"{task.stage} ({task.label}): the product in the store is damaged, and is made again"
+        logger.warning(message)
+        console.print(message, markup=False)
+    costs = {task.key: estimate(task).seconds for task in plan.todo}
+    with report(plan.todo, costs, console) as show:
+
+        def done(task: Task, product: Product) -> None:
+            logger.info("%s (%s): %.1f s", task.stage, task.label, product.record["seconds"])
+            show(task, product)
+
+        products = execute(plan.todo, store, crew, done)
+    products |= plan.ready
+    drop_temporary(targets, store)
+    for task in unique(targets):
+        if task.key not in products and (found := store.find(task.stage, task.key)) is not None:
+            products[task.key] = found
+    return products, plan.todo
+
+
+def fill_folder(folder: Path, graph: Graph, products: dict[str, Product], made: Sequence[Task]) -> Run:
+    """Put what an experiment asked for into its run folder: figures, tables, claims, manifest, the experiment itself.
+
+    Parameters
+    ----------
+    folder
+        From `run_folder`, after `open_folder`.
+    graph
+        Of the experiment.
+    products, made
+        From `make`; products and tasks that are not the experiment's are passed over.
+    """
+    own = {task.key for task in graph.tasks}
+    own_products = {key: product for key, product in products.items() if key in own}
+    own_made = tuple(task for task in made if task.key in own)
+    publish([products[task.key] for task in graph.figures], folder / "figures")
+    publish([products[task.key] for task in graph.tables], folder / "tables")
+    publish([products[graph.claims.key]], folder)
+    write(folder / "experiment.yaml", dump(graph.experiment))
+    manifest = _manifest(graph.experiment, graph, own_products, {task.key for task in own_made})
+    write(folder / MANIFEST, json.dumps(manifest, indent=1))
+    return Run(folder, own_products, own_made, tuple(graph.tasks))
+
+
 def run(experiment: Experiment, workers: int, scheduler: str | None, console: Console) -> Run:
     """Make the figures and spectra of an experiment, reusing every product that is in the store.
 
@@ -169,29 +228,7 @@ def run(experiment: Experiment, workers: int, scheduler: str | None, console: Co
     """
     graph, store, folder = Graph(experiment), Store(experiment.outputs.store), run_folder(experiment)
     store.prepare()
-    _open_folder(folder)
-    with _log_to(folder / "run.log"):
-        plan = schedule(graph.targets, store)
-        for task in plan.damaged:
-            message = f"{task.stage} ({task.label}): the product in the store is damaged, and is made again"
-            logger.warning(message)
-            console.print(message, markup=False)
-        costs = {task.key: estimate(task).seconds for task in plan.todo}
-        with report(plan.todo, costs, console) as show:
-
-            def done(task: Task, product: Product) -> None:
-                logger.info("%s (%s): %.1f s", task.stage, task.label, product.record["seconds"])
-                show(task, product)
-
-            products = execute(plan.todo, store, Crew(workers, folder / "run.log", scheduler), done)
-        products |= plan.ready
-        drop_temporary(graph.targets, store)
-        for task in graph.tasks:
-            if task.key not in products and (found := store.find(task.stage, task.key)) is not None:
-                products[task.key] = found
-        _publish([products[task.key] for task in graph.figures], folder / "figures")
-        _publish([products[graph.spectra.key]], folder / "tables")
-        _write(folder / "experiment.yaml", dump(experiment))
-        made = {task.key for task in plan.todo}
-        _write(folder / MANIFEST, json.dumps(_manifest(experiment, graph, products, made), indent=1))
-    return Run(folder, products, plan.todo, tuple(graph.tasks))
+    open_folder(folder)
+    with log_to(folder / "run.log"):
+        products, made = make(graph.targets, store, Crew(workers, folder / "run.log", scheduler), console)
+        return fill_folder(folder, graph, products, made)

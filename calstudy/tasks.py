@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.experiment.model import Experiment, Variant
+from calstudy.simulate.settings import SimulationSettings
 from calstudy.store import digest_file, digest_json
 
 PARITIES = ("even", "odd")
+DEFAULT_CHUNKS = SimulationSettings().chunks
 
 
 @lru_cache(maxsize=64)
@@ -54,6 +56,8 @@ class Task:
         The tasks whose products it reads, by the names it knows them under.
     temporary
         Whether the product may be dropped once what needs it is made.
+    equivalent
+        The task whose product this one's is, to rounding, though made from other pieces: it has that one's key.
     """
 
     stage: str
@@ -61,12 +65,15 @@ class Task:
     settings: Mapping[str, Any]
     inputs: Mapping[str, Task] = field(default_factory=dict)
     temporary: bool = False
+    equivalent: Task | None = None
 
     @cached_property
     def key(self) -> str:
         """The content address: a digest of stage, its version, settings, and the inputs' keys."""
         from calstudy.stages.registry import STAGES
 
+        if self.equivalent is not None:
+            return self.equivalent.key
         inputs = {name: task.key for name, task in self.inputs.items()}
         version = STAGES[self.stage].version
         return digest_json([self.stage, version, identify(self.settings), inputs])
@@ -126,9 +133,18 @@ class Graph:
         return self._simulation("eor", self._sections["sky"]["eor"])
 
     def _simulation(self, component: str, sky: Mapping[str, Any]) -> Task:
-        settings = {**self._section("instrument", "simulation"), "component": component, "sky": sky}
-        count = min(self.experiment.simulation.chunks, self.experiment.instrument.channels.count)
-        chunks = {
+        """Return a simulation in as many chunks as asked for, under the key that it has in the default number."""
+        chunks = self.experiment.simulation.chunks
+        equivalent = None if chunks == DEFAULT_CHUNKS else self._simulation_in(component, sky, DEFAULT_CHUNKS)
+        return self._simulation_in(component, sky, chunks, equivalent)
+
+    def _simulation_in(
+        self, component: str, sky: Mapping[str, Any], chunks: int, equivalent: Task | None = None
+    ) -> Task:
+        simulation = {**self._sections["simulation"], "chunks": chunks}
+        settings = {**self._section("instrument"), "simulation": simulation, "component": component, "sky": sky}
+        count = min(chunks, self.experiment.instrument.channels.count)
+        pieces = {
             f"chunk{index:03d}": Task(
                 "simulate-chunk",
                 f"{component} {index + 1}/{count}",
@@ -137,7 +153,7 @@ class Graph:
             )
             for index in range(count)
         }
-        return Task("simulate", component, settings, chunks)
+        return Task("simulate", component, settings, pieces, equivalent=equivalent)
 
     @cached_property
     def gains(self) -> Task:
@@ -200,6 +216,10 @@ class Graph:
     def power(self, name: str) -> Task:
         """Return the delay power spectra of a variant, even x odd."""
         variant = self.experiment.variants[name]
+        return self.crossed(name, {parity: self.average(variant, parity) for parity in PARITIES})
+
+    def crossed(self, label: str, averages: Mapping[str, Task]) -> Task:
+        """Return the delay power spectra of two averaged data sets, "even" x "odd"."""
         instrument = self._sections["instrument"]
         # Bins and masks are applied later, to the spectra.
         later = ("bins", "wedge_buffer", "length_bin")
@@ -208,7 +228,7 @@ class Graph:
             "channels": instrument["channels"],
             "power": {key: value for key, value in self._sections["power"].items() if key not in later},
         }
-        return Task("power", name, settings, {parity: self.average(variant, parity) for parity in PARITIES})
+        return Task("power", label, settings, averages)
 
     @cached_property
     def spectra(self) -> Task:
@@ -218,11 +238,39 @@ class Graph:
         return Task("spectra", "wedge and spherical", {**self._section("power"), "variants": variants}, inputs)
 
     @cached_property
+    def agreement(self) -> Task | None:
+        """How far the calibration agrees with the truth, or None if the experiment has no such comparison."""
+        from calstudy.claim_tasks import agreement_task
+
+        return agreement_task(self)
+
+    @cached_property
+    def claims(self) -> Task:
+        """The paper's claims, evaluated on this experiment alone."""
+        from calstudy.claim_tasks import claims_task
+
+        return claims_task(self)
+
+    @cached_property
     def figures(self) -> list[Task]:
         """The figures asked for."""
         from calstudy.figure_tasks import figure_task
+        from calstudy.transfer_tasks import transfer_figure
 
-        return [figure_task(self, name) for name in self.experiment.outputs.figures]
+        names = self.experiment.outputs.figures
+        return [transfer_figure(self) if name == "signal-loss" else figure_task(self, name) for name in names]
+
+    @cached_property
+    def transfer(self) -> Task | None:
+        """The signal loss, or None if the experiment does not calibrate the data with the EoR and without."""
+        from calstudy.transfer_tasks import transfer_task
+
+        return transfer_task(self) if self.experiment.measures_signal_loss else None
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The products whose files are the tables of a run."""
+        return [task for task in (self.spectra, self.agreement, self.transfer) if task is not None]
 
     @cached_property
     def footnotes(self) -> tuple[str, ...]:
@@ -234,7 +282,7 @@ class Graph:
     @cached_property
     def targets(self) -> list[Task]:
         """The products a run is for; the others are made on the way."""
-        return [*self.figures, self.spectra]
+        return [*self.figures, *self.tables, self.claims]
 
     @cached_property
     def tasks(self) -> list[Task]:

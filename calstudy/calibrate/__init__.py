@@ -1,1 +1,1 @@
-"""calibrate"""
+"""The calibrator: foregrounds modelled by DPSS, gains without restriction (paper §Method)."""

@@ -8,7 +8,6 @@ import tensorflow as tf
 
 from calstudy.calibrate.tensors import FitTensors
 
-
 # Real and imaginary parts stay apart here: stacking them would cost the compiled step a copy each time.
 Parts = tuple[tf.Tensor, tf.Tensor]
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,7 +18,7 @@ Prior = Literal["sum", "post-hoc", "none"]
 class FitStructure:
     """Which antennas make which baseline, and which baselines share a foreground model.
 
-    Every integration of a data set shares one instance; solvers compile once per instance.
+    Solvers compile once per structure: instances with the same content are equal, and hash alike.
 
     Attributes
     ----------
@@ -49,6 +51,22 @@ class FitStructure:
             raise ValueError(f"groups and conjugated: one entry for each of the {n_baselines} baselines is needed")
         if not np.array_equal(np.unique(self.groups), np.arange(self.basis.n_models)):
             raise ValueError(f"groups: every one of the {self.basis.n_models} foreground models needs a baseline")
+
+    @cached_property
+    def _content(self) -> str:
+        digest = hashlib.sha256()
+        arrays = [self.antennas, self.groups, self.conjugated.astype(np.int64)]
+        for bucket in self.basis.buckets:
+            arrays += [bucket.members, bucket.vectors]
+        for array in arrays:
+            digest.update(repr((array.shape, self.n_antennas)).encode() + np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FitStructure) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
 
     @classmethod
     def per_baseline(cls, antennas: np.ndarray, n_antennas: int, basis: ForegroundBasis) -> FitStructure:

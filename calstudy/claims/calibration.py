@@ -70,7 +70,9 @@ def model_error_exceeds_noise(study: Study) -> Finding:
     return _median(study, "model_over_noise")
 
 
-PRODUCT = "our visibility model is accurate at the 0.1 % level and at a similar level to the thermal noise at all delays"
+PRODUCT = (
+    "our visibility model is accurate at the 0.1 % level and at a similar level to the thermal noise at all delays"
+)
 
 
 @RESULTS.states(

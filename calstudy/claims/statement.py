@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
+from calstudy.claims.facts import Role
 from calstudy.claims.study import Study, Unevaluated
 
 Verdict = Literal["PASS", "FAIL", "not evaluated"]
-Role = Literal["minimally_redundant", "redundant", "redundant_modelling", "low_snr", "paper_solver"]
 ROLES: dict[Role, str] = {
     "minimally_redundant": "a run of an array that is not redundant, with gains per channel",
     "redundant": "a run of a redundant array, each baseline modelled by itself",

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from calstudy.calibrate.agreement import Measurement, from_json
+from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.corrupt.settings import CorruptionSettings
+from calstudy.power.settings import PowerSettings
 from calstudy.power.spherical import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.power.wedge import WedgeSpectrum
 
 AGREEMENT = "agreement.json"
-FACTS = ("calibration", "corruption", "power")
-"""Sections of the experiment that claims read."""
 
 Spectrum = TypeVar("Spectrum", SphericalSpectrum, WedgeSpectrum)
 
@@ -32,15 +33,28 @@ class Study:
     ----------
     name
         Of the experiment.
-    facts
-        The sections `FACTS` of the experiment, as in its file.
+    calibration, corruption, power
+        Sections of the experiment.
     folders
         Where tables are looked for: spectra as ``<variant>.<kind>.h5`` and agreement.json.
     """
 
     name: str
-    facts: Mapping[str, Any]
+    calibration: CalibrationSettings
+    corruption: CorruptionSettings
+    power: PowerSettings
     folders: tuple[Path, ...]
+
+    @classmethod
+    def of(cls, experiment: Mapping[str, Any], folders: Sequence[Path]) -> Study:
+        """Return the study of an experiment, given as in its file: `name` and the sections of `calstudy.claims.facts`."""
+        return cls(
+            name=experiment["name"],
+            calibration=CalibrationSettings.model_validate(experiment["calibration"]),
+            corruption=CorruptionSettings.model_validate(experiment["corruption"]),
+            power=PowerSettings.model_validate(experiment["power"]),
+            folders=tuple(folders),
+        )
 
     def spherical(self, variant: str, modes: str) -> SphericalSpectrum:
         """Return the spherical spectrum of a variant, over "all-modes" or "outside-wedge"."""

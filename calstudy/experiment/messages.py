@@ -45,6 +45,12 @@ def _members(annotation: Any) -> list[Any]:
     return [annotation]
 
 
+def _items(annotation: Any) -> list[Any]:
+    """Return what the items of a block or a list may be, or nothing for anything else."""
+    position = {dict: 1, tuple: 0}.get(get_origin(annotation))
+    return [] if position is None else _members(get_args(annotation)[position])
+
+
 def _tags(model: type[BaseModel]) -> list[str]:
     """Return the values by which a block of a choice is selected: those of its `kind` or `name` literal."""
     for key in ("kind", "name"):
@@ -72,7 +78,7 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
             field = holder.model_fields.get(str(step))
             members = _members(field.annotation) if field else []
         else:
-            members = _members(get_args(members[0])[1]) if members and get_origin(members[0]) is dict else []
+            members = _items(members[0]) if members else []
     return ".".join(path), holder
 
 

@@ -16,7 +16,19 @@ from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.settings import SkySettings
 
 Component = Literal["foregrounds", "eor", "noise"]
-FigureName = Literal["layout", "gains", "model", "data", "baselines", "wedge", "spherical", "reflections"]
+FigureName = Literal[
+    "layout",
+    "gains",
+    "model",
+    "data",
+    "baselines",
+    "wedge",
+    "spherical",
+    "spherical-excised",
+    "reflections",
+    "signal-loss",
+]
+SIGNAL_LOSS_VARIANTS = ("residual", "residual_without_eor", "eor")
 FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
     "layout": (),
     "gains": ("residual",),
@@ -26,6 +38,8 @@ FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
     "reflections": (),
     "wedge": ("uncorrupted", "uncalibrated", "residual", "eor", "noise"),
     "spherical": ("eor",),
+    "spherical-excised": ("eor",),
+    "signal-loss": SIGNAL_LOSS_VARIANTS,
 }
 """Names of the variants that each figure cannot do without."""
 
@@ -94,6 +108,7 @@ class Outputs(Section):
         "baselines",
         "wedge",
         "spherical",
+        "signal-loss",
     )
     inspect: Inspection = Inspection()
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all experiments.")
@@ -136,6 +151,30 @@ class Experiment(Section):
             missing = [name for name in FIGURE_VARIANTS[figure] if name not in self.variants]
             if missing:
                 raise fault("outputs.figures", f"asks for {figure!r}, which needs the variant(s) {', '.join(missing)}")
+        return self
+
+    @property
+    def measures_signal_loss(self) -> bool:
+        """Whether data are calibrated with the EoR and without, all else equal, so that its loss can be told."""
+        residual, without, eor = (self.variants.get(name) for name in SIGNAL_LOSS_VARIANTS)
+        if residual is None or without is None or eor is None:
+            return False
+        return (
+            set(residual.components) == {*without.components, "eor"} != set(without.components)
+            and residual.calibrate
+            and without.calibrate
+            and residual.gains == without.gains
+            and eor == Variant(components=("eor",))
+        )
+
+    @model_validator(mode="after")
+    def _signal_loss_is_told(self) -> Experiment:
+        if "signal-loss" in self.outputs.figures and not self.measures_signal_loss:
+            raise fault(
+                "variants",
+                "of the figure 'signal-loss' must be residual and residual_without_eor, which differ in the EoR alone "
+                "and have calibrate: true, and eor, with components [eor] alone",
+            )
         return self
 
     @model_validator(mode="after")

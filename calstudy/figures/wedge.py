@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import LogLocator
 
 from calstudy.figures import style
-from calstudy.figures.domains import horizon_delay
+from calstudy.figures.cylinder import cells, delay_axis, draw_horizon, label_axes
 
 if TYPE_CHECKING:
     from calstudy.power.wedge import WedgeSpectrum
@@ -93,11 +93,11 @@ def draw_wedge(
     grid = figure.subplots(1, len(spectra), sharey=True)
     for axes, (name, spectrum) in zip(grid, spectra.items(), strict=True):
         _draw_power(axes, spectrum, norms)
-        _draw_horizon(axes, spectrum, buffer)
-        _label_axes(axes, spectrum, max_delay)
+        draw_horizon(axes, spectrum, buffer)
+        label_axes(axes, spectrum, max_delay)
         axes.set_title(TITLES[name], pad=4)
     grid[0].set_ylabel(style.K_PARALLEL)
-    _delay_axis(grid[-1], spectra["noise"])
+    delay_axis(grid[-1], spectra["noise"])
     grid[0].legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
     _colour_bars(figure, grid, norms)
     style.note_stand_ins(figure, stand_ins)
@@ -128,68 +128,14 @@ def _colour_limits(spectra: Iterable[WedgeSpectrum]) -> tuple[float, float, floa
     return floor, highest, lowest
 
 
-def _length_cells(spectrum: WedgeSpectrum) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges (M + 1,) in m of contiguous cells, and which of them each bin of lengths fills, (Nb,) int.
-
-    Cells between bins that are not adjacent hold no baselines.
-    """
-    edges = np.unique(spectrum.bin_edges)
-    return edges, np.searchsorted(edges, spectrum.bin_edges[:, 0])
-
-
-def _delay_edges(centres: np.ndarray) -> np.ndarray:
-    """Return the (N + 1,) edges halfway between (N,) increasing centres >= 0; none is below 0."""
-    middle = (centres[1:] + centres[:-1]) / 2
-    return np.concatenate([[max(2 * centres[0] - middle[0], 0.0)], middle, [2 * centres[-1] - middle[-1]]])
-
-
 def _draw_power(axes: Axes, spectrum: WedgeSpectrum, norms: tuple[LogNorm, LogNorm]) -> None:
-    lengths, filled = _length_cells(spectrum)
-    power = np.full((spectrum.delay.size, lengths.size - 1), np.nan)
-    power[:, filled] = spectrum.power.real.T
-    x, y = lengths * _ratio(spectrum.k_perp, spectrum.baseline_length), _delay_edges(spectrum.k_parallel)
+    x, y, power = cells(spectrum, spectrum.power.real)
     axes.set_facecolor(EMPTY)
     for sign, norm, colours in ((1, norms[0], POSITIVE), (-1, norms[1], NEGATIVE)):
         drawn = power >= 0 if sign > 0 else power < 0
         signed = np.ma.masked_where(~drawn, sign * power)
         # Fainter than the scale, exact zeros included, is not missing: it has the lowest colour.
         axes.pcolormesh(x, y, np.ma.maximum(signed, norm.vmin), norm=norm, cmap=colours, rasterized=True)
-
-
-def _draw_horizon(axes: Axes, spectrum: WedgeSpectrum, buffer: float) -> None:
-    lengths = spectrum.bin_edges[[0, -1], [0, 1]]
-    k_perp = lengths * _ratio(spectrum.k_perp, spectrum.baseline_length)
-    per_second = _ratio(spectrum.k_parallel, spectrum.delay)
-    for extra, line, label in ((0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")):
-        edge = (horizon_delay(lengths) + extra) * per_second
-        axes.plot(k_perp, edge, line, color="black", linewidth=0.8, label=label)
-
-
-def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> float:
-    """Return the constant factor between two proportional axes."""
-    return float(numerator[-1] / denominator[-1])
-
-
-def _label_axes(axes: Axes, spectrum: WedgeSpectrum, max_delay: float | None) -> None:
-    metres = _ratio(spectrum.baseline_length, spectrum.k_perp)
-    shortest, longest = spectrum.bin_edges[[0, -1], [0, 1]]
-    top = _delay_edges(spectrum.k_parallel)[-1]
-    if max_delay is not None:
-        top = min(top, max_delay * _ratio(spectrum.k_parallel, spectrum.delay))
-    axes.set(xlim=(shortest / metres, longest / metres), ylim=(0, top), xlabel=style.K_PERPENDICULAR)
-    axes.tick_params(which="both", top=False, right=False, direction="out")
-    axes.locator_params(axis="x", nbins=3)
-    lengths = axes.secondary_xaxis("top", functions=(lambda k: k * metres, lambda b: b / metres))
-    lengths.set_xlabel(style.BASELINE_LENGTH, fontsize=style.SMALL_SIZE, labelpad=2)
-    lengths.tick_params(direction="out", labelsize=style.SMALL_SIZE, pad=1)
-    lengths.xaxis.set_major_locator(MaxNLocator(nbins=3))
-
-
-def _delay_axis(axes: Axes, spectrum: WedgeSpectrum) -> None:
-    per_nanosecond = _ratio(spectrum.k_parallel, spectrum.delay) * 1e-9
-    delays = axes.secondary_yaxis("right", functions=(lambda k: k / per_nanosecond, lambda t: t * per_nanosecond))
-    delays.set_ylabel(style.DELAY)
-    delays.tick_params(direction="out")
 
 
 def _colour_bars(figure: Figure, grid: np.ndarray, norms: tuple[LogNorm, LogNorm]) -> None:

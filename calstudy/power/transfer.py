@@ -13,8 +13,8 @@ the signal is responsible for, and
 
 is the transfer function P^R / P^S without what is in P^R even when there is no signal. It beats the difference of the
 two powers, P^{R_with} - P^{R_without}, by the whole of that last term, in which noise and foreground residuals scatter:
-in D they cancel, up to the change of the gains (S / F, 1e-4) times the noise. T is still made of even times odd, so that
-what is left of the noise in D gives no bias.
+in D they cancel, up to the change of the gains (S / F, 1e-4) times the noise. T is still made of even times odd, so
+that what is left of the noise in D gives no bias.
 
 The *coherence* is the cross power with the signal, C(k) = Re <S* D> / P^S. If a calibration projects (D = M S with
 M = M* = M^2) and S is white, <D* D> = <S* M* M S> = <S* M S>: both are equal, and are the fraction of the mode outside
@@ -231,9 +231,7 @@ class _Ratio:
     n_samples: np.ndarray
 
 
-def _ratio(
-    numerator: DelaySpectra, signal: DelaySpectra, bins: np.ndarray, samples: np.ndarray, n_bins: int
-) -> _Ratio:
+def _ratio(numerator: DelaySpectra, signal: DelaySpectra, bins: np.ndarray, samples: np.ndarray, n_bins: int) -> _Ratio:
     """Return the ratio of sums in each bin, with the error that the scatter of the samples gives it.
 
     `bins` (-1: left out) and `samples` number the modes, (Nu, Nd) each.

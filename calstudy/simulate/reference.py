@@ -1,13 +1,10 @@
 """pyuvsim: the paper's simulator and the reference of the others.
 
-The engine runs serially, without MPI. In a program started with ``mpiexec -n 8 python program.py`` in which all ranks
-call `PyuvsimEngine.simulate` with the same arguments, each simulates its share and all get the whole.
+In a run that was started with ``mpiexec`` every rank computes its share of the visibilities; see `calstudy.ranks`.
 """
 
 from __future__ import annotations
 
-import atexit
-import os
 import warnings
 
 import numpy as np
@@ -19,11 +16,9 @@ from pyuvsim import BeamList
 from pyuvsim.simsetup import SkyModelData
 from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
 
+from calstudy import ranks
 from calstudy.instrument.telescope import use_bundled_earth_orientation
 from calstudy.visibilities import require_rectangular
-
-# How the launchers of MPICH, Open MPI and Slurm tell a process how many there are.
-RANK_COUNT_VARIABLES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE")
 
 
 class PyuvsimEngine:
@@ -49,18 +44,20 @@ class PyuvsimEngine:
         tabulated = beam.at(template.freq_array)
         products = _products(tabulated)
         columns = [products.index(number) for number in template.polarization_array]
-        beams = BeamList([BeamInterface(tabulated, beam_type="efield")])
-        cube = np.zeros((template.Nblts, template.Nfreqs, len(products)), dtype=np.complex128)
-        communicator = _communicator()
-        tasks = range(template.Nblts * template.Nfreqs)
-        share = tasks if communicator is None else _share(tasks, communicator.rank, communicator.size)
-        with warnings.catch_warnings():
-            # A 21 cm sky is a brightness difference.
-            warnings.filterwarnings("ignore", "Some Stokes I values are negative", UserWarning)
-            _run_tasks(share, _catalog(sky, template.freq_array), beams, template, cube)
-        if communicator is not None:
-            communicator.Allreduce(cube.copy(), cube)
+        cube = ranks.share(_visibilities, sky, tabulated, template)
         return cube.reshape(template.Ntimes, template.Nbls, template.Nfreqs, -1)[..., columns]
+
+
+def _visibilities(rank: int, count: int, sky: SkyModel, tabulated, template: UVData) -> np.ndarray:
+    """Return the visibilities of a rank's share, (Nblts, Nfreqs, Nproducts) complex128, zero outside it."""
+    beams = BeamList([BeamInterface(tabulated, beam_type="efield")])
+    cube = np.zeros((template.Nblts, template.Nfreqs, len(_products(tabulated))), dtype=np.complex128)
+    share = _share(range(template.Nblts * template.Nfreqs), rank, count)
+    with warnings.catch_warnings():
+        # A 21 cm sky is a brightness difference.
+        warnings.filterwarnings("ignore", "Some Stokes I values are negative", UserWarning)
+        _run_tasks(share, _catalog(sky, template.freq_array), beams, template, cube)
+    return cube
 
 
 def _products(beam) -> list[int]:
@@ -95,15 +92,3 @@ def _share(tasks: range, rank: int, count: int) -> range:
     """Return a rank's share: a contiguous piece, so that few ranks work on one time and evaluate its beam."""
     edges = np.linspace(0, len(tasks), count + 1).astype(int).tolist()
     return tasks[edges[rank] : edges[rank + 1]]
-
-
-def _communicator():
-    """Return MPI's world communicator if a launcher started several ranks, or None."""
-    if all(int(os.environ.get(name, "1")) < 2 for name in RANK_COUNT_VARIABLES):
-        return None
-    from mpi4py import MPI
-
-    if not MPI.Is_initialized():
-        MPI.Init()
-        atexit.register(MPI.Finalize)
-    return MPI.COMM_WORLD

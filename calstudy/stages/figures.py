@@ -41,17 +41,26 @@ def _wedge(job: Job) -> tuple[Figure, Any]:
     return draw_wedge(panels, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"]), panels
 
 
-def _column(folder: Path, title: str, modes: str) -> SphericalColumn:
+def spherical_column(folder: Path, title: str, modes: str) -> SphericalColumn:
+    """Read the spherical spectra of all series that a product of stage `spectra` has, over one choice of modes."""
     found = {name: folder / f"{name}.{modes}.h5" for name in SERIES}
     spectra = {name: load_spectrum(path, SphericalSpectrum) for name, path in found.items() if path.exists()}
     return SphericalColumn(title=title, **spectra)
 
 
+def _excised(job: Job) -> SphericalColumn:
+    title = f"outside wedge + {1e9 * job.settings['wedge_buffer']:.0f} ns"
+    return spherical_column(job.inputs["spectra"], title, "outside-wedge")
+
+
 def _spherical(job: Job) -> tuple[Figure, Any]:
-    folder = job.inputs["spectra"]
-    excised = f"outside wedge + {1e9 * job.settings['wedge_buffer']:.0f} ns"
-    columns = [_column(folder, "all modes", "all-modes"), _column(folder, excised, "outside-wedge")]
-    return draw_spherical(columns, stand_ins=job.settings["notes"]), {"all_modes": columns[0], "excised": columns[1]}
+    columns = {"all_modes": spherical_column(job.inputs["spectra"], "all modes", "all-modes"), "excised": _excised(job)}
+    return draw_spherical(list(columns.values()), stand_ins=job.settings["notes"]), columns
+
+
+def _spherical_excised(job: Job) -> tuple[Figure, Any]:
+    column = _excised(job)
+    return draw_spherical([column], stand_ins=job.settings["notes"]), {"excised": column}
 
 
 def _gains(job: Job) -> tuple[Figure, Any]:
@@ -88,6 +97,7 @@ FIGURES = {
     "baselines": _baselines,
     "wedge": _wedge,
     "spherical": _spherical,
+    "spherical-excised": _spherical_excised,
     "reflections": _reflections,
 }
 

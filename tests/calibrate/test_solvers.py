@@ -12,7 +12,7 @@ from test_calibration_loss import redundant_structure
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.solvers.first_order import FirstOrder
-from calstudy.calibrate.solvers.gauss_newton import GaussNewton
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton, compiled
 from calstudy.calibrate.solvers.interface import WarmStart, solve, solve_warm
 
 
@@ -196,6 +196,13 @@ def test_sum_prior_is_at_its_minimum(converged):
         problem.structure, problem.visibilities, problem.weights, problem.initial_gains, -solution.model
     )
     assert solve(opposite, GaussNewton(max_steps=3)).status == "failed"
+
+
+def test_structures_are_compiled_once_for_the_same_content(toy):
+    same, other = toy.structure, make_toy(scattered(8, seed=4)).structure
+    assert same == toy.structure and hash(same) == hash(toy.structure)
+    assert same != other
+    assert compiled(same) is compiled(toy.structure)
 
 
 def test_bad_problems_are_refused_in_one_sentence(toy):

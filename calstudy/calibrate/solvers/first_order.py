@@ -7,7 +7,7 @@ so that the learning rate is a relative change, plus the prior on the summed mod
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -37,6 +37,25 @@ class Parameters(NamedTuple):
     coefficients: tuple[tf.Tensor, ...]
 
 
+class Descent(NamedTuple):
+    """What changes from step to step.
+
+    Attributes
+    ----------
+    parameters
+        Where the descent is.
+    moments
+        First and second moment of the gradient, each of the shape of the parameters.
+    best, best_loss
+        The parameters with the lowest loss so far, and that loss.
+    """
+
+    parameters: Parameters
+    moments: tuple[Parameters, Parameters]
+    best: Parameters
+    best_loss: tf.Tensor
+
+
 class FitData(NamedTuple):
     """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's target (2,), in units of the rms."""
 
@@ -45,12 +64,18 @@ class FitData(NamedTuple):
     target: tf.Tensor
 
 
-def _map(function, *parameters: Parameters) -> Parameters:
+def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
+    """Apply a function to all tensors of parameters, or of several alike."""
     return tf.nest.map_structure(function, *parameters)
 
 
 def update(
-    method: Method, learning_rate: float, step: tf.Tensor, parameters: Parameters, moments: tuple, gradient: Parameters
+    method: Method,
+    learning_rate: float,
+    step: tf.Tensor,
+    parameters: Parameters,
+    moments: tuple[Parameters, Parameters],
+    gradient: Parameters,
 ) -> tuple[Parameters, tuple[Parameters, Parameters]]:
     """Return parameters and moments after one step of Adamax, Adam (Kingma & Ba 2014) or plain gradient descent.
 
@@ -102,25 +127,26 @@ class Kernels:
             value = self.loss(parameters, data)
         return value, _map(tf.convert_to_tensor, tape.gradient(value, parameters))
 
-    def _descend(self, n_steps, done, parameters, moments, best_loss, best, data):
-        """Take `n_steps` steps and remember the best parameters seen; returns all that changed, and the losses."""
+    def _descend(
+        self, n_steps: tf.Tensor, done: tf.Tensor, descent: Descent, data: FitData
+    ) -> tuple[Descent, tf.Tensor, tf.Tensor]:
+        """Take `n_steps` steps after `done`; returns the descent, the loss before each step, and the loss after all."""
 
-        def body(index, parameters, moments, best_loss, best, losses):
-            value, gradient = self.loss_and_gradient(parameters, data)
-            better = value < best_loss
-            best = _map(lambda new, old: tf.where(better, new, old), parameters, best)
-            losses = tf.tensor_scatter_nd_update(losses, [[index]], [value])
+        def body(index: tf.Tensor, now: Descent, losses: tf.Tensor) -> tuple[tf.Tensor, Descent, tf.Tensor]:
+            value, gradient = self.loss_and_gradient(now.parameters, data)
+            better = value < now.best_loss
+            best = _map(lambda new, old: tf.where(better, new, old), now.parameters, now.best)
             step = tf.cast(done + index + 1, self.dtype)
-            moved, moments = update(self._method, self._learning_rate, step, parameters, moments, gradient)
-            return index + 1, moved, moments, tf.where(better, value, best_loss), best, losses
+            moved = update(self._method, self._learning_rate, step, now.parameters, now.moments, gradient)
+            descent = Descent(*moved, best, tf.where(better, value, now.best_loss))
+            return index + 1, descent, tf.tensor_scatter_nd_update(losses, [[index]], [value])
 
-        start = (tf.constant(0), parameters, moments, best_loss, best, tf.zeros([STEPS_PER_CALL], self.dtype))
-        result = tf.while_loop(lambda index, *_: index < n_steps, body, start, parallel_iterations=1)
-        final = self.loss(result[1], data)
-        return (*result[1:], final)
+        start = (tf.constant(0), descent, tf.zeros([STEPS_PER_CALL], self.dtype))
+        _, descent, losses = tf.while_loop(lambda index, *_: index < n_steps, body, start, parallel_iterations=1)
+        return descent, losses, self.loss(descent.parameters, data)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def compiled(
     structure: FitStructure, method: Method, learning_rate: float, precision: Precision, with_prior: bool
 ) -> Kernels:
@@ -135,10 +161,7 @@ class FirstOrderState:
     kernels: Kernels
     data: FitData
     scale: float
-    parameters: Parameters
-    moments: tuple[Parameters, Parameters]
-    best_loss: tf.Tensor
-    best: Parameters
+    descent: Descent
     history: tuple[float, ...]
 
 
@@ -180,25 +203,20 @@ class FirstOrder:
         data = FitData(tf.cast(exact.visibilities, kernels.dtype), tf.cast(exact.weights, kernels.dtype), target)
         loss = kernels.loss(parameters, data)
         zero = _map(tf.zeros_like, parameters)
-        return FirstOrderState(kernels, data, exact.scale, parameters, (zero, zero), loss, parameters, (float(loss),))
+        descent = Descent(parameters, (zero, zero), parameters, loss)
+        return FirstOrderState(kernels, data, exact.scale, descent, (float(loss),))
 
     def step(self, state: FirstOrderState) -> FirstOrderState:
         """Take up to `STEPS_PER_CALL` steps."""
         done = len(state.history) - 1
         n_steps = min(STEPS_PER_CALL, self.max_steps - done)
-        parameters, moments, best_loss, best, losses, final = state.kernels.descend(
-            tf.constant(n_steps),
-            tf.constant(done),
-            state.parameters,
-            state.moments,
-            state.best_loss,
-            state.best,
-            state.data,
+        descent, losses, final = state.kernels.descend(
+            tf.constant(n_steps), tf.constant(done), state.descent, state.data
         )
-        if final < best_loss:
-            best_loss, best = final, parameters
+        if final < descent.best_loss:
+            descent = descent._replace(best=descent.parameters, best_loss=final)
         history = (*state.history, *losses.numpy()[1:n_steps].astype(float), float(final))
-        return replace(state, parameters=parameters, moments=moments, best_loss=best_loss, best=best, history=history)
+        return replace(state, descent=descent, history=history)
 
     def terminate(self, state: FirstOrderState) -> Verdict | None:
         """Judge by the change of the best loss over the last call."""
@@ -207,7 +225,7 @@ class FirstOrder:
             return Verdict("failed", f"the loss is not finite after {n_steps} steps; lower the learning rate")
         if n_steps >= STEPS_PER_CALL:
             before = min(state.history[:-STEPS_PER_CALL])
-            if abs(before - float(state.best_loss)) < self.tolerance:
+            if abs(before - float(state.descent.best_loss)) < self.tolerance:
                 return Verdict(
                     "converged", f"the best loss fell by less than {self.tolerance:g} over {STEPS_PER_CALL} steps"
                 )
@@ -221,8 +239,8 @@ class FirstOrder:
 
     def estimate(self, state: FirstOrderState) -> Estimate:
         """Return the best gains and foregrounds seen."""
-        model = tf.stack(foreground_model(state.best.coefficients, state.kernels.bases))
-        return Estimate(pairs.to_complex(state.best.gains), state.kernels.tensors.unload(model, state.scale))
+        model = tf.stack(foreground_model(state.descent.best.coefficients, state.kernels.bases))
+        return Estimate(pairs.to_complex(state.descent.best.gains), state.kernels.tensors.unload(model, state.scale))
 
     def memory(self, state: FirstOrderState) -> None:
         """Return nothing: only the gains carry over."""

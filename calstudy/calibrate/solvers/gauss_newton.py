@@ -97,7 +97,7 @@ class Kernels:
         return pairs.inner_product(descent, solve_antennas(factors, descent))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def compiled(structure: FitStructure) -> Kernels:
     """Return the kernels of a structure, compiled once for all its integrations."""
     return Kernels(structure)

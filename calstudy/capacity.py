@@ -1,0 +1,132 @@
+"""Fit a run to the machine: how many workers, and how finely the simulations are cut, for the memory there is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from calstudy import ranks
+from calstudy.errors import InputError
+from calstudy.estimates import LIBRARIES_MEMORY, estimate
+from calstudy.experiment.model import Experiment
+from calstudy.resources import cores, free_memory
+from calstudy.store import Store
+from calstudy.tasks import Graph, Task
+
+BYTES = {"MB": 1e6, "GB": 1e9, "TB": 1e12}
+SHARED_STAGE = "simulate-chunk"
+"""The stage whose pieces may be made smaller without changing its results."""
+
+
+def parse_memory(text: str) -> float:
+    """Return the bytes that a text such as ``6 GB`` or ``500MB`` stands for.
+
+    Raises
+    ------
+    InputError
+        If it is not a positive number with one of the units MB, GB, TB.
+    """
+    found = re.fullmatch(r"\s*([0-9.]+)\s*([MGT]B)\s*", text)
+    try:
+        number = float(found[1]) * BYTES[found[2]] if found else 0.0
+    except ValueError:
+        number = 0.0
+    if number <= 0:
+        raise InputError(f"--max-memory {text!r}: write a positive number and a unit (MB, GB or TB), such as '6 GB'")
+    return number
+
+
+def fit(experiment: Experiment, workers: int | None, max_memory: str | None) -> tuple[Experiment, int]:
+    """Choose the number of workers, and cut simulations finely enough for them, within the memory.
+
+    How many chunks a simulation is cut into changes its visibilities by rounding only, and not the key under which
+    they are stored.
+
+    Parameters
+    ----------
+    experiment
+        Validated.
+    workers
+        Wanted number of worker processes, or None for one per core as far as the memory goes.
+    max_memory
+        What all workers together may take, such as "6 GB", or None for what is free now.
+
+    Returns
+    -------
+    experiment
+        The same, perhaps with more `simulation.chunks`.
+    workers
+        Not more than the memory holds; those that were asked for, if no memory was given.
+
+    Raises
+    ------
+    InputError
+        If a single task is estimated to need more than there is, `max_memory` is not an amount of memory, or MPI ranks
+        cannot help; before anything has started.
+    """
+    if ranks.count() > 1:
+        _require_shared_engine(experiment, workers)
+    memory = free_memory() if max_memory is None else parse_memory(max_memory)
+    # The parent process holds the libraries, too.
+    budget = memory - LIBRARIES_MEMORY
+    hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
+    cut = _cut(experiment, budget / hoped)
+    needs = {task: estimate(task).memory for task in _missing(cut)}
+    if not needs:
+        return cut, workers or hoped
+    largest = max(needs, key=needs.__getitem__)
+    if needs[largest] > budget:
+        source = "--max-memory leaves" if max_memory else "this machine has"
+        raise InputError(
+            f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage} ({largest.label}) needs "
+            f"about {needs[largest] / 1e9:.1f} GB; give it more with --max-memory, or use fewer antennas, channels, "
+            "integrations or sources"
+        )
+    if ranks.count() > 1:
+        return cut, 1
+    fitting = max(1, int(budget // needs[largest]))
+    if workers is not None and max_memory is None:
+        return cut, workers
+    return cut, min(hoped, fitting)
+
+
+def _require_shared_engine(experiment: Experiment, workers: int | None) -> None:
+    engine = experiment.simulation.engine
+    if engine != "pyuvsim":
+        raise InputError(
+            f"simulation.engine = {engine!r} does not share its work between MPI ranks, only 'pyuvsim' does; leave out "
+            "mpiexec and use --workers, or add --set simulation.engine=pyuvsim"
+        )
+    if workers not in (None, 1):
+        raise InputError(f"--workers {workers}: under mpiexec the ranks are the workers; choose their number with -n")
+
+
+def _cut(experiment: Experiment, share: float) -> Experiment:
+    """Double the number of simulation chunks until each takes no more than its share, or they are single channels."""
+    cut = experiment
+    while cut.simulation.chunks < cut.instrument.channels.count and _largest_chunk(cut) > share:
+        chunks = min(2 * cut.simulation.chunks, cut.instrument.channels.count)
+        finer = cut.model_copy(update={"simulation": cut.simulation.model_copy(update={"chunks": chunks})})
+        if _largest_chunk(finer) > 0.95 * _largest_chunk(cut):
+            break  # What is left is the sky itself.
+        cut = finer
+    return cut
+
+
+def _largest_chunk(experiment: Experiment) -> float:
+    return max((estimate(task).memory for task in _missing(experiment) if task.stage == SHARED_STAGE), default=0.0)
+
+
+def _missing(experiment: Experiment) -> Sequence[Task]:
+    """Return the tasks whose products a run would have to make, by a quick look into the store."""
+    store, found = Store(experiment.outputs.store), {}
+
+    def visit(task: Task) -> None:
+        if task.key not in found and store.find(task.stage, task.key) is None:
+            found[task.key] = task
+            for needed in task.inputs.values():
+                visit(needed)
+
+    for task in Graph(experiment).targets:
+        visit(task)
+    return tuple(found.values())

@@ -1,0 +1,268 @@
+"""Claims on the wedge and the spherical power spectra of the minimally redundant array (paper §Simulation Results)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.constants import speed_of_light
+
+from calstudy.claims.bins import (
+    bias_extent,
+    fraction_within,
+    ratio,
+    recovered,
+    rms_power,
+    used_bins,
+)
+from calstudy.claims.calibration import FACTOR_OF_TWO, RESULTS
+from calstudy.claims.statement import Above, Below, Consistent, Finding, Within
+from calstudy.claims.study import Study, Unevaluated
+from calstudy.power.wedge import WedgeSpectrum
+
+K_AGREEMENT = 0.2
+"""The paper's P^R agrees with P^S beyond this, h/Mpc."""
+K_BIAS = 0.25
+K_SMALL = 0.5
+"""The paper's 'small k values', h/Mpc: where the signal is and the noise is not all."""
+MAIN_LOBE = 4
+"""Half-width of the Blackman-Harris main lobe in units of 1 / bandwidth."""
+
+
+def window(study: Study, wedge: WedgeSpectrum) -> np.ndarray:
+    """Return which modes are beyond horizon and buffer, or the taper's main lobe if that is wider, (Nb, Nd) bool.
+
+    The horizon is that of the longest baseline of each bin.
+    """
+    bandwidth = 1 / (wedge.delay[1] - wedge.delay[0])
+    horizon = wedge.bin_edges[:, 1] / speed_of_light
+    chosen = wedge.delay > horizon[:, None] + max(study.power.wedge_buffer, MAIN_LOBE / bandwidth)
+    if not chosen.any():
+        raise Unevaluated("no delays outside the wedge")
+    return chosen
+
+
+def _rows(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the median of |values| over the chosen delays of each bin of lengths that has any."""
+    return np.array([np.median(np.abs(row[mask])) for row, mask in zip(values, chosen, strict=True) if mask.any()])
+
+
+def _row_ratio(study: Study, above: str, below: tuple[str, ...]) -> Finding:
+    """Return the ratio of medians over the window, median and scatter over the bins of lengths."""
+    upper = study.wedge(above)
+    chosen = window(study, upper)
+    total = sum(_rows(study.wedge(name).power.real, chosen) for name in below)
+    low, middle, high = np.quantile(_rows(upper.power.real, chosen) / total, [0.16, 0.5, 0.84])
+    return Finding(float(middle), float(high - low) / 2)
+
+
+@RESULTS.states(
+    "in our simulated visibilities without calibration errors, foreground power is contained within the wedge",
+    "|P^{S+N+F}| in the window over |P^S| + |P^N|; medians",
+    Below(2),
+    "what is not contained adds to EoR and noise; " + FACTOR_OF_TWO,
+)
+def foregrounds_contained(study: Study) -> Finding:
+    return _row_ratio(study, "uncorrupted", ("eor", "noise"))
+
+
+@RESULTS.states(
+    "the entire EoR window is filled in with systematics",
+    "part of the window in which P^V exceeds P^S",
+    Above(0.95),
+    "the entire window, but for chance crossings of zero",
+)
+def leakage_fills_window(study: Study) -> Finding:
+    upper, signal = study.wedge("uncalibrated"), study.wedge("eor")
+    chosen = window(study, upper)
+    above = (np.abs(upper.power.real) > np.abs(signal.power.real))[chosen]
+    return Finding(float(above.mean()), float(np.sqrt(above.mean() * (1 - above.mean()) / above.size)))
+
+
+@RESULTS.states(
+    "the entire EoR window is filled in with systematics",
+    "|P^V| in the window over |P^S|; medians",
+    Above(100),
+    "systematics orders of magnitude above the signal: two at least",
+)
+def leakage_far_above_signal(study: Study) -> Finding:
+    return _row_ratio(study, "uncalibrated", ("eor",))
+
+
+@RESULTS.states(
+    "over most cylindrical modes, these residuals are roughly consistent with the injected EoR signal level",
+    "part of the window in which P^R is within 95 % errors (noise + sample) of P^S",
+    Above(0.5),
+    "most is more than half",
+)
+def calibrated_window_consistent(study: Study) -> Finding:
+    residual, signal, noise = (study.wedge(name) for name in ("residual", "eor", "noise"))
+    chosen = window(study, residual)
+    rows = chosen.any(axis=1)
+    thermal = np.array(
+        [np.sqrt(np.mean(row[mask] ** 2)) for row, mask in zip(noise.power.real, chosen, strict=True) if mask.any()]
+    )
+    modes = 2 * residual.n_pairs[rows]
+    sample = np.abs(signal.power.real[rows]) / np.sqrt(modes)[:, None]
+    difference = (residual.power.real - signal.power.real)[rows]
+    return fraction_within(difference[chosen[rows]], (thermal[:, None] + sample)[chosen[rows]])
+
+
+BROAD = "P^R is in broad agreement with P^S beyond k ≳ 0.2 h/Mpc when we only average modes outside of the wedge"
+
+
+@RESULTS.states(
+    BROAD,
+    "part of the bins at k >= 0.2 in which P^R is within the 95 % errors of P^S",
+    Above(0.9),
+    "95 % by chance alone; broad agreement may miss a tenth",
+)
+def residual_agrees_outside_wedge(study: Study) -> Finding:
+    residual, signal = (study.spherical(name, "outside-wedge") for name in ("residual", "eor"))
+    used = used_bins(residual, signal, k_min=K_AGREEMENT)
+    return fraction_within((residual.power - signal.power).real[used], residual.error[used])
+
+
+@RESULTS.states(
+    "in both scenarios, it recovers relatively unbiased estimates of the power spectrum within the EoR window "
+    "(Conclusion)",
+    "mean P^R/P^S outside the wedge at k >= 0.2; error of the difference, the EoR being common",
+    Consistent(1),
+    "no bias beyond the errors",
+)
+def residual_unbiased_outside_wedge(study: Study) -> Finding:
+    return recovered(*(study.spherical(name, "outside-wedge") for name in ("residual", "eor")), K_AGREEMENT)
+
+
+BIAS = "when we include modes inside of the wedge, we encounter negative bias out to ≈ 0.3 h/Mpc"
+BIAS_CAPTION = "our calibrated residual is biased below k ≲ 0.25 h/Mpc"
+
+
+@RESULTS.states(BIAS_CAPTION, "mean P^R/P^S of all modes at k <= 0.25", Below(1, 2), "a bias beyond the errors")
+def residual_biased_with_wedge(study: Study) -> Finding:
+    return recovered(*(study.spherical(name, "all-modes") for name in ("residual", "eor")), 0.0, K_BIAS)
+
+
+@RESULTS.states(
+    BIAS,
+    "k in h/Mpc up to which P^R < P^S beyond 95 % errors, all modes; reading of the text",
+    Within(0.2, 0.4),
+    "≈ 0.3, within 0.1",
+)
+def bias_with_wedge_ends_near_0p3(study: Study) -> Finding:
+    return bias_extent(*(study.spherical(name, "all-modes") for name in ("residual", "eor")))
+
+
+@RESULTS.states(
+    BIAS_CAPTION,
+    "k in h/Mpc up to which P^R < P^S beyond 95 % errors, all modes; reading of the caption",
+    Below(0.29),
+    "≲ 0.25, plus one bin",
+)
+def bias_with_wedge_ends_below_0p25(study: Study) -> Finding:
+    return bias_extent(*(study.spherical(name, "all-modes") for name in ("residual", "eor")))
+
+
+NOISE_ONLY = "calibration residuals [without EoR] are an order of magnitude lower than the EoR"
+
+
+def _without_eor(study: Study) -> Finding:
+    residual, signal = (study.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
+    used = used_bins(residual, signal, k_min=K_AGREEMENT)
+    return ratio(rms_power(residual, used), Finding(float(np.mean(signal.power.real[used])), 0.0))
+
+
+@RESULTS.states(
+    NOISE_ONLY, "rms P^R without EoR over mean P^S, outside the wedge, k >= 0.2", Below(0.1), "an order of magnitude"
+)
+def residual_without_eor_tenfold_lower(study: Study) -> Finding:
+    return _without_eor(study)
+
+
+@RESULTS.states(NOISE_ONLY, "the same", Below(10**-0.5), "an order of magnitude, to half an order")
+def residual_without_eor_lower_within_half_an_order(study: Study) -> Finding:
+    return _without_eor(study)
+
+
+@RESULTS.states(
+    "at a similar level to the noise only simulations",
+    "rms of P^R without EoR, in units of its noise error, over the same of P^N; outside the wedge, k >= 0.2",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+)
+def residual_without_eor_at_noise(study: Study) -> Finding:
+    residual, noise = (study.spherical(name, "outside-wedge") for name in ("residual_without_eor", "noise"))
+    used = used_bins(residual, noise, k_min=K_AGREEMENT)
+    rms = [np.sqrt(np.mean((item.power.real / item.noise_error)[used] ** 2)) for item in (residual, noise)]
+    part = 1 / np.sqrt(2 * used.sum())
+    return ratio(Finding(rms[0], rms[0] * part), Finding(rms[1], rms[1] * part))
+
+
+@RESULTS.states(
+    "≈ 90 dB below the level of the foregrounds in the power-spectrum domain",
+    "rms P^R without EoR (outside the wedge, k >= 0.2) over the largest P^{S+F+N} of all modes, in dB",
+    Below(-85),
+    "≈ 90 dB, to half an order of magnitude",
+)
+def residual_without_eor_90_db_below_foregrounds(study: Study) -> Finding:
+    residual = study.spherical("residual_without_eor", "outside-wedge")
+    foregrounds = study.spherical("uncorrupted", "all-modes")
+    found = rms_power(residual, used_bins(residual, k_min=K_AGREEMENT))
+    highest = float(np.nanmax(foregrounds.power.real))
+    return Finding(10 * np.log10(found.value / highest), 10 / np.log(10) * found.uncertainty / found.value)
+
+
+POSITIVE = (
+    "our noise residuals show a slight positive bias that is at roughly the same level as the thermal noise at small k"
+)
+
+
+def _positive_bias(study: Study) -> Finding:
+    residual = study.spherical("residual_without_eor", "outside-wedge")
+    signal = study.spherical("eor", "outside-wedge")
+    used = used_bins(residual, signal, k_max=K_SMALL)
+    weights = residual.noise_error[used] ** -2.0
+    level = float(np.mean(signal.power.real[used]))
+    mean = np.sum(weights * residual.power.real[used]) / np.sum(weights)
+    return Finding(float(mean) / level, float(np.sum(weights) ** -0.5) / level)
+
+
+@RESULTS.states(
+    POSITIVE,
+    "mean P^R without EoR at k <= 0.5 outside the wedge, in units of P^S; the run's own solver",
+    Above(0, 2),
+    "positive beyond the noise",
+)
+def positive_bias_at_small_k(study: Study) -> Finding:
+    return _positive_bias(study)
+
+
+@RESULTS.states(
+    POSITIVE, "the same with the paper's solver", Above(0, 2), "positive beyond the noise", roles=("paper_solver",)
+)
+def positive_bias_at_small_k_with_papers_solver(study: Study) -> Finding:
+    return _positive_bias(study)
+
+
+TAPERED = "our residual does significantly better than a tapered estimator, contaminated by Blackman-Harris sidelobes"
+
+
+def _better_than_taper(study: Study, modes: str) -> Finding:
+    tapered, residual, signal = (study.spherical(name, modes) for name in ("uncorrupted", "residual", "eor"))
+    used = used_bins(tapered, residual, signal, k_max=K_BIAS)
+    errors = [np.sqrt(np.mean((item.power - signal.power).real[used] ** 2)) for item in (tapered, residual)]
+    part = 1 / np.sqrt(2 * used.sum())
+    return ratio(Finding(errors[0], errors[0] * part), Finding(errors[1], errors[1] * part))
+
+
+@RESULTS.states(
+    TAPERED,
+    "rms of P^{S+F+N} - P^S over that of P^R - P^S, outside the wedge, k <= 0.25",
+    Above(1, 2),
+    "better beyond the errors",
+)
+def residual_beats_taper_outside_wedge(study: Study) -> Finding:
+    return _better_than_taper(study, "outside-wedge")
+
+
+@RESULTS.states(TAPERED, "the same over all modes", Above(1, 2), "better beyond the errors")
+def residual_beats_taper_all_modes(study: Study) -> Finding:
+    return _better_than_taper(study, "all-modes")

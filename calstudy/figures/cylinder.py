@@ -1,0 +1,84 @@
+"""What figures over baseline length and delay have in common: cells, the horizon, axes of metres and nanoseconds."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from calstudy.figures import style
+from calstudy.figures.domains import horizon_delay
+
+
+class Cylinder(Protocol):
+    """The axes of quantities per baseline length and delay, as in `calstudy.power.wedge.WedgeSpectrum`."""
+
+    baseline_length: np.ndarray
+    bin_edges: np.ndarray
+    k_perp: np.ndarray
+    delay: np.ndarray
+    k_parallel: np.ndarray
+
+
+def length_cells(cylinder: Cylinder) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges (M + 1,) in m of contiguous cells, and which of them each bin of lengths fills, (Nb,) int.
+
+    Cells between bins that are not adjacent hold no baselines.
+    """
+    edges = np.unique(cylinder.bin_edges)
+    return edges, np.searchsorted(edges, cylinder.bin_edges[:, 0])
+
+
+def delay_edges(centres: np.ndarray) -> np.ndarray:
+    """Return the (N + 1,) edges halfway between (N,) increasing centres >= 0; none is below 0."""
+    middle = (centres[1:] + centres[:-1]) / 2
+    return np.concatenate([[max(2 * centres[0] - middle[0], 0.0)], middle, [2 * centres[-1] - middle[-1]]])
+
+
+def cells(cylinder: Cylinder, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return edges in k_perp and k_parallel, and the values (Nb, Nd) on them with NaN where there are no baselines."""
+    lengths, filled = length_cells(cylinder)
+    grid = np.full((cylinder.delay.size, lengths.size - 1), np.nan)
+    grid[:, filled] = values.T
+    return lengths * ratio(cylinder.k_perp, cylinder.baseline_length), delay_edges(cylinder.k_parallel), grid
+
+
+def draw_horizon(axes: Axes, cylinder: Cylinder, buffer: float, colour: str = "black") -> None:
+    """Draw the horizon and, dashed, the delay `buffer` (s) beyond it."""
+    lengths = cylinder.bin_edges[[0, -1], [0, 1]]
+    k_perp = lengths * ratio(cylinder.k_perp, cylinder.baseline_length)
+    per_second = ratio(cylinder.k_parallel, cylinder.delay)
+    for extra, line, label in ((0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")):
+        edge = (horizon_delay(lengths) + extra) * per_second
+        axes.plot(k_perp, edge, line, color=colour, linewidth=0.8, label=label)
+
+
+def ratio(numerator: np.ndarray, denominator: np.ndarray) -> float:
+    """Return the constant factor between two proportional axes."""
+    return float(numerator[-1] / denominator[-1])
+
+
+def label_axes(axes: Axes, cylinder: Cylinder, max_delay: float | None) -> None:
+    """Set limits and label k_perp below and metres above; delays end at `max_delay` (s), if that is not None."""
+    metres = ratio(cylinder.baseline_length, cylinder.k_perp)
+    shortest, longest = cylinder.bin_edges[[0, -1], [0, 1]]
+    top = delay_edges(cylinder.k_parallel)[-1]
+    if max_delay is not None:
+        top = min(top, max_delay * ratio(cylinder.k_parallel, cylinder.delay))
+    axes.set(xlim=(shortest / metres, longest / metres), ylim=(0, top), xlabel=style.K_PERPENDICULAR)
+    axes.tick_params(which="both", top=False, right=False, direction="out")
+    axes.locator_params(axis="x", nbins=3)
+    lengths = axes.secondary_xaxis("top", functions=(lambda k: k * metres, lambda b: b / metres))
+    lengths.set_xlabel(style.BASELINE_LENGTH, fontsize=style.SMALL_SIZE, labelpad=2)
+    lengths.tick_params(direction="out", labelsize=style.SMALL_SIZE, pad=1)
+    lengths.xaxis.set_major_locator(MaxNLocator(nbins=3))
+
+
+def delay_axis(axes: Axes, cylinder: Cylinder) -> None:
+    """Add an axis of delays in ns on the right."""
+    per_nanosecond = ratio(cylinder.k_parallel, cylinder.delay) * 1e-9
+    delays = axes.secondary_yaxis("right", functions=(lambda k: k / per_nanosecond, lambda t: t * per_nanosecond))
+    delays.set_ylabel(style.DELAY)
+    delays.tick_params(direction="out")

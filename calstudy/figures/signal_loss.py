@@ -1,0 +1,130 @@
+"""What a calibration leaves of the EoR: transfer functions per wavenumber, and per baseline length and delay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from calstudy.figures import style
+from calstudy.figures.cylinder import cells, delay_axis, draw_horizon, label_axes
+
+if TYPE_CHECKING:
+    from calstudy.power.transfer import TransferFunction, TransferMap
+
+SIGMAS_95 = 1.96
+"""Half-width of a 95 % interval, in standard deviations."""
+TRANSFER = r"$T = P^{R}/P^{S}$"
+COHERENT = r"outside, coherent with $S$"
+MAP_COLOURS = "cividis"
+EMPTY = "0.8"
+
+
+@dataclass(frozen=True)
+class SignalLoss:
+    """The transfer functions of one calibration.
+
+    Attributes
+    ----------
+    outside, inside
+        Per |k|, outside and inside the wedge.
+    map
+        Per baseline length and delay.
+    """
+
+    outside: TransferFunction
+    inside: TransferFunction
+    map: TransferMap
+
+
+@style.journal_style()
+def draw_signal_loss(
+    loss: SignalLoss, buffer: float = 100e-9, max_delay: float | None = 2e-6, stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw T per |k| outside and inside the wedge on the left, per (|b|, tau) on the right.
+
+    Parameters
+    ----------
+    loss
+        Bars are 95 % (1.96 sigma); a point without an error (one baseline in its bin) has none.
+    buffer
+        What was added to the horizon to tell inside from outside, s: the dashed line.
+    max_delay
+        Upper end of the delay axis, s; all delays if None or larger than those.
+    stand_ins
+        See `calstudy.figures.style.note_stand_ins`.
+
+    Raises
+    ------
+    ValueError
+        If no bin outside or inside the wedge has a transfer function.
+    """
+    if not any(np.isfinite(part.transfer).any() for part in (loss.outside, loss.inside)):
+        raise ValueError("no bin of |k| has a transfer function, expected at least one with modes in it")
+    figure = style.new_figure(style.TWO_COLUMNS, 3.0)
+    left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
+    _draw_per_k(left, loss, buffer)
+    _draw_map(figure, right, loss.map, buffer, max_delay)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
+    axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
+    where = f"wedge + {1e9 * buffer:.0f} ns"
+    for part, label, marker, colour in (
+        (loss.outside, f"outside {where}", "o", style.BLUE),
+        (loss.inside, f"inside {where}", "s", style.ORANGE),
+    ):
+        draw_transfer(axes, part, label, marker, colour)
+    axes.plot(loss.outside.k, loss.outside.coherence, color=style.BLUE, linewidth=0.7, zorder=1, label=COHERENT)
+    axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, _last_k(loss)), ylim=_limits(loss))
+    handles, labels = axes.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda index: labels[index] == COHERENT)
+    axes.legend([handles[index] for index in order], [labels[index] for index in order], loc="lower right")
+
+
+def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, colour: str) -> None:
+    """Draw one transfer function as points with 95 % bars at the centres of its bins."""
+    known = np.isfinite(part.transfer)
+    axes.errorbar(
+        part.k[known],
+        part.transfer[known],
+        yerr=SIGMAS_95 * np.nan_to_num(part.transfer_error[known]),
+        fmt=marker,
+        color=colour,
+        markersize=2.6,
+        ecolor=(colour, 0.55),
+        elinewidth=0.7,
+        label=label,
+    )
+
+
+def _last_k(loss: SignalLoss) -> float:
+    """Return the end of the last bin with modes, but not far beyond the last of the window's interesting part."""
+    filled = np.isfinite(loss.outside.transfer) | np.isfinite(loss.inside.transfer)
+    return min(float(loss.outside.bin_edges[1:][filled].max()), 1.5)
+
+
+def _limits(loss: SignalLoss) -> tuple[float, float]:
+    values = np.concatenate([loss.outside.transfer, loss.inside.transfer])
+    return min(-0.03, 1.1 * float(np.nanmin(values))), max(1.1, 1.05 * float(np.nanmax(values)))
+
+
+def _draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, max_delay: float | None) -> None:
+    norm = Normalize(0.0, 1.0)
+    x, y, values = cells(transfer, transfer.transfer)
+    axes.set_facecolor(EMPTY)
+    axes.pcolormesh(x, y, np.ma.masked_invalid(values), norm=norm, cmap=MAP_COLOURS, rasterized=True)
+    draw_horizon(axes, transfer, buffer, colour="white")
+    label_axes(axes, transfer, max_delay)
+    axes.set_ylabel(style.K_PARALLEL)
+    delay_axis(axes, transfer)
+    bar = figure.colorbar(ScalarMappable(norm, MAP_COLOURS), ax=axes, extend="max", pad=0.02, aspect=25)
+    bar.set_label(TRANSFER)

@@ -1,0 +1,34 @@
+"""The signal loss of an experiment as tasks: the response of the residual to the EoR, its power, and T = P^R / P^S."""
+
+from __future__ import annotations
+
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.tasks import PARITIES, Graph, Task
+
+
+def transfer_task(graph: Graph) -> Task:
+    """Return the task that measures T of an experiment that `measures_signal_loss`."""
+    residual, without, eor = (graph.experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS)
+    responses = {
+        parity: Task(
+            "difference",
+            f"response to the EoR {parity}",
+            {},
+            {"with_signal": graph.average(residual, parity), "without_signal": graph.average(without, parity)},
+        )
+        for parity in PARITIES
+    }
+    signals = {parity: graph.average(eor, parity) for parity in PARITIES}
+    inputs = {
+        "signal": graph.power("eor"),
+        "response": graph.crossed("response to the EoR", responses),
+        "cross": graph.crossed("EoR x response", {"even": signals["even"], "odd": responses["odd"]}),
+        "spectra": graph.spectra,
+    }
+    return Task("transfer", "signal loss", {"power": graph.sections["power"]}, inputs)
+
+
+def transfer_figure(graph: Graph) -> Task:
+    """Return the task that draws T of an experiment that `measures_signal_loss`."""
+    settings = {"notes": list(graph.footnotes), "wedge_buffer": graph.experiment.power.wedge_buffer}
+    return Task("transfer-figure", "signal-loss", settings, {"transfer": transfer_task(graph)})

@@ -1,0 +1,217 @@
+"""Transfer functions: known losses are found, nothing else counts as loss, and the errors are those of the scatter."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calstudy.power.delay import delay_transform, delays
+from calstudy.power.spectra import DelaySpectra
+from calstudy.power.spherical import SphericalSpectrum
+from calstudy.power.tables import load_spectrum, save_spectrum, write_transfer_csv
+from calstudy.power.transfer import (
+    Injection,
+    TransferFunction,
+    TransferMap,
+    correct,
+    cylindrical_transfer,
+    pool,
+    signal_response,
+    spherical_transfer,
+)
+
+BASELINES, CHANNELS, WIDTH = 40, 64, 400e3
+FREQUENCY = 170e6 + WIDTH * np.arange(CHANNELS)
+LENGTHS = np.linspace(10.0, 60.0, BASELINES)
+BUFFER = 100e-9
+ONE_BIN = (0.0, 10.0)
+
+
+def cross(first: np.ndarray, second: np.ndarray, taper: str = "none") -> DelaySpectra:
+    """Delay spectra of (Nbls, Nfreqs) visibilities; k is the delay in us."""
+    even, odd = (delay_transform(part, FREQUENCY, taper) for part in (first, second))
+    delay = delays(CHANNELS, WIDTH)
+    return DelaySpectra(
+        power=even.conj() * odd,
+        vectors=np.stack([LENGTHS, 0 * LENGTHS, 0 * LENGTHS], axis=1),
+        n_pairs=np.ones(BASELINES, dtype=int),
+        n_polarizations=1,
+        delay=delay,
+        k_perp=1e-4 * LENGTHS,
+        k_parallel=1e6 * delay,
+        frequency=182e6,
+        omega_pp=0.1,
+        taper=taper,
+    )
+
+
+def inject(signal: np.ndarray, even: np.ndarray, odd: np.ndarray, taper: str = "none") -> Injection:
+    return Injection(
+        signal=cross(signal, signal, taper), response=cross(even, odd, taper), cross=cross(signal, odd, taper)
+    )
+
+
+def noise(rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(size=(BASELINES, CHANNELS)) + 1j * rng.normal(size=(BASELINES, CHANNELS))
+
+
+def low_delays_removed(spectra: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """Project out of each baseline all delays up to its edge (Nbls,)."""
+    transformed = np.fft.fft(spectra, axis=1)
+    transformed[np.abs(np.fft.fftfreq(CHANNELS, WIDTH)) <= edge[:, None]] = 0
+    return np.fft.ifft(transformed, axis=1)
+
+
+@given(st.floats(0.01, 3.0))
+def test_a_signal_scaled_by_a_factor_has_the_squared_factor_as_transfer_and_itself_as_coherence(factor):
+    signal = noise(np.random.default_rng(1))
+    found = spherical_transfer(inject(signal, factor * signal, factor * signal), ONE_BIN, BUFFER, inside=False)
+    assert found.transfer == pytest.approx([factor**2])
+    assert found.coherence == pytest.approx([factor])
+    assert found.transfer_error == pytest.approx([0], abs=1e-9)
+
+
+def test_no_loss_is_one_in_every_bin_and_cell(rng):
+    signal = noise(rng)
+    injection = inject(signal, signal, signal, "blackman-harris")
+    outside = spherical_transfer(injection, np.arange(0, 1.4, 0.1), BUFFER, inside=False)
+    filled = outside.n_samples > 0
+    assert filled.sum() > 5
+    assert outside.transfer[filled] == pytest.approx(np.ones(filled.sum()))
+    assert np.isnan(outside.transfer[~filled]).all()
+    assert cylindrical_transfer(injection, 4.0).transfer == pytest.approx(1.0)
+
+
+def test_a_projection_loses_what_it_projects_out_and_nothing_else(rng):
+    signal = noise(rng)
+    left = low_delays_removed(signal, LENGTHS / 299792458.0 + BUFFER)
+    injection = inject(signal, left, left)
+    outside, inside = (spherical_transfer(injection, ONE_BIN, BUFFER, inside) for inside in (False, True))
+    assert outside.transfer == pytest.approx([1.0])
+    assert inside.transfer == pytest.approx([0.0], abs=1e-20)
+    found = cylindrical_transfer(injection, 1e-6)
+    lost = found.delay <= found.horizon_delay[:, None] + BUFFER
+    assert found.transfer == pytest.approx(np.where(lost, 0.0, 1.0), abs=1e-12)
+
+
+def random_projection(rng: np.random.Generator, lost: int) -> np.ndarray:
+    """Projection of all baselines of a channel, which loses `lost` of their dimensions."""
+    basis, _ = np.linalg.qr(rng.normal(size=(BASELINES, lost)) + 1j * rng.normal(size=(BASELINES, lost)))
+    return np.eye(BASELINES) - basis @ basis.conj().T
+
+
+def test_gains_that_absorb_some_of_all_baselines_lose_their_share_at_all_delays(rng):
+    lost = 10
+    projections = [random_projection(rng, lost) for _ in range(CHANNELS)]
+    found = []
+    for _ in range(8):
+        signal = noise(rng)
+        left = np.stack([matrix @ column for matrix, column in zip(projections, signal.T, strict=True)], axis=1)
+        found.append(spherical_transfer(inject(signal, left, left), ONE_BIN, BUFFER, inside=False))
+    pooled = pool(found)
+    for value, error in ((pooled.transfer, pooled.transfer_error), (pooled.coherence, pooled.coherence_error)):
+        assert value[0] == pytest.approx(1 - lost / BASELINES, abs=4 * error[0])
+        assert error[0] < 0.02
+
+
+def test_noise_that_both_residuals_share_cancels(template, rng, white):
+    """The difference of powers scatters by the noise; the power of the difference does not see it."""
+    from calstudy.visibilities import from_cube, to_cube
+
+    signal, common = (to_cube(white(template, rng, sigma)) for sigma in (1.0, 30.0))
+    without = from_cube(template, common)
+    with_signal = from_cube(template, common + 0.5 * signal)
+    response = to_cube(signal_response(with_signal, without))
+    assert response == pytest.approx(0.5 * signal, abs=1e-12)
+    powers = [np.mean(np.abs(part) ** 2) for part in (common + 0.5 * signal, common, signal, response)]
+    assert powers[3] / powers[2] == pytest.approx(0.25)
+    assert abs((powers[0] - powers[1]) / powers[2] - 0.25) > 0.1
+
+
+def test_noise_that_is_left_in_the_response_scatters_but_gives_no_bias():
+    pulls = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        signal = noise(rng)
+        even, odd = (0.8 * signal + 0.7 * noise(rng) for _ in range(2))
+        found = spherical_transfer(inject(signal, even, odd, "blackman-harris"), (0.5, 0.9), BUFFER, inside=False)
+        pulls.append(
+            [
+                (found.transfer[0] - 0.64) / found.transfer_error[0],
+                (found.coherence[0] - 0.8) / found.coherence_error[0],
+            ]
+        )
+    assert np.mean(pulls, axis=0) == pytest.approx([0, 0], abs=4 / np.sqrt(200))
+    assert np.std(pulls, axis=0) == pytest.approx([1, 1], abs=0.2)
+
+
+def test_one_sample_has_no_error(rng):
+    signal = noise(rng)
+    shortest = LENGTHS[0] / 299792458.0
+    found = spherical_transfer(inject(signal, signal, signal), (0.0, 1e6 * shortest), 0.0, inside=True)
+    single = cylindrical_transfer(inject(signal, signal, signal), 1e-6)
+    assert found.n_samples[0] == BASELINES
+    assert np.isnan(single.transfer_error[:, 0]).all()
+    assert np.isfinite(single.transfer_error[:, 1:-1]).all()
+
+
+def test_pooling_is_as_if_all_modes_were_of_one_injection(rng):
+    signals = [noise(rng) for _ in range(3)]
+    injections = [
+        inject(part, part * factor, part * factor) for part, factor in zip(signals, (0.9, 0.8, 0.7), strict=True)
+    ]
+    found = [spherical_transfer(item, ONE_BIN, BUFFER, inside=False) for item in injections]
+    response, signal = (sum(part.transfer * part.signal for part in found), sum(part.signal for part in found))
+    pooled = pool(found)
+    assert pooled.transfer == pytest.approx(response / signal)
+    assert pooled.n_samples == pytest.approx(3 * found[0].n_samples)
+    with pytest.raises(ValueError, match="different bins"):
+        pool([found[0], spherical_transfer(injections[0], (0.0, 5.0), BUFFER, inside=False)])
+    with pytest.raises(ValueError, match="no transfer function"):
+        pool([])
+
+
+def spectrum(power: list[float], error: float, edges: np.ndarray) -> SphericalSpectrum:
+    ones = np.ones(len(power))
+    return SphericalSpectrum(
+        (edges[1:] + edges[:-1]) / 2, edges, np.array(power, dtype=complex), ones, ones, ones, error * ones, 0 * ones,
+        wedge_excluded=True,
+    )  # fmt: skip
+
+
+def test_corrected_power_is_unbiased_with_both_errors_and_unknown_where_all_is_lost():
+    edges = np.array([0.0, 1.0, 2.0, 3.0])
+    ones = np.ones(3)
+    transfer = TransferFunction(
+        (edges[1:] + edges[:-1]) / 2, edges, np.array([0.5, 1.0, 0.01]), 0.01 * ones, ones, ones, ones, ones
+    )
+    power, error = correct(spectrum([50.0, 100.0, 1.0], 3.0, edges), transfer)
+    assert power[:2] == pytest.approx([100.0, 100.0])
+    assert error[:2] == pytest.approx([np.hypot(6.0, 2.0), np.hypot(3.0, 1.0)])
+    assert np.isnan([power[2], error[2]]).all()
+    with pytest.raises(ValueError, match="different bins"):
+        correct(spectrum([1.0], 1.0, edges[:2]), transfer)
+
+
+def test_tables_read_back(tmp_path, rng):
+    signal = noise(rng)
+    injection = inject(signal, 0.5 * signal, 0.5 * signal)
+    found = spherical_transfer(injection, (0.0, 0.5, 1.0), BUFFER, inside=False)
+    for value, kind in ((found, TransferFunction), (cylindrical_transfer(injection, 4.0), TransferMap)):
+        save_spectrum(tmp_path / "t.h5", value)
+        back = load_spectrum(tmp_path / "t.h5", kind)
+        assert np.array_equal(back.transfer, value.transfer, equal_nan=True)
+    write_transfer_csv(tmp_path / "t.csv", found)
+    rows = (tmp_path / "t.csv").read_text().splitlines()
+    assert rows[0].startswith("k [h/Mpc],k from [h/Mpc],k to [h/Mpc],transfer,transfer error")
+    assert len(rows) == 3
+    assert float(rows[1].split(",")[3]) == pytest.approx(0.25)
+
+
+def test_spectra_of_different_shape_are_refused(rng):
+    whole = cross(noise(rng), noise(rng))
+    part = dataclasses.replace(whole, power=whole.power[:3])
+    with pytest.raises(ValueError, match="expected those of the signal"):
+        Injection(whole, part, whole)
