@@ -36,7 +36,9 @@ def parse_memory(text: str) -> float:
     return number
 
 
-def fit(experiment: Experiment, workers: int | None, max_memory: str | None) -> tuple[Experiment, int]:
+def fit(
+    experiment: Experiment, workers: int | None, max_memory: str | None, scheduler: str | None = None
+) -> tuple[Experiment, int]:
     """Choose the number of workers, and cut simulations finely enough for them, within the memory.
 
     How many chunks a simulation is cut into changes its visibilities by rounding only, and not the key under which
@@ -50,6 +52,8 @@ def fit(experiment: Experiment, workers: int | None, max_memory: str | None) -> 
         Wanted number of worker processes, or None for one per core as far as the memory goes.
     max_memory
         What all workers together may take, such as "6 GB", or None for what is free now.
+    scheduler
+        Address of a cluster, whose memory is not looked at, or None.
 
     Returns
     -------
@@ -65,7 +69,9 @@ def fit(experiment: Experiment, workers: int | None, max_memory: str | None) -> 
         cannot help; before anything has started.
     """
     if ranks.count() > 1:
-        _require_shared_engine(experiment, workers)
+        _require_sharing(experiment, workers, scheduler)
+    if scheduler is not None:
+        return experiment, workers or 1
     memory = free_memory() if max_memory is None else parse_memory(max_memory)
     # The parent process holds the libraries, too.
     budget = memory - LIBRARIES_MEMORY
@@ -90,15 +96,18 @@ def fit(experiment: Experiment, workers: int | None, max_memory: str | None) -> 
     return cut, min(hoped, fitting)
 
 
-def _require_shared_engine(experiment: Experiment, workers: int | None) -> None:
+def _require_sharing(experiment: Experiment, workers: int | None, scheduler: str | None) -> None:
     engine = experiment.simulation.engine
     if engine != "pyuvsim":
         raise InputError(
             f"simulation.engine = {engine!r} does not share its work between MPI ranks, only 'pyuvsim' does; leave out "
             "mpiexec and use --workers, or add --set simulation.engine=pyuvsim"
         )
-    if workers not in (None, 1):
-        raise InputError(f"--workers {workers}: under mpiexec the ranks are the workers; choose their number with -n")
+    if scheduler is not None or workers not in (None, 1):
+        raise InputError(
+            "--workers and --scheduler: under mpiexec the ranks are the workers; leave both out and choose the number "
+            "of ranks with -n"
+        )
 
 
 def _cut(experiment: Experiment, share: float) -> Experiment:

@@ -1,4 +1,4 @@
-"""The command line: ``calstudy run | plan | data``.
+"""The command line: ``calstudy run | plan | calibrate | claims | report | data``.
 
 Only light modules are imported here, so that ``calstudy --help`` answers at once.
 """
@@ -14,6 +14,9 @@ import typer
 from rich.console import Console
 
 from calstudy import __version__, ranks
+from calstudy.commands.bench import bench_app
+from calstudy.commands.calibrate import calibrate
+from calstudy.commands.check import check_app
 from calstudy.errors import ExperimentError, InputError
 
 app = typer.Typer(
@@ -25,10 +28,13 @@ app = typer.Typer(
 )
 data_app = typer.Typer(help="Catalogues that are downloaded once.", no_args_is_help=True)
 app.add_typer(data_app, name="data")
+app.command()(calibrate)
+app.add_typer(bench_app, name="bench")
+app.add_typer(check_app, name="check")
 
 EXIT_INPUT = 2
 
-File = Annotated[Path, typer.Argument(help="The experiment file (YAML).", show_default=False)]
+File = Annotated[Path, typer.Argument(help="The file (YAML) of an experiment or a collection.", show_default=False)]
 Scale = Annotated[str | None, typer.Option(help="Apply a named set of overrides of the file, such as 'small'.")]
 Set = Annotated[
     list[str] | None,
@@ -64,18 +70,15 @@ def run(
     max_memory: MaxMemory = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Run an experiment: simulate, corrupt, calibrate, measure power spectra, draw figures.
+    """Run an experiment or a collection: simulate, corrupt, calibrate, measure power spectra, draw figures.
 
     Products that are in the store already are not made again; an interrupted run is resumed by the same command.
     """
-    from calstudy.capacity import fit
-    from calstudy.experiment.files import load
-    from calstudy.plans import show_result
-    from calstudy.runs import run as run_experiment
+    from calstudy.experiment.collection import load_study
+    from calstudy.studies import run_study
 
-    console = Console(soft_wrap=True, highlight=False)
-    experiment, count = fit(load(file, scale, overrides or ()), workers, max_memory)
-    show_result(run_experiment(experiment, count, scheduler, console), console)
+    study = load_study(file, scale, overrides or ())
+    run_study(study, workers, max_memory, scheduler, Console(soft_wrap=True, highlight=False))
 
 
 @app.command()
@@ -87,12 +90,35 @@ def plan(
     max_memory: MaxMemory = None,
 ) -> None:
     """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
-    from calstudy.capacity import fit
-    from calstudy.experiment.files import load
-    from calstudy.plans import show_plan
+    from calstudy.experiment.collection import load_study
+    from calstudy.studies import plan_study
 
-    experiment, count = fit(load(file, scale, overrides or ()), workers, max_memory)
-    show_plan(experiment, count, Console(highlight=False))
+    plan_study(load_study(file, scale, overrides or ()), workers, max_memory, Console(highlight=False))
+
+
+@app.command()
+def claims(
+    folder: Annotated[Path, typer.Argument(help="The folder of a finished run or collection.", show_default=False)],
+) -> None:
+    """Hold a finished run against the paper: every claim with the measured number, its threshold, PASS or FAIL.
+
+    Writes claims.json and claims.md into the folder.
+    """
+    from calstudy.claims.folders import evaluate_folder
+    from calstudy.claims.tables import show_table
+
+    evaluated = evaluate_folder(folder)
+    show_table(evaluated.claims, evaluated.title, Console(highlight=False))
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="The folder of a finished run.", show_default=False)],
+) -> None:
+    """Write the report of a finished run, one self-contained page, report.html, into its folder."""
+    from calstudy.report.page import write_report
+
+    typer.echo(f"{write_report(folder)}")
 
 
 @app.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from rich.console import Console
 from calstudy.collection_tasks import CollectionGraph
 from calstudy.execution import Crew
 from calstudy.experiment.collection import Collection
+from calstudy.report.page import write_report
 from calstudy.runs import MANIFEST, Run, fill_folder, log_to, make, open_folder, publish, run_folder, write
 from calstudy.store import Product, Store, digest_json
 
@@ -64,14 +66,16 @@ def run_collection(collection: Collection, workers: int, scheduler: str | None, 
     graph, store, folder = CollectionGraph(collection), Store(collection.outputs.store), collection_folder(collection)
     store.prepare()
     folders = {name: run_folder(experiment) for name, experiment in collection.members.items()}
-    for needed in (folder, *folders.values()):
-        open_folder(needed)
-    with log_to(folder / "run.log"):
+    with ExitStack() as logs:
+        for needed in (folder, *folders.values()):
+            open_folder(needed)
+            logs.enter_context(log_to(needed / "run.log"))
         products, made = make(graph.targets, store, Crew(workers, folder / "run.log", scheduler), console)
         members = {name: fill_folder(folders[name], graph.graphs[name], products, made) for name in collection.members}
         publish([products[task.key] for task in graph.figures], folder / "figures")
         publish([products[graph.claims.key]], folder)
         write(folder / MANIFEST, json.dumps(_manifest(graph, folders), indent=1))
+        write_report(folder)
     return CollectionRun(folder, {task.key: products[task.key] for task in graph.own}, members)
 
 

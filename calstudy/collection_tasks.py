@@ -34,7 +34,7 @@ class CollectionGraph:
         notes = list(dict.fromkeys(note for graph in compared.values() for note in graph.footnotes))
         settings = {"figure": name, "notes": notes}
         if name == "layouts":
-            settings["layouts"] = [graph.sections["instrument"]["layout"] for graph in compared.values()]
+            settings["layouts"] = {role: graph.sections["instrument"]["layout"] for role, graph in compared.items()}
             return Task("combined-figure", name, settings)
         return Task("combined-figure", name, settings, {role: graph.spectra for role, graph in compared.items()})
 

@@ -84,6 +84,8 @@ def _engine_seconds(engine: str, sources: float, slots: float, antennas: int) ->
         return 2.8e-8 * sources * slots * antennas**2 / 2
     if engine == "fftvis":
         return 1.8e-5 * sources * slots
+    if engine == "matvis":
+        return (3e-6 + 3.2e-9 * antennas**2) * sources * slots
     above_horizon = sources / 2
     return 1.1 * above_horizon * slots * (2e-8 + 0.9e-9 * antennas + 0.87e-10 * antennas**2) + 4.5e-6 * sources
 
@@ -148,7 +150,7 @@ def _power(task: Task) -> Cost:
 
 def _agreement(task: Task) -> Cost:
     samples = _size(_instrument(task)).samples
-    return Cost(2 + samples * 4e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
+    return Cost(2 + samples * 1e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
 
 
 ESTIMATES: Mapping[str, Callable[[Task], Cost]] = {

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+QUIET_TENSORFLOW = {"TF_CPP_MIN_LOG_LEVEL": "3", "TF_ENABLE_ONEDNN_OPTS": "0"}
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -99,7 +101,7 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
 
     threads = str(max(1, cores() // workers))
     environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TF_NUM_INTRAOP_THREADS"), threads)
-    environment |= {"TF_CPP_MIN_LOG_LEVEL": "3", "TF_ENABLE_ONEDNN_OPTS": "0"}
+    environment |= QUIET_TENSORFLOW
     settings = {
         "distributed.nanny.pre-spawn-environ": environment,
         "distributed.admin.tick.limit": "10 m",
@@ -114,7 +116,8 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
             threads_per_worker=1,
             processes=workers > 1,
             memory_limit=0,
-            dashboard_address=None,
+            # The scheduler serves HTTP in any case: to this machine only, on any free port.
+            dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,
@@ -215,6 +218,7 @@ def execute(
 
 def _execute_here(tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None]) -> dict[str, Product]:
     """Make products one after the other in the main thread, where MPI may be used."""
+    os.environ.update(QUIET_TENSORFLOW)
     products = {}
     for task in tasks:
         products[task.key] = perform(Order.of(task, store))

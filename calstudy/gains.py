@@ -39,7 +39,8 @@ def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = N
         telescope=template.telescope,
         freq_array=template.freq_array,
         channel_width=template.channel_width,
-        flex_spw_id_array=np.zeros(template.Nfreqs, dtype=int),
+        flex_spw_id_array=template.flex_spw_id_array,
+        spw_array=template.spw_array,
         integration_time=float(np.ptp(times) * 86400 + template.integration_time[0])
         if constant
         else float(template.integration_time[0]),

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from calstudy.claims.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
+from calstudy.collection_runs import CollectionRun
+from calstudy.collection_tasks import CollectionGraph
 from calstudy.estimates import LIBRARIES_MEMORY, Cost, estimate
 from calstudy.execution import schedule
+from calstudy.experiment.collection import Collection
 from calstudy.experiment.model import Experiment
 from calstudy.progress import duration
 from calstudy.resources import free_memory
-from calstudy.runs import Run, run_folder
+from calstudy.runs import Run
 from calstudy.store import Store
+from calstudy.sweep_tasks import SweepGraph
 from calstudy.tasks import Graph, Task
 
 
@@ -29,12 +35,30 @@ def _gigabytes(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e7 else f"{count / 1e6:.1f} MB"
 
 
-def show_plan(experiment: Experiment, workers: int, console: Console) -> None:
-    """Print the stages of an experiment, what is in the store, and what the rest will take."""
-    graph, store = Graph(experiment), Store(experiment.outputs.store)
+def show_plan(
+    study: Experiment | Collection,
+    graph: Graph | CollectionGraph | SweepGraph,
+    folders: Sequence[Path],
+    workers: int,
+    console: Console,
+) -> None:
+    """Print the stages of an experiment or a collection, what is in the store, and what the rest will take.
+
+    Parameters
+    ----------
+    study, graph
+        What is planned, and its tasks.
+    folders
+        Its run folders.
+    workers
+        Worker processes.
+    console
+        Where it is written.
+    """
+    store = Store(study.outputs.store)
     plan = schedule(graph.targets, store)
     todo = {task.key for task in plan.todo}
-    table = Table(title=f"{experiment.name}: plan for {workers} worker(s)", title_justify="left")
+    table = Table(title=f"{study.name}: plan for {workers} worker(s)", title_justify="left")
     for heading, justify in (("stage", "left"), ("products", "right"), ("to make", "right"), ("cpu time", "right")):
         table.add_column(heading, justify=justify)
     table.add_column("memory each", justify="right")
@@ -55,7 +79,9 @@ def show_plan(experiment: Experiment, workers: int, console: Console) -> None:
     _total([estimate(task) for task in plan.todo], plan.todo, workers, console)
     for note in graph.footnotes:
         console.print(f"stand-in: {note}", markup=False)
-    console.print(f"store: {store.root}\nrun folder: {run_folder(experiment)}", markup=False, soft_wrap=True)
+    console.print(f"store: {store.root}", markup=False, soft_wrap=True)
+    for folder in folders:
+        console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
 
 
 def _total(costs: list[Cost], tasks: Sequence[Task], workers: int, console: Console) -> None:
@@ -96,3 +122,22 @@ def show_result(result: Run, console: Console) -> None:
     for figure in sorted((result.folder / "figures").glob("*.png")):
         console.print(f"figure: {figure}", markup=False)
     console.print(f"tables: {result.folder / 'tables'}\nmanifest: {result.folder / 'manifest.json'}", markup=False)
+
+
+def show_collection_result(result: CollectionRun, console: Console) -> None:
+    """Print what the members of a collection made, and where the results and the combined ones are."""
+    for name, member in result.members.items():
+        console.print(f"\n{name}", markup=False)
+        show_result(member, console)
+    console.print(f"\ncombined: {result.folder}", markup=False)
+    for figure in sorted((result.folder / "figures").glob("*.png")):
+        console.print(f"figure: {figure}", markup=False)
+
+
+def show_claims(folder: Path, console: Console) -> None:
+    """Print how many of the paper's claims hold in a run, which fail, and where all of them are."""
+    claims = from_json((folder / CLAIMS_JSON).read_text(encoding="utf-8"))
+    for claim in claims:
+        if claim.verdict == "FAIL":
+            console.print(f"claim FAILS: {claim.name}: {measured(claim)}, must be {claim.threshold}", markup=False)
+    console.print(f"claims: {tally(claims)}: {folder / CLAIMS_MARKDOWN}", markup=False)

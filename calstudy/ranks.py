@@ -16,12 +16,9 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from calstudy.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
 
 # How the launchers of MPICH and Open MPI tell a process which one it is, of how many.
 LAUNCHERS = (("PMI_RANK", "PMI_SIZE"), ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"))
@@ -31,8 +28,6 @@ PAUSE = 0.02
 
 EXPECTED = (ValueError, MemoryError, OSError)
 """Errors that all ranks survive and rank 0 reports; any other ends all of them."""
-
-Work = Callable[..., "np.ndarray"]
 
 
 def _place() -> tuple[int, int]:
@@ -52,14 +47,13 @@ def is_helper() -> bool:
     return _place()[0] > 0
 
 
-def share(work: Work, *arguments: Any) -> np.ndarray:
-    """Do a piece of work on all ranks and return the sum of what they return.
+def share(work: Callable[..., Any], *arguments: Any) -> list[Any]:
+    """Do a piece of work on all ranks and return what each returns, in the order of the ranks.
 
     Parameters
     ----------
     work
-        A function of a module, called on every rank as ``work(rank, size, *arguments)``; it must return an array of the
-        same shape and dtype everywhere.
+        A function of a module, called on every rank as ``work(rank, size, *arguments)``.
     arguments
         Sent to every rank. Without a launcher the work is simply done here.
 
@@ -69,7 +63,7 @@ def share(work: Work, *arguments: Any) -> np.ndarray:
         If the work raises a ValueError, MemoryError or OSError on any rank. Any other error ends all ranks.
     """
     if count() == 1:
-        return work(0, 1, *arguments)
+        return [work(0, 1, *arguments)]
     communicator = _communicator()
     for rank in range(1, communicator.size):
         communicator.send((work, arguments), dest=rank, tag=WORK)
@@ -124,9 +118,7 @@ def _next_tag(communicator) -> int:
     return status.Get_tag()
 
 
-def _contribute(communicator, work: Work, arguments: tuple) -> np.ndarray:
-    from mpi4py import MPI
-
+def _contribute(communicator, work: Callable[..., Any], arguments: tuple) -> list[Any]:
     with _AllOrNone(communicator):
         part, fault = None, None
         try:
@@ -136,8 +128,7 @@ def _contribute(communicator, work: Work, arguments: tuple) -> np.ndarray:
         faults = [reason for reason in communicator.allgather(fault) if reason is not None]
         if faults:
             raise InputError(faults[0])
-        communicator.Allreduce(MPI.IN_PLACE, part)
-        return part
+        return communicator.gather(part, root=0) or []
 
 
 class _AllOrNone:

@@ -22,6 +22,7 @@ from calstudy.experiment.files import dump
 from calstudy.experiment.model import Experiment
 from calstudy.progress import report
 from calstudy.provenance import git_commit, machine, package_versions, seeds
+from calstudy.report.page import write_report
 from calstudy.store import Product, Store, digest_json
 from calstudy.tasks import Graph, Task, unique
 
@@ -72,7 +73,7 @@ def run_folder(experiment: Experiment) -> Path:
 
 def open_folder(folder: Path) -> None:
     """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
-    known = {"figures", "tables", "claims.json", "claims.md", MANIFEST, "experiment.yaml", "run.log"}
+    known = {"report.html", "points", "figures", "tables", "claims.json", "claims.md", MANIFEST, "experiment.yaml", "run.log"}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in folder.iterdir() if path.name not in known)
@@ -204,10 +205,13 @@ def fill_folder(folder: Path, graph: Graph, products: dict[str, Product], made: 
     write(folder / "experiment.yaml", dump(graph.experiment))
     manifest = _manifest(graph.experiment, graph, own_products, {task.key for task in own_made})
     write(folder / MANIFEST, json.dumps(manifest, indent=1))
+    write_report(folder)
     return Run(folder, own_products, own_made, tuple(graph.tasks))
 
 
-def run(experiment: Experiment, workers: int, scheduler: str | None, console: Console) -> Run:
+def run(
+    experiment: Experiment, workers: int = 1, scheduler: str | None = None, console: Console | None = None
+) -> Run:
     """Make the figures and spectra of an experiment, reusing every product that is in the store.
 
     Parameters
@@ -219,16 +223,19 @@ def run(experiment: Experiment, workers: int, scheduler: str | None, console: Co
     scheduler
         Address of a running dask scheduler to use instead, or None.
     console
-        Where progress is written.
+        Where progress is written; nowhere if None.
 
     Raises
     ------
     InputError
-        If the store or the run folder cannot be written, or a stage refuses its input.
+        If the experiment has a sweep, the store or the run folder cannot be written, or a stage refuses its input.
     """
+    if experiment.sweep:
+        raise InputError(f"{experiment.name}: has a sweep, and so is several experiments; run it with run_sweep")
     graph, store, folder = Graph(experiment), Store(experiment.outputs.store), run_folder(experiment)
     store.prepare()
     open_folder(folder)
     with log_to(folder / "run.log"):
-        products, made = make(graph.targets, store, Crew(workers, folder / "run.log", scheduler), console)
+        crew = Crew(workers, folder / "run.log", scheduler)
+        products, made = make(graph.targets, store, crew, console or Console(quiet=True))
         return fill_folder(folder, graph, products, made)

@@ -1,43 +1,95 @@
-"""Plan and run what a file holds: one experiment, or a collection of several."""
+"""Plan and run what a file holds: one experiment, the family that its sweep makes, or a collection of several."""
 
 from __future__ import annotations
 
+import dataclasses
+
 from rich.console import Console
 
+from calstudy.capacity import fit
 from calstudy.collection_runs import collection_folder, run_collection
 from calstudy.collection_tasks import CollectionGraph
 from calstudy.experiment.collection import Collection
 from calstudy.experiment.model import Experiment
-from calstudy.plans import choose_workers, show_claims, show_collection_result, show_plan, show_result
+from calstudy.experiment.sweep import Sweep, expand
+from calstudy.plans import show_claims, show_collection_result, show_plan, show_result
 from calstudy.runs import run, run_folder
+from calstudy.sweep_runs import run_sweep
+from calstudy.sweep_tasks import SweepGraph
 from calstudy.tasks import Graph
 
-Study = Experiment | Collection
+Study = Experiment | Collection | Sweep
 
 
-def graph_of(study: Study) -> Graph | CollectionGraph:
-    """Return the tasks of an experiment or a collection."""
-    return CollectionGraph(study) if isinstance(study, Collection) else Graph(study)
+def fit_study(
+    study: Study, workers: int | None, max_memory: str | None, scheduler: str | None = None
+) -> tuple[Study, int]:
+    """Fit an experiment, or all of a collection or sweep, to the machine, as `calstudy.capacity.fit` does.
+
+    An experiment with a sweep becomes the family of its points.
+    """
+    if isinstance(study, Experiment) and study.sweep:
+        study = expand(study)
+    if isinstance(study, Sweep):
+        fits = [[fit(point.experiment, workers, max_memory, scheduler) for point in block] for block in study.blocks]
+        blocks = tuple(
+            tuple(
+                dataclasses.replace(point, experiment=experiment)
+                for point, (experiment, _) in zip(block, fitted, strict=True)
+            )
+            for block, fitted in zip(study.blocks, fits, strict=True)
+        )
+        return dataclasses.replace(study, blocks=blocks), min(count for fitted in fits for _, count in fitted)
+    if not isinstance(study, Collection):
+        return fit(study, workers, max_memory, scheduler)
+    fitted = {name: fit(experiment, workers, max_memory, scheduler) for name, experiment in study.members.items()}
+    members = {name: experiment for name, (experiment, _) in fitted.items()}
+    return dataclasses.replace(study, members=members), min(count for _, count in fitted.values())
 
 
-def plan_study(study: Study, workers: int | None, console: Console) -> None:
-    """Print what a run would do; `workers` is their number, or None for as many as there is room for."""
-    graph = graph_of(study)
+def plan_study(study: Study, workers: int | None, max_memory: str | None, console: Console) -> None:
+    """Print what a run would do.
+
+    Parameters
+    ----------
+    study
+        An experiment, with a sweep or without, or a collection.
+    workers, max_memory
+        As for `calstudy.capacity.fit`.
+    console
+        Where it is written.
+    """
+    study, count = fit_study(study, workers, max_memory)
     if isinstance(study, Collection):
-        folders = {name: run_folder(experiment) for name, experiment in study.members.items()}
-        folders[study.name] = collection_folder(study)
+        folders = [run_folder(experiment) for experiment in study.members.values()] + [collection_folder(study)]
+        show_plan(study, CollectionGraph(study), folders, count, console)
+    elif isinstance(study, Sweep):
+        show_plan(study.base, SweepGraph(study), [run_folder(study.base)], count, console)
     else:
-        folders = {study.name: run_folder(study)}
-    show_plan(graph, study, folders, choose_workers(graph, workers), console)
+        show_plan(study, Graph(study), [run_folder(study)], count, console)
 
 
-def run_study(study: Study, workers: int | None, scheduler: str | None, console: Console) -> None:
-    """Run an experiment or a collection, and print what was made and which claims hold."""
-    count = choose_workers(graph_of(study), workers)
+def run_study(
+    study: Study, workers: int | None, max_memory: str | None, scheduler: str | None, console: Console
+) -> None:
+    """Run an experiment or a collection, and print what was made and which claims hold; parameters as above.
+
+    Parameters
+    ----------
+    study
+        An experiment, with a sweep or without, or a collection.
+    workers, max_memory
+        As for `calstudy.capacity.fit`.
+    scheduler, console
+        As for `calstudy.runs.run`.
+    """
+    study, count = fit_study(study, workers, max_memory, scheduler)
     if isinstance(study, Collection):
         collected = run_collection(study, count, scheduler, console)
         show_collection_result(collected, console)
         show_claims(collected.folder, console)
+    elif isinstance(study, Sweep):
+        show_result(run_sweep(study, count, scheduler, console).whole, console)
     else:
         result = run(study, count, scheduler, console)
         show_result(result, console)

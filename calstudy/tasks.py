@@ -143,6 +143,8 @@ class Graph:
     ) -> Task:
         simulation = {**self._sections["simulation"], "chunks": chunks}
         settings = {**self._section("instrument"), "simulation": simulation, "component": component, "sky": sky}
+        if component == "eor":
+            settings["cosmology"] = self._sections["power"]["cosmology"]
         count = min(chunks, self.experiment.instrument.channels.count)
         pieces = {
             f"chunk{index:03d}": Task(
@@ -191,7 +193,9 @@ class Graph:
         """Return the calibration of one noise realization of a variant."""
         data = self.data(variant, parity)
         settings = self._section("calibration")
-        count = min(self.experiment.calibration.chunks, self.experiment.instrument.times.count)
+        calibration = self.experiment.calibration
+        solves = -(-self.experiment.instrument.times.count // calibration.integrations_per_solve)
+        count = min(calibration.chunks, solves)
         inputs = {"data": data}
         if self.foregrounds is not None:
             inputs["sky_model"] = self.foregrounds

@@ -71,6 +71,40 @@ def test_a_plan_computes_and_writes_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
+def products_by_stage(plan: str) -> dict[str, str]:
+    rows = [line.split("│") for line in plan.splitlines() if "│" in line]
+    return {row[1].strip(): row[2].strip() for row in rows}
+
+
+def test_a_plan_of_a_sweep_counts_what_its_points_share_once(tmp_path):
+    sweep = {"calibration.basis.buffer": ["50 ns", "100 ns", "200 ns"]}
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "sweep": sweep}))
+    result = calstudy("plan", "tiny.yaml", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    counts = products_by_stage(result.stdout)
+    assert (counts["simulate"], counts["transfer"], counts["sweep"]) == ("2", "3", "1")
+
+
+def test_a_plan_of_a_collection_counts_what_its_members_share_once(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    members = ["tiny.yaml", {"file": "tiny.yaml", "name": "louder", "overrides": {"corruption.noise.factor": 5}}]
+    (tmp_path / "both.yaml").write_text(yaml.safe_dump({"name": "both", "experiments": members}))
+    result = calstudy("plan", "both.yaml", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    counts = products_by_stage(result.stdout)
+    assert (counts["simulate"], counts["gains"], counts["claims"]) == ("2", "1", "2")
+    assert counts["combined-claims"] == "1"
+    assert result.stdout.count("run folder: ") == 3
+
+
+def test_claims_of_what_is_no_run_are_refused(tmp_path):
+    assert "not the folder of a finished run" in refused(calstudy("claims", ".", cwd=tmp_path))
+
+
+def test_a_report_of_what_is_no_run_is_refused(tmp_path):
+    assert "not the folder of a finished run" in refused(calstudy("report", ".", cwd=tmp_path))
+
+
 def test_the_field_reference_in_the_docs_is_current():
     path = Path(__file__).parents[1] / "docs" / "experiments.md"
     assert path.read_text() == field_reference(), "run: python -m calstudy fields > docs/experiments.md"

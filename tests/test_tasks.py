@@ -20,18 +20,20 @@ def changed_stages(path: str, value: object) -> set[str]:
     return {stage for (stage, label), key in after.items() if before.get((stage, label)) != key}
 
 
-DOWNSTREAM = {"levels", "corrupt", "calibrate-chunk", "calibrate", "average", "power", "spectra", "figure"}
+TRANSFER = {"transfer", "transfer-figure"}
+AVERAGED = {"power", "spectra", "figure", "claims"} | TRANSFER
+DOWNSTREAM = {"levels", "corrupt", "calibrate-chunk", "calibrate", "average", "difference", "agreement"} | AVERAGED
 
 
 @pytest.mark.parametrize(
     ("path", "value", "stages"),
     [
-        ("name", "other", set()),
+        ("name", "other", {"claims"}),
         ("description", "words", set()),
         ("outputs.store", "elsewhere", set()),
-        ("power.wedge_buffer", "200 ns", {"spectra", "figure"}),
-        ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure"}),
-        ("power.taper", "hann", {"power", "spectra", "figure"}),
+        ("power.wedge_buffer", "200 ns", {"spectra", "figure", "agreement", "claims"} | TRANSFER),
+        ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure", "claims"} | TRANSFER),
+        ("power.taper", "hann", AVERAGED),
         ("calibration.basis.buffer", "80 ns", DOWNSTREAM - {"levels", "corrupt"}),
         ("corruption.gains.seed", 99, {"gains"} | DOWNSTREAM - {"levels"}),
         ("corruption.noise.seeds", [8, 9], DOWNSTREAM - {"levels"}),

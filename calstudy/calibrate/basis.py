@@ -18,6 +18,8 @@ from calstudy.calibrate.settings import BasisSettings
 
 # Sequences asked for beyond the Shannon number 2NW; concentrations fall to 1e-14 well within these.
 EXTRA_SEQUENCES = 40
+# How far channels may be off their grid, in units of its spacing.
+GRID_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,15 +97,55 @@ def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: f
     return basis
 
 
-def channel_width(frequencies: np.ndarray) -> float:
-    """Return the spacing of evenly spaced channels in Hz; ValueError if they are not evenly spaced or just one."""
-    spacings = np.diff(frequencies)
-    if spacings.size == 0 or not np.allclose(spacings, spacings[0], rtol=1e-3, atol=0):
-        raise ValueError(
-            "frequencies: the DPSS foreground basis needs at least two evenly spaced channels; "
-            "fill gaps with flagged channels"
-        )
-    return float(abs(spacings.mean()))
+@dataclass(frozen=True, eq=False)
+class ChannelGrid:
+    """The even grid that channels lie on.
+
+    Attributes
+    ----------
+    width
+        Spacing of the grid in Hz.
+    n_channels
+        Length of the grid, gaps included.
+    positions
+        Where each channel is on it, shape (Nfreqs,).
+    """
+
+    width: float
+    n_channels: int
+    positions: np.ndarray
+
+
+def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
+    """Return the grid of channel centres (Nfreqs,) in Hz, ascending or descending, with or without gaps.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two channels, or they lie on no even grid.
+    """
+    spacings = np.abs(np.diff(frequencies))
+    refusal = ValueError("frequencies: the DPSS foreground basis needs at least two channels on an even grid")
+    if spacings.size == 0 or spacings.min() == 0:
+        raise refusal
+    span = np.abs(frequencies - frequencies[0])
+    # The narrowest spacing has the rounding of stored frequencies; the whole band gives a better one.
+    width = span[-1] / max(round(span[-1] / spacings.min()), 1)
+    positions = span / width
+    if np.abs(positions - np.round(positions)).max() > GRID_TOLERANCE:
+        raise refusal
+    return ChannelGrid(float(width), round(positions[-1]) + 1, np.round(positions).astype(int))
+
+
+def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -> np.ndarray:
+    """Return an orthonormal basis of sequences on the grid, (n_channels, Nvec), seen at the channels that exist.
+
+    Combinations of which the existing channels hold less than `eigenvalue_cutoff` are left out.
+    """
+    if len(grid.positions) == grid.n_channels:
+        return vectors
+    left, singular, _ = np.linalg.svd(vectors[grid.positions], full_matrices=False)
+    return np.ascontiguousarray(left[:, singular**2 > eigenvalue_cutoff])
 
 
 def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings) -> ForegroundBasis:
@@ -114,18 +156,19 @@ def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSett
     lengths
         Baseline length of each model in m, shape (Nmodels,); zero for autocorrelations.
     frequencies
-        Channel centres in Hz, evenly spaced, shape (Nfreqs,).
+        Channel centres in Hz on an even grid, gaps allowed, shape (Nfreqs,).
     settings
         Delays that are modelled, and the eigenvalue cutoff.
 
     Raises
     ------
     ValueError
-        If channels are not evenly spaced, a half-width is zero, or a basis would leave no channel's worth of freedom
+        If channels are on no even grid, a half-width is zero, or a basis would leave no channel's worth of freedom
         to the data.
     """
     n_frequencies = len(frequencies)
-    width = channel_width(np.asarray(frequencies, float))
+    grid = channel_grid(np.asarray(frequencies, float))
+    width = grid.width
     half_widths = delay_half_widths(lengths, settings)
     buckets = []
     for half_width in np.unique(half_widths):
@@ -134,7 +177,8 @@ def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSett
         product = half_width * width
         vectors = None
         if product < 0.5:
-            vectors = dpss_vectors(n_frequencies, n_frequencies * product, settings.eigenvalue_cutoff)
+            sequences = dpss_vectors(grid.n_channels, grid.n_channels * product, settings.eigenvalue_cutoff)
+            vectors = restrict(sequences, grid, settings.eigenvalue_cutoff)
         if vectors is None or vectors.shape[1] >= n_frequencies:
             raise ValueError(
                 f"calibration.basis: a delay half-width of {half_width * 1e9:.0f} ns fills all {n_frequencies} "

@@ -3,96 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from pyuvdata import UVCal, UVData
 
-from calstudy.calibrate.basis import make_basis
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
-from calstudy.calibrate.products import make_uvcal, make_visibilities, parallel_hands
-from calstudy.calibrate.settings import CalibrationSettings, GaussNewtonSettings
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
+from calstudy.calibrate.products import make_gains, make_visibilities, require_parallel_hands
+from calstudy.calibrate.records import CalibrationResult, SolveRecord
+from calstudy.calibrate.settings import CalibrationSettings, GaussNewtonSettings, LbfgsSettings
 from calstudy.calibrate.solution import Solution
-from calstudy.calibrate.solvers.first_order import FirstOrder
+from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solver, WarmStart, solve_warm
-from calstudy.instrument.layouts import redundant_groups
-from calstudy.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
+from calstudy.calibrate.solvers.lbfgs import Lbfgs
+from calstudy.calibrate.starts import read_gains, starting_gains
+from calstudy.calibrate.structure import make_structure, repeat_structure
+from calstudy.calibrate.weights import make_weights
+from calstudy.errors import InputError
+from calstudy.resources import Usage
+from calstudy.visibilities import antenna_pairs, flag_cube, to_cube
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class SolveRecord:
-    """How the solve of one integration and polarization went; fields as in `calstudy.calibrate.solution.Solution`.
-
-    Attributes
-    ----------
-    integration
-        Index of the integration.
-    time
-        Its Julian date.
-    polarization
-        Polarization number of the AIPS convention, such as -5 for XX.
-    """
-
-    integration: int
-    time: float
-    polarization: int
-    status: str
-    message: str
-    n_steps: int
-    loss_history: np.ndarray
-    seconds: float
-
-    def summary(self) -> dict[str, Any]:
-        """Return everything but the full loss history, as plain JSON types."""
-        losses = self.loss_history
-        return {
-            "integration": self.integration,
-            "time": self.time,
-            "polarization": self.polarization,
-            "status": self.status,
-            "message": self.message,
-            "n_steps": self.n_steps,
-            "first_loss": float(losses[0]) if losses.size else None,
-            "last_loss": float(losses[-1]) if losses.size else None,
-            "seconds": self.seconds,
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationResult:
-    """What `calibrate` returns.
-
-    Attributes
-    ----------
-    gains
-        Gains g of each antenna, channel and integration, gain convention ``divide``: V = g_a g_b* m. Flagged where
-        an antenna has no data in a channel, and where a solve was skipped or failed; unity there.
-    model
-        The intrinsic foregrounds F, in the unit of the data.
-    residual
-        R = V / (g_a g_b*) - F, zero where flagged.
-    solutions
-        One record per solve, polarization by polarization, each in the order of time.
-    """
-
-    gains: UVCal
-    model: UVData
-    residual: UVData
-    solutions: tuple[SolveRecord, ...]
-
-    def summary(self) -> dict[str, Any]:
-        """Return the number of solves by status, total seconds, and every record, as plain JSON types."""
-        statuses = [record.status for record in self.solutions]
-        return {
-            "solves": len(statuses),
-            "by_status": {status: statuses.count(status) for status in sorted(set(statuses))},
-            "seconds": sum(record.seconds for record in self.solutions),
-            "records": [record.summary() for record in self.solutions],
-        }
 
 
 def make_solver(settings: CalibrationSettings) -> Solver:
@@ -100,41 +32,49 @@ def make_solver(settings: CalibrationSettings) -> Solver:
     solver = settings.solver
     if isinstance(solver, GaussNewtonSettings):
         return GaussNewton(solver.tolerance, solver.max_steps)
-    return FirstOrder(solver.name, solver.learning_rate, solver.tolerance, solver.max_steps, solver.precision)
+    if isinstance(solver, LbfgsSettings):
+        return Lbfgs(solver.tolerance, solver.max_steps, solver.memory)
+    optimizer = Optimizer(solver.name, solver.learning_rate, solver.schedule, solver.final_rate, solver.max_steps)
+    return FirstOrder(optimizer, solver.tolerance, solver.precision)
 
 
-def make_structure(data: UVData, settings: CalibrationSettings) -> tuple[FitStructure, np.ndarray]:
-    """Return the structure of the fit of `data`, and the antenna numbers that its antenna indices stand for.
+class Measured(NamedTuple):
+    """The arrays of a calibration.
 
-    A redundant group is modelled with the basis of its longest baseline.
-
-    Raises
-    ------
-    ValueError
-        If the basis does not fit into the channels (see `calstudy.calibrate.basis.make_basis`).
+    Attributes
+    ----------
+    visibilities, weights
+        Shape (Ntimes, Nbls, Nfreqs, Npols).
+    start
+        Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
+    sky
+        The sky model like the visibilities, or None.
     """
-    numbers, antennas = np.unique(antenna_pairs(data), return_inverse=True)
-    antennas = antennas.reshape(-1, 2)
-    vectors = baseline_vectors(data)
-    lengths = np.linalg.norm(vectors, axis=1)
-    frequencies = data.freq_array
-    if settings.calibrator == "calamity":
-        basis = make_basis(lengths, frequencies, settings.basis)
-        return FitStructure.per_baseline(antennas, len(numbers), basis), numbers
-    groups = redundant_groups(vectors, settings.redundancy_tolerance)
-    longest = np.zeros(groups.index.max() + 1)
-    np.maximum.at(longest, groups.index, lengths)
-    basis = make_basis(longest, frequencies, settings.basis)
-    return FitStructure(antennas, len(numbers), basis, groups.index, groups.conjugated), numbers
+
+    visibilities: np.ndarray
+    weights: np.ndarray
+    start: np.ndarray
+    sky: np.ndarray | None
+
+
+class Solve(NamedTuple):
+    """One solve: its integrations, first and one past the last, its polarization, and how it went."""
+
+    first: int
+    last: int
+    polarization: int
+    solution: Solution
+    peak_memory: int
 
 
 def calibrate(
     data: UVData,
     settings: CalibrationSettings,
     sky_model: UVData | None = None,
+    gains: UVCal | None = None,
     progress: Progress | None = None,
 ) -> CalibrationResult:
-    """Solve for gains and foregrounds, independently for every integration and polarization.
+    """Solve for gains and foregrounds, independently for every polarization and every integration or group of them.
 
     Parameters
     ----------
@@ -142,80 +82,118 @@ def calibrate(
         Visibilities, rectangular and time-major, with parallel-hand polarizations only; not changed. Flagged samples
         have no influence. Autocorrelations are left out, also of the results, unless `settings.autos` is set.
     settings
-        Calibrator, foreground basis, solver and prior.
+        Calibrator, foreground basis, weights, solver and prior.
     sky_model
         Visibilities whose weighted sum fixes the overall scale, with the baselines, times, channels and polarizations
-        of `data`; the data themselves if none is given, which makes gains of about unity.
+        of `data`; the data themselves if none is given, which makes gains of about unity. The sky-based calibrator
+        takes them for the truth.
+    gains
+        Where to start, before what `settings.initial_gains` says.
     progress
         Called after each solve with the number done and the total.
 
     Raises
     ------
+    InputError
+        If weights or gains do not fit the data, or the sky-based calibrator has no sky model.
     ValueError
         If the data are not rectangular, not finite where unflagged, of cross-hand polarizations, without any baseline
         to fit, or differ from the sky model in shape; or if the basis does not fit into the channels.
     """
-    data = _fitted_part(data, settings.autos)
-    sky = None if sky_model is None else _matching_cube(_fitted_part(sky_model, settings.autos), data)
+    fitted = _fitted_baselines(data, settings.autos)
+    weights = make_weights(data, fitted, settings.weights)
+    data = _keep(data, fitted)
+    sky = None
+    if sky_model is not None:
+        sky = _matching_cube(fitted_part(sky_model, settings.autos), data)
+    elif settings.calibrator == "sky-based":
+        raise InputError("calibration.calibrator: 'sky-based' needs a sky model, and there is none")
     _require_finite(data)
     structure, numbers = make_structure(data, settings)
-    visibilities, flags = to_cube(data), flag_cube(data)
-    n_times, _, n_frequencies, n_polarizations = visibilities.shape
-    gains = np.ones((len(numbers), n_frequencies, n_times, n_polarizations), complex)
-    gain_flags = np.ones(gains.shape, bool)
-    model = np.zeros_like(visibilities)
-    residual = np.zeros_like(visibilities)
-    residual_flags = flags.copy()
+    if gains is None and settings.initial_gains.kind == "file":
+        gains = read_gains(settings.initial_gains.path)
+    measured = Measured(to_cube(data), weights, starting_gains(data, numbers, gains), sky)
+    return _collect(data, numbers, structure, measured, _solve_all(structure, settings, measured, progress))
+
+
+def _collect(
+    data: UVData, numbers: np.ndarray, structure: FitStructure, measured: Measured, solves: Iterator[Solve]
+) -> CalibrationResult:
+    """Put the solutions together."""
+    visibilities, used = measured.visibilities, measured.weights > 0
+    gains, gain_flags = np.ones(measured.start.shape, complex), np.ones(measured.start.shape, bool)
+    model, residual, flags = np.zeros_like(visibilities), np.zeros_like(visibilities), ~used
     records = []
-    for t, p, solution in _solve_all(structure, settings, visibilities, flags, sky):
-        records.append(_record(data, t, p, solution))
-        if solution.usable:
-            used = ~flags[t, :, :, p]
-            gain_flags[:, :, t, p] = ~_has_data(structure, used)
+    for first, last, p, solution, peak_memory in solves:
+        records.append(_record(data, Solve(first, last, p, solution, peak_memory)))
+        if not solution.usable:
+            flags[first:last, :, :, p] = True
+            continue
+        fitted = solution.model.reshape(last - first, *visibilities.shape[1:3])
+        for t in range(first, last):
+            present = used[t, :, :, p]
+            gain_flags[:, :, t, p] = ~_has_data(structure, present)
             gains[:, :, t, p] = np.where(gain_flags[:, :, t, p], 1, solution.gains)
-            model[t, :, :, p] = solution.model
+            model[t, :, :, p] = fitted[t - first]
             products = gain_products(gains[:, :, t, p], structure.antennas)
-            calibrated = np.where(used, visibilities[t, :, :, p], 0) / products
-            residual[t, :, :, p] = np.where(used, calibrated - solution.model, 0)
-        else:
-            residual_flags[t, :, :, p] = True
-        if progress is not None:
-            progress(len(records), n_times * n_polarizations)
+            calibrated = np.where(present, visibilities[t, :, :, p], 0) / products
+            residual[t, :, :, p] = np.where(present, calibrated - fitted[t - first], 0)
     return CalibrationResult(
-        make_uvcal(data, numbers, gains, gain_flags),
-        make_visibilities(data, model, residual_flags),
-        make_visibilities(data, residual, residual_flags),
+        make_gains(data, numbers, gains, gain_flags),
+        make_visibilities(data, model, flags),
+        make_visibilities(data, residual, flags),
         tuple(records),
     )
 
 
 def _solve_all(
-    structure: FitStructure,
-    settings: CalibrationSettings,
-    visibilities: np.ndarray,
-    flags: np.ndarray,
-    sky: np.ndarray | None,
-) -> Iterator[tuple[int, int, Solution]]:
-    """Yield (integration, polarization, solution) for every solve; arrays are (Ntimes, Nbls, Nfreqs, Npols)."""
+    structure: FitStructure, settings: CalibrationSettings, measured: Measured, progress: Progress | None
+) -> Iterator[Solve]:
+    """Yield every solve, polarization by polarization, each in the order of time."""
     solver = make_solver(settings)
-    unity = np.ones((structure.n_antennas, structure.n_frequencies), complex)
-    for p in range(visibilities.shape[3]):
+    n_times, _, _, n_polarizations = measured.visibilities.shape
+    step = settings.integrations_per_solve
+    groups = [(first, min(first + step, n_times)) for first in range(0, n_times, step)]
+    for p in range(n_polarizations):
         warm: WarmStart | None = None
-        for t in range(visibilities.shape[0]):
-            weights = flag_weights(flags[t, :, :, p])
-            if not np.any(visibilities[t, :, :, p], where=weights > 0):
-                yield t, p, _skipped(structure, "every sample is flagged" if not weights.any() else "the data are zero")
-                continue
-            problem = CalibrationProblem(
-                structure,
-                visibilities[t, :, :, p],
-                weights,
-                unity,
-                None if sky is None else sky[t, :, :, p],
-                settings.prior,
-            )
-            solution, warm = solve_warm(problem, solver, warm if settings.solver.warm_start else None)
-            yield t, p, solution
+        for index, (first, last) in enumerate(groups):
+            shared = repeat_structure(structure, last - first)
+            with Usage() as usage:
+                problem = _problem(shared, settings, measured, slice(first, last), p)
+                if isinstance(problem, str):
+                    solution = _skipped(shared, problem)
+                else:
+                    solution, warm = solve_warm(problem, solver, warm if settings.solver.warm_start else None)
+            yield Solve(first, last, p, solution, usage.peak_memory)
+            if progress is not None:
+                progress(p * len(groups) + index + 1, len(groups) * n_polarizations)
+
+
+def _problem(
+    structure: FitStructure, settings: CalibrationSettings, measured: Measured, times: slice, p: int
+) -> CalibrationProblem | str:
+    """Return the problem of some integrations, or the reason why there is none."""
+
+    def rows(cube: np.ndarray) -> np.ndarray:
+        return cube[times, :, :, p].reshape(structure.n_baselines, structure.n_frequencies)
+
+    weights, visibilities = rows(measured.weights), rows(measured.visibilities)
+    flagged = float(np.mean(weights == 0))
+    if flagged == 1:
+        return "every sample is flagged or has no weight"
+    if flagged >= settings.skip_flagged:
+        return f"{100 * flagged:.0f} % of the samples are flagged, which skip_flagged excludes"
+    if not np.any(visibilities, where=weights > 0):
+        return "the data are zero"
+    return CalibrationProblem(
+        structure,
+        visibilities,
+        weights,
+        measured.start[:, :, times.start, p],
+        None if measured.sky is None else rows(measured.sky),
+        settings.prior,
+        settings.calibrator == "sky-based",
+    )
 
 
 def _skipped(structure: FitStructure, message: str) -> Solution:
@@ -224,16 +202,19 @@ def _skipped(structure: FitStructure, message: str) -> Solution:
     return Solution(gains, model, np.empty(0), "skipped", message, 0, 0.0)
 
 
-def _record(data: UVData, t: int, p: int, solution: Solution) -> SolveRecord:
+def _record(data: UVData, solve: Solve) -> SolveRecord:
+    solution = solve.solution
     return SolveRecord(
-        integration=t,
-        time=float(data.time_array[t * data.Nbls]),
-        polarization=int(data.polarization_array[p]),
+        integration=solve.first,
+        n_integrations=solve.last - solve.first,
+        time=float(data.time_array[solve.first * data.Nbls]),
+        polarization=int(data.polarization_array[solve.polarization]),
         status=solution.status,
         message=solution.message,
         n_steps=solution.n_steps,
         loss_history=solution.loss_history,
         seconds=solution.seconds,
+        peak_memory=solve.peak_memory,
     )
 
 
@@ -245,17 +226,27 @@ def _has_data(structure: FitStructure, used: np.ndarray) -> np.ndarray:
     return found
 
 
-def _fitted_part(data: UVData, autos: bool) -> UVData:
-    """Return the data without autocorrelations unless these are fitted, after checking the polarizations."""
-    parallel_hands(data)
-    is_auto = data.ant_1_array == data.ant_2_array
+def _fitted_baselines(data: UVData, autos: bool) -> np.ndarray:
+    """Return which baselines are calibrated, shape (Nbls,), after checking that there are some."""
+    require_parallel_hands(data)
+    to_cube(data)
+    is_auto = antenna_pairs(data)[:, 0] == antenna_pairs(data)[:, 1]
     if autos and not is_auto.any():
         raise ValueError("calibration.autos is true, but the data hold no autocorrelations")
-    if autos or not is_auto.any():
-        return data
-    if is_auto.all():
+    if not autos and is_auto.all():
         raise ValueError("the data hold no cross-correlations, so that there is nothing to calibrate")
-    return data.select(ant_str="cross", inplace=False)
+    return np.ones(is_auto.shape, bool) if autos else ~is_auto
+
+
+def fitted_part(data: UVData, autos: bool) -> UVData:
+    """Return the baselines that are calibrated; raises as `calibrate` does if there are none."""
+    return _keep(data, _fitted_baselines(data, autos))
+
+
+def _keep(data: UVData, fitted: np.ndarray) -> UVData:
+    if fitted.all():
+        return data
+    return data.select(blt_inds=np.flatnonzero(np.tile(fitted, data.Ntimes)), inplace=False)
 
 
 def _require_finite(data: UVData) -> None:

@@ -31,19 +31,23 @@ def fix_phase(gains: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return gains * np.where(modulus > 0, overlap.conj() / np.where(modulus > 0, modulus, 1), 1)
 
 
-def model_scale(model: np.ndarray, problem: CalibrationProblem) -> float:
-    """Return the real factor by which the model is multiplied, and the gains' products divided.
+def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> float:
+    """Return the real factor by which the model is multiplied, and the gains' products divided; one if it is frozen.
 
     For the ``sum`` prior this is the exact minimum of the prior along the scale, so that the likelihood keeps its own
-    minimum; for ``post-hoc`` the ratio of the moduli of the two sums (paper §Method); for ``none`` one.
+    minimum; for ``post-hoc`` the ratio of the moduli of the two sums (paper §Method); for ``gains`` what gives the
+    gains the geometric mean of the initial ones; for ``none`` one.
 
     Raises
     ------
     ValueError
         If the summed model vanishes, or opposes the summed sky model, so that no positive scale exists.
     """
-    if problem.prior == "none":
+    if problem.prior == "none" or problem.frozen:
         return 1.0
+    if problem.prior == "gains":
+        used = problem.antenna_weights > 0
+        return float(np.exp(2 * np.mean(np.log(np.abs(gains[used] / problem.initial_gains[used])))))
     total, target = complex(np.sum(problem.weights * model)), problem.prior_target
     if problem.prior == "sum":
         scale = (total.conjugate() * target).real / abs(total) ** 2 if total else 0.0
@@ -60,6 +64,13 @@ def model_scale(model: np.ndarray, problem: CalibrationProblem) -> float:
 def fix_degeneracies(
     gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains (Nants, Nfreqs) and model (Nbls, Nfreqs) with phase and scale fixed; g g* F is unchanged."""
-    scale = model_scale(model, problem)
-    return fix_phase(gains, problem.initial_gains) / np.sqrt(scale), model * scale
+    """Return gains (Nants, Nfreqs) and model (Nbls, Nfreqs) with phase and scale fixed; g g* F is unchanged.
+
+    Gains in a smooth basis keep to it, and have but one phase fixed.
+    """
+    scale = model_scale(gains, model, problem)
+    if problem.structure.gain_vectors is None:
+        turned = fix_phase(gains, problem.initial_gains)
+    else:
+        turned = fix_phase(gains.reshape(-1, 1), problem.initial_gains.reshape(-1, 1)).reshape(gains.shape)
+    return turned / np.sqrt(scale), model * scale

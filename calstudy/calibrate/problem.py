@@ -11,7 +11,7 @@ import numpy as np
 
 from calstudy.calibrate.basis import ForegroundBasis
 
-Prior = Literal["sum", "post-hoc", "none"]
+Prior = Literal["sum", "post-hoc", "gains", "none"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +33,9 @@ class FitStructure:
         (paper Eq. LOGLIKELIHOOD), the redundant group otherwise (Eq. LOGLIKELIHOODREDUNDANT).
     conjugated
         True where a baseline sees the conjugate of its model because it points the other way, shape (Nbls,).
+    gain_vectors
+        Orthonormal real functions of frequency whose span holds the gains, shape (Nfreqs, Ngain), float64; None for
+        gains without restriction.
     """
 
     antennas: np.ndarray
@@ -40,6 +43,7 @@ class FitStructure:
     basis: ForegroundBasis
     groups: np.ndarray
     conjugated: np.ndarray
+    gain_vectors: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n_baselines = len(self.antennas)
@@ -56,6 +60,8 @@ class FitStructure:
     def _content(self) -> str:
         digest = hashlib.sha256()
         arrays = [self.antennas, self.groups, self.conjugated.astype(np.int64)]
+        if self.gain_vectors is not None:
+            arrays.append(self.gain_vectors)
         for bucket in self.basis.buckets:
             arrays += [bucket.members, bucket.vectors]
         for array in arrays:
@@ -105,7 +111,11 @@ class CalibrationProblem:
         Visibilities m whose weighted sum fixes the overall scale, shape (Nbls, Nfreqs); None for the measured
         visibilities divided by the initial gains.
     prior
-        How the overall scale is fixed: in the loss and after it (``sum``), only after (``post-hoc``), or not.
+        How the overall scale is fixed: in the loss and after it (``sum``), only after (``post-hoc``, by the sums of the
+        models, or ``gains``, by the size of the gains), or not.
+    frozen
+        Whether the foregrounds are the sky model, so that only gains are fitted. The scale is then known, and the
+        prior not used.
 
     Raises
     ------
@@ -120,6 +130,7 @@ class CalibrationProblem:
     initial_gains: np.ndarray
     sky_model: np.ndarray | None = None
     prior: Prior = "sum"
+    frozen: bool = False
 
     def __post_init__(self) -> None:
         shape = (self.structure.n_baselines, self.structure.n_frequencies)
@@ -132,6 +143,8 @@ class CalibrationProblem:
                 raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {wanted}")
         if self.prior not in get_args(Prior):
             raise ValueError(f"prior: {self.prior!r} is not one of {', '.join(get_args(Prior))}")
+        if self.frozen and self.sky_model is None:
+            raise ValueError("sky_model: is needed where the foregrounds are frozen")
         if np.iscomplexobj(self.weights) or not np.isfinite(self.weights).all() or (self.weights < 0).any():
             raise ValueError("weights: must be real, finite and not negative")
         if not np.isfinite(self.initial_gains).all() or (self.initial_gains == 0).any():
@@ -146,6 +159,14 @@ class CalibrationProblem:
             object.__setattr__(self, "sky_model", np.where(used, self.sky_model, 0).astype(np.complex128))
             if not np.isfinite(self.sky_model).all():
                 raise ValueError("sky_model: not finite where the weight is not zero")
+
+    @property
+    def antenna_weights(self) -> np.ndarray:
+        """Summed weights of the baselines of each antenna, shape (Nants, Nfreqs)."""
+        total = np.zeros((self.structure.n_antennas, self.structure.n_frequencies))
+        for column in self.structure.antennas.T:
+            np.add.at(total, column, self.weights)
+        return total
 
     @property
     def prior_target(self) -> complex:

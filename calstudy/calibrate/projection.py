@@ -41,7 +41,7 @@ class Projection(NamedTuple):
         W of each model, shape (Nmodels, Q, Q), float32: foregrounds answer a weighted change y of the visibilities of
         their group with ``Q W Q^T y``, where Q is the common basis.
     roots
-        For each bucket the inverse Cholesky factors of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel
+        For each piece the inverse Cholesky factors of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel
         without the common basis is ``Q W Q^T = (L^-1 A^T)^T (L^-1 A^T)``.
     """
 
@@ -54,6 +54,18 @@ class Projection(NamedTuple):
     roots: tuple[tf.Tensor, ...]
 
 
+class _Piece(NamedTuple):
+    """What one piece of models adds to a `Projection`; `pull` is its share of the descent, by baseline."""
+
+    loss: tf.Tensor
+    model: tf.Tensor
+    pull: tf.Tensor
+    curvature: tf.Tensor
+    baseline_model: tf.Tensor
+    absorber: tf.Tensor
+    root: tf.Tensor
+
+
 class Projector:
     """Eliminates the foregrounds of one fit structure.
 
@@ -63,7 +75,9 @@ class Projector:
 
     def __init__(self, tensors: FitTensors) -> None:
         self.tensors = tensors
-        left, singular, _ = np.linalg.svd(np.concatenate(tensors.bases, axis=1), full_matrices=False)
+        self._one_by_one = tensors.n_baselines > tensors.piece
+        distinct = list({id(basis): basis for basis in tensors.bases}.values())
+        left, singular, _ = np.linalg.svd(np.concatenate(distinct, axis=1), full_matrices=False)
         common = left[:, singular > SPAN_CUTOFF * singular[0]]
         self.common = tf.constant(common, tf.float32)
         self.rank = common.shape[1]
@@ -82,37 +96,55 @@ class Projector:
         return tf.linalg.cholesky(normal + ridge * tf.eye(n_vectors, dtype=normal.dtype))
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
-        tensors = self.tensors
-        products = tensors.gain_products(gains)
-        curvature = weights * pairs.squared_modulus(products)
-        group_curvature = tensors.sum_over_group(curvature)
-        matched = tensors.sum_pairs_over_group(pairs.conjugate_multiply(products, weights * visibilities))
-        models, absorbers, roots = [], [], []
-        for (start, end), basis, overlap in zip(tensors.slices, self._bases, self._overlaps, strict=True):
-            factor = self._normal_cholesky(group_curvature[start:end], basis)
-            n_frequencies, n_vectors = basis.shape
-            projected = tf.reshape(tf.reshape(matched[:, start:end], [-1, n_frequencies]) @ basis, [2, -1, n_vectors])
-            coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
-            coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
-            models.append(tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, n_frequencies]))
-            identity = tf.eye(n_vectors, batch_shape=[end - start], dtype=tf.float64)
-            root = tf.cast(tf.linalg.triangular_solve(factor, identity), tf.float32)
-            spread = tf.reshape(tf.reshape(root, [-1, n_vectors]) @ overlap, [-1, n_vectors, self.rank])
-            absorbers.append(tf.matmul(spread, spread, transpose_a=True))
-            roots.append(root)
-        model = tf.concat(models, axis=1)
-        baseline_model = tensors.to_baselines(model)
-        residual = visibilities - pairs.multiply(products, baseline_model)
-        loss = tf.reduce_sum(weights * pairs.squared_modulus(residual))
-        pull = pairs.conjugate_multiply(baseline_model, weights * pairs.conjugate_multiply(products, residual))
+        pieces: list[_Piece] = []
+        for index in range(len(self.tensors.slices)):
+            # Without this, all pieces would be worked on at once, and their temporaries add up.
+            with tf.control_dependencies([pieces[-1].absorber] if self._one_by_one and pieces else []):
+                pieces.append(self._project_piece(index, gains, visibilities, weights))
+        loss, model, pull, curvature, baseline_model, absorber, roots = zip(*pieces, strict=True)
         return Projection(
-            loss,
+            tf.add_n(loss),
+            tf.concat(model, axis=1),
+            self.tensors.sum_over_antenna(tf.concat(pull, axis=1)),
+            tf.concat(curvature, axis=0),
+            tf.concat(baseline_model, axis=1),
+            tf.concat(absorber, axis=0),
+            roots,
+        )
+
+    def _project_piece(self, index: int, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> _Piece:
+        """Eliminate the foregrounds of one piece of models."""
+        tensors, basis, overlap = self.tensors, self._bases[index], self._overlaps[index]
+        (start, end), (first, last) = tensors.slices[index], tensors.baseline_slices[index]
+        visibilities, weights = visibilities[:, first:last], weights[first:last]
+        products = tensors.gain_products(gains, first, last)
+        curvature = weights * pairs.squared_modulus(products)
+        matched = pairs.conjugate_multiply(products, weights * visibilities)
+        owner = None if tensors.model_index is None else tensors.model_index[first:last] - start
+        if owner is None:
+            group_curvature = curvature
+        else:
+            group_curvature = tf.math.segment_sum(curvature, owner)
+            matched = tf.stack([tf.math.segment_sum(part, owner) for part in tf.unstack(matched)])
+        factor = self._normal_cholesky(group_curvature, basis)
+        n_frequencies, n_vectors = basis.shape
+        projected = tf.reshape(tf.reshape(matched, [-1, n_frequencies]) @ basis, [2, -1, n_vectors])
+        coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
+        coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
+        model = tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, n_frequencies])
+        identity = tf.eye(n_vectors, batch_shape=[end - start], dtype=tf.float64)
+        root = tf.cast(tf.linalg.triangular_solve(factor, identity), tf.float32)
+        spread = tf.reshape(tf.reshape(root, [-1, n_vectors]) @ overlap, [-1, n_vectors, self.rank])
+        baseline_model = model if owner is None else tf.gather(model, owner, axis=1)
+        residual = visibilities - pairs.multiply(products, baseline_model)
+        return _Piece(
+            tf.reduce_sum(weights * pairs.squared_modulus(residual)),
             model,
-            tensors.sum_over_antenna(pull),
+            pairs.conjugate_multiply(baseline_model, weights * pairs.conjugate_multiply(products, residual)),
             tf.cast(curvature, tf.float32),
             tf.cast(baseline_model, tf.float32),
-            tf.concat(absorbers, axis=0),
-            tuple(roots),
+            tf.matmul(spread, spread, transpose_a=True),
+            root,
         )
 
     def absorb(self, values: tf.Tensor, absorber: tf.Tensor) -> tf.Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -33,7 +34,7 @@ class GaussNewtonSettings(Section):
     tolerance: float = Field(
         1e-3, gt=0, lt=1, description="Stop when the predicted relative decrease of the loss is smaller."
     )
-    max_steps: int = Field(30, ge=1)
+    max_steps: int = Field(100, ge=1)
     warm_start: bool = Field(True, description="Start each integration from the solution of the one before.")
 
 
@@ -42,32 +43,111 @@ class FirstOrderSettings(Section):
 
     name: Literal["adamax", "adam", "sgd"]
     learning_rate: float = Field(0.01, gt=0)
+    schedule: Literal["constant", "cosine", "exponential"] = Field(
+        "constant", description="How the learning rate falls from the first step to the last of max_steps."
+    )
+    final_rate: float = Field(
+        0.01, gt=0, le=1, description="Learning rate at the last step over that at the first, unless constant."
+    )
     tolerance: float = Field(1e-14, ge=0, description="Stop when the loss changes by less than this between checks.")
     max_steps: int = Field(10_000, ge=1)
     precision: Literal["single", "double"] = "single"
     warm_start: bool = False
 
 
+class LbfgsSettings(Section):
+    """L-BFGS on the gains, with the foregrounds eliminated exactly."""
+
+    name: Literal["lbfgs"]
+    tolerance: float = Field(
+        1e-3, gt=0, lt=1, description="Stop when ten steps together lower the loss by less than this of itself."
+    )
+    max_steps: int = Field(2000, ge=1)
+    memory: int = Field(20, ge=1, description="Pairs of steps and gradients that stand for the curvature.")
+    warm_start: bool = True
+
+
 Solver = Annotated[
-    GaussNewtonSettings | FirstOrderSettings, Field(discriminator="name"), choice("name", "gauss-newton")
+    GaussNewtonSettings | LbfgsSettings | FirstOrderSettings,
+    Field(discriminator="name"),
+    choice("name", "gauss-newton"),
 ]
+
+
+class FlagWeights(Section):
+    """Every unflagged sample counts alike, 1 / (Nbls Nfreqs): the paper's weights."""
+
+    kind: Literal["flags"] = "flags"
+
+
+class SampleWeights(Section):
+    """Unflagged samples count as often as they were measured: the nsamples of the data."""
+
+    kind: Literal["nsamples"]
+
+
+class AutoWeights(Section):
+    """Inverse variance by the radiometer equation: nsamples / (V_aa V_bb), from the autocorrelations of the data."""
+
+    kind: Literal["autos"]
+
+
+class FileWeights(Section):
+    """Weights from a UVFlag file in metric mode, by baseline, with the samples of the data; zero is a flag."""
+
+    kind: Literal["file"]
+    path: Path = Field(strict=False)
+
+
+Weights = Annotated[
+    FlagWeights | SampleWeights | AutoWeights | FileWeights, Field(discriminator="kind"), choice("kind", "flags")
+]
+
+
+class UnityStart(Section):
+    """Start from perfect gains."""
+
+    kind: Literal["unity"] = "unity"
+
+
+class FileStart(Section):
+    """Start from gains in a CalH5 or calfits file, at the integration closest in time."""
+
+    kind: Literal["file"]
+    path: Path = Field(strict=False)
+
+
+InitialGains = Annotated[UnityStart | FileStart, Field(discriminator="kind"), choice("kind", "unity")]
 
 
 class CalibrationSettings(Section):
     """The calibrator, its foreground basis and its solver."""
 
-    calibrator: Literal["calamity", "calamity-redundant"] = Field(
+    calibrator: Literal["calamity", "calamity-redundant", "sky-based"] = Field(
         "calamity",
-        description="One foreground model per baseline (LOGLIKELIHOOD) or group (LOGLIKELIHOODREDUNDANT).",
+        description="One foreground model per baseline (LOGLIKELIHOOD) or group (LOGLIKELIHOODREDUNDANT), or none: "
+        "gains alone, with the sky model frozen.",
     )
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are one group.")
     basis: BasisSettings = BasisSettings()
     solver: Solver = GaussNewtonSettings()
-    prior: Literal["sum", "post-hoc", "none"] = Field(
+    prior: Literal["sum", "post-hoc", "gains", "none"] = Field(
         "sum",
-        description="How the overall scale is fixed: by the paper's prior on the summed model, afterwards, or not.",
+        description="How the overall scale is fixed: by the paper's prior on the summed model, by the summed model "
+        "afterwards, by the geometric mean of the gains afterwards, or not.",
     )
     autos: bool = Field(False, description="Include autocorrelations in the fit.")
+    weights: Weights = FlagWeights()
+    initial_gains: InitialGains = UnityStart()
+    gain_delay: Delay | None = Field(
+        None, gt=0, description="Restrict gains to a DPSS basis up to this delay; null: any gain in any channel."
+    )
+    integrations_per_solve: int = Field(
+        1, ge=1, description="Consecutive integrations that are solved together and share their gains."
+    )
+    skip_flagged: float = Field(
+        1.0, gt=0, le=1, description="Skip a solve when at least this fraction of its samples is flagged."
+    )
     chunks: int = Field(
         4, ge=1, description="Pieces of consecutive integrations; the unit of resuming and of work sharing."
     )

@@ -16,6 +16,10 @@ from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 
 
+# Models of one bucket that are worked on at a time: bounds the temporaries, which have the size of their bases.
+PIECE = 512
+
+
 class Measurements(NamedTuple):
     """The data of one problem, in the solvers' order and orientation.
 
@@ -46,14 +50,20 @@ class FitTensors:
     model_index
         Model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model.
     slices
-        Range of models of each bucket.
+        Range of models of each piece: a bucket, or a part of a large one.
+    baseline_slices
+        Range of baselines that have the models of each piece.
+    piece
+        Models that are worked on at a time, at most.
     bases
-        Basis of each bucket, shape (Nfreqs, Nvec), float64 arrays.
+        Basis of each piece, shape (Nfreqs, Nvec), float64 arrays.
+    gain_vectors
+        As in the structure.
     orientation
         1, or -1 for baselines that were turned around, shape (Nbls, 1); None if there are none.
     """
 
-    def __init__(self, structure: FitStructure) -> None:
+    def __init__(self, structure: FitStructure, piece: int = PIECE) -> None:
         buckets = structure.basis.buckets
         model_order = np.concatenate([bucket.members for bucket in buckets])
         model_position = np.empty(structure.basis.n_models, int)
@@ -71,9 +81,17 @@ class FitTensors:
         self.second = tf.constant(pairs_sorted[:, 1], tf.int32)
         self.shared = self.n_models < self.n_baselines
         self.model_index = tf.constant(position[self._order], tf.int32) if self.shared else None
-        ends = np.cumsum([bucket.members.size for bucket in buckets])
-        self.slices = [(int(end - bucket.members.size), int(end)) for bucket, end in zip(buckets, ends, strict=True)]
-        self.bases = [bucket.vectors for bucket in buckets]
+        self.piece = piece
+        self.slices, self.bases, first = [], [], 0
+        for bucket in buckets:
+            last = first + bucket.members.size
+            for start in range(first, last, piece):
+                self.slices.append((start, min(start + piece, last)))
+                self.bases.append(bucket.vectors)
+            first = last
+        edges = np.searchsorted(position[self._order], self.slices)
+        self.baseline_slices = [(int(start), int(end)) for start, end in edges]
+        self.gain_vectors = structure.gain_vectors
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
 
     def load(self, problem: CalibrationProblem, dtype: tf.DType) -> Measurements:
@@ -82,6 +100,11 @@ class FitTensors:
         visibilities = np.where(self._conjugated[:, None], visibilities.conj(), visibilities)
         scale = float(np.sqrt(np.sum(weights * np.abs(visibilities) ** 2) / np.sum(weights)))
         return Measurements(pairs.to_pair(visibilities / scale, dtype), tf.constant(weights, dtype), scale)
+
+    def load_model(self, model: np.ndarray, scale: float, dtype: tf.DType) -> tf.Tensor:
+        """Return a model on the problem's baselines, (Nbls, Nfreqs), divided by `scale`; the inverse of `unload`."""
+        values = model[self._order] / scale
+        return pairs.to_pair(np.where(self._conjugated[:, None], values.conj(), values), dtype)
 
     def unload(self, model: tf.Tensor, scale: float) -> np.ndarray:
         """Return a model (2, Nmodels, Nfreqs) on the problem's baselines, shape (Nbls, Nfreqs), times `scale`."""
@@ -104,9 +127,10 @@ class FitTensors:
             return values
         return tf.stack([self.sum_over_group(values[0]), self.sum_over_group(values[1])])
 
-    def gain_products(self, gains: tf.Tensor) -> tf.Tensor:
-        """Return g_a g_b*, shape (2, Nbls, Nfreqs), from gains (2, Nants, Nfreqs)."""
-        first, second = tf.gather(gains, self.first, axis=1), tf.gather(gains, self.second, axis=1)
+    def gain_products(self, gains: tf.Tensor, start: int = 0, end: int | None = None) -> tf.Tensor:
+        """Return g_a g_b* of baselines start ... end, shape (2, Nbls, Nfreqs), from gains (2, Nants, Nfreqs)."""
+        first = tf.gather(gains, self.first[start:end], axis=1)
+        second = tf.gather(gains, self.second[start:end], axis=1)
         return pairs.conjugate_multiply(second, first)
 
     def relative_change(self, eta: tf.Tensor) -> tf.Tensor:

@@ -43,7 +43,8 @@ def uncalibrated_systematics_suppressed(minimal: Study, redundant: Study) -> Fin
 
 @REDUNDANT.states(
     SUPPRESSED,
-    "the same for rms P^R without EoR: what calibration leaves behind, noise included",
+    "rms P^R without EoR (what calibration leaves behind, and noise) of the minimally redundant array over that of the "
+    "redundant one, outside the wedge, k >= 0.2",
     Above(10),
     "one order of magnitude at least",
 )
@@ -94,7 +95,7 @@ def more_loss_at_small_k(minimal: Study, redundant: Study) -> Finding:
 
 @REDUNDANT.states(
     "fewer independent realizations are averaged down in each gain solution, which increases signal loss on all scales",
-    "the same at k >= 0.3",
+    "P^R/P^S of the minimally redundant array minus that of the redundant one, outside the wedge, k >= 0.3",
     Above(0, 2),
     "higher beyond the errors",
 )

@@ -47,7 +47,7 @@ class Study:
 
     @classmethod
     def of(cls, experiment: Mapping[str, Any], folders: Sequence[Path]) -> Study:
-        """Return the study of an experiment, given as in its file: `name` and the sections of `calstudy.claims.facts`."""
+        """Return the study of an experiment, as in its file: `name` and the sections of `calstudy.claims.facts`."""
         return cls(
             name=experiment["name"],
             calibration=CalibrationSettings.model_validate(experiment["calibration"]),

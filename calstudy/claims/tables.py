@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from calstudy.claims.statement import Claim
@@ -80,25 +82,27 @@ def to_markdown(claims: Sequence[Claim], title: str, notes: Sequence[str] = ()) 
     return "\n".join(lines)
 
 
-def to_table(claims: Sequence[Claim], title: str) -> Table:
-    """Return claims as a table for the terminal."""
-    table = Table(title=f"{title}: {tally(claims)}", title_justify="left", show_lines=True)
-    for heading in ("claim", "measured", "must be", ""):
-        table.add_column(heading, overflow="fold")
+def show_table(claims: Sequence[Claim], title: str, console: Console) -> None:
+    """Print the evaluated claims as a table, and after it those that could not be, by what they lack."""
+    table = Table(title=f"{title}: {tally(claims)}", title_justify="left", show_lines=True, expand=True)
+    for heading, ratio in (("claim", 5), ("measured", 4), ("must be", 2)):
+        table.add_column(heading, ratio=ratio)
+    table.add_column("", no_wrap=True)
+    lacking: dict[str, list[str]] = {}
     for claim in claims:
-        what = f"[bold]{claim.name}[/bold]\n{_plain(claim.sentence)}"
-        value = f"{_plain(measured(claim))}\n[dim]{_plain(claim.quantity)}[/dim]"
+        if claim.verdict == "not evaluated":
+            lacking.setdefault(claim.reason, []).append(claim.name)
+            continue
+        what = f"[bold]{claim.name}[/bold]\n{escape(claim.sentence)}"
+        value = f"{escape(measured(claim))}\n[dim]{escape(claim.quantity)}[/dim]"
         colour = COLOURS[claim.verdict]
-        table.add_row(what, value, _plain(claim.threshold), f"[{colour}]{claim.verdict}[/{colour}]")
-    return table
+        table.add_row(what, value, escape(claim.threshold), f"[{colour}]{claim.verdict}[/{colour}]")
+    console.print(table)
+    for reason, names in lacking.items():
+        console.print(f"not evaluated: {', '.join(names)}: {reason}", markup=False)
 
 
 def write_claims(claims: Sequence[Claim], folder: Path, title: str, notes: Sequence[str] = ()) -> None:
     """Write claims.json and claims.md into a folder."""
     (folder / CLAIMS_JSON).write_text(to_json(claims) + "\n", encoding="utf-8")
     (folder / CLAIMS_MARKDOWN).write_text(to_markdown(claims, title, notes), encoding="utf-8")
-
-
-def _plain(text: str) -> str:
-    """Keep rich from reading brackets as markup."""
-    return text.replace("[", "\\[")

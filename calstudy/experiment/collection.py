@@ -165,7 +165,10 @@ def _load_member(member: Member, path: Path, scale: str | None, overrides: Seque
         data["name"] = member.name
     for text in overrides:
         data = override(data, *parse_override(text))
-    return validate(data, path.resolve().parent)
+    experiment = validate(data, path.resolve().parent)
+    if experiment.sweep:
+        raise InputError("has a sweep; run it by itself, or leave the sweep out with overrides: {sweep: []}")
+    return experiment
 
 
 def _roles(file: CollectionFile, members: Mapping[str, Experiment]) -> dict[Role, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from calstudy.calibrate.settings import CalibrationSettings
 from calstudy.corrupt.settings import CorruptionSettings
@@ -79,7 +79,7 @@ class Inspection(Section):
     """What the figures of single gains and baselines show; antennas are counted from 0 in the order of the layout."""
 
     antennas: Pair = Field((0, 1), description="Two antennas; the model and data figures show their baseline.")
-    integration: int = Field(0, ge=0)
+    integration: int = Field(0, ge=0, description="Counted from 0.")
     realization: Literal["even", "odd"] = "even"
     baselines: Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)] | None = Field(
         None, description="Baselines of the `baselines` figure, such as [[0, 1], [0, 5]]; null: four, short to long."
@@ -115,6 +115,14 @@ class Outputs(Section):
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
 
 
+SweepValues = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
+SweepBlock = Annotated[dict[str, SweepValues], Field(min_length=1)]
+
+
+def _as_list(blocks: Any) -> Any:
+    return [blocks] if isinstance(blocks, dict) else blocks
+
+
 class Experiment(Section):
     """One study: an instrument, a sky, what corrupts the data, the calibration under test, and what is measured."""
 
@@ -130,6 +138,11 @@ class Experiment(Section):
         default_factory=_paper_variants, min_length=1, description="By default the six of the paper's figures."
     )
     outputs: Outputs = Outputs()
+    sweep: Annotated[tuple[SweepBlock, ...], Field(strict=False), BeforeValidator(_as_list)] = Field(
+        (),
+        description="Fields to vary (dotted path: list of values; several fields: all combinations), or a list of such "
+        "blocks; a run makes every point and compares their signal loss.",
+    )
     scales: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
     )

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from calstudy.experiment.collection import CollectionFile, Member
 from calstudy.experiment.model import Experiment
 
 
@@ -36,7 +37,8 @@ def _kind(info: FieldInfo) -> str:
         if get_origin(item) is Literal:
             words.append(" \\| ".join(f"`{value}`" for value in get_args(item)))
         elif get_origin(item) is tuple:
-            words.append("list")
+            choices = " \\| ".join(f"`{value}`" for value in get_args(get_args(item)[0]) if isinstance(value, str))
+            words.append(f"list of {choices}" if choices else "list")
         elif get_origin(item) is dict:
             words.append("block")
         else:
@@ -100,5 +102,14 @@ def field_reference() -> str:
         "## `variants`: each",
         "",
         *_section(Experiment.model_fields["variants"].annotation.__args__[1], "variants"),
+        "# Collection files",
+        "",
+        "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run",
+        "folder, and what compares them in a folder of the collection; `--scale` and `--set` go to every member.",
+        "",
+        *_section(CollectionFile, ""),
+        "## `experiments`: each",
+        "",
+        *_section(Member, "experiments"),
     ]
     return "\n".join(lines).rstrip() + "\n"

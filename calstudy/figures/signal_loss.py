@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""
 TRANSFER = r"$T = P^{R}/P^{S}$"
-COHERENT = r"outside, coherent with $S$"
+RETAINED = "outside, free of the flux scale"
 MAP_COLOURS = "cividis"
 EMPTY = "0.8"
 
@@ -83,10 +83,10 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
         (loss.inside, f"inside {where}", "s", style.ORANGE),
     ):
         draw_transfer(axes, part, label, marker, colour)
-    axes.plot(loss.outside.k, loss.outside.coherence, color=style.BLUE, linewidth=0.7, zorder=1, label=COHERENT)
+    axes.plot(loss.outside.k, loss.outside.retained, color=style.BLUE, linewidth=0.7, zorder=1, label=RETAINED)
     axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, _last_k(loss)), ylim=_limits(loss))
     handles, labels = axes.get_legend_handles_labels()
-    order = sorted(range(len(labels)), key=lambda index: labels[index] == COHERENT)
+    order = sorted(range(len(labels)), key=lambda index: labels[index] == RETAINED)
     axes.legend([handles[index] for index in order], [labels[index] for index in order], loc="lower right")
 
 

@@ -116,12 +116,15 @@ class GriddedBeam:
     fit_error
         Largest difference of a Jones component from the tabulated one within the band, relative to the zenith
         (`TabulatedBeam`).
+    tabulated_frequencies
+        Frequencies of the table in and next to the band, in Hz, shape (Ntab,).
     """
 
     def __init__(self, table: TabulatedBeam, name: str, stand_in: str | None) -> None:
         self.name = name
         self.stand_in = stand_in
         self.fit_error = table.fit_error
+        self.tabulated_frequencies = table.tabulated_frequencies
         self._table = table
 
     def at(self, frequencies: np.ndarray) -> UVBeam:

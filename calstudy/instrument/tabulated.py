@@ -99,9 +99,10 @@ class TabulatedBeam:
     ----------
     zenith_angles
         In radians, shape (Nza,).
+    tabulated_frequencies
+        Those of the band, and those next to its ends, in Hz, shape (Ntab,).
     fit_error
-        Largest |ΔJ| against the table, relative to the zenith, over directions and the tabulated frequencies of the
-        band, those next to its ends included.
+        Largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`.
     """
 
     def __init__(self, table: UVBeam, band: tuple[float, float], interpolation: str) -> None:
@@ -127,8 +128,9 @@ class TabulatedBeam:
         else:
             self._evaluate = interp1d(tabulated, values, kind=interpolation, axis=0, assume_sorted=True)
         first, last = np.searchsorted(tabulated, band[0], side="right") - 1, np.searchsorted(tabulated, band[1])
+        self.tabulated_frequencies = tabulated[first : last + 1]
         reference = _zenith_normalized(np.moveaxis(values[first : last + 1], 0, 2))
-        self.fit_error = float(np.abs(self.jones(tabulated[first : last + 1]) - reference).max())
+        self.fit_error = float(np.abs(self.jones(self.tabulated_frequencies) - reference).max())
 
     def jones(self, frequencies: np.ndarray) -> np.ndarray:
         """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz."""

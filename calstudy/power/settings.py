@@ -37,4 +37,6 @@ class PowerSettings(Section):
     wedge_buffer: Delay = Field(100e-9, ge=0, description="Modes with |delay| <= |b|/c + buffer count as wedge.")
     length_bin: Length = Field(4.0, gt=0, description="Width of the cylindrical (wedge) bins in baseline length.")
     bins: KBins = KBins()
-    cosmology: Literal["Planck15", "Planck18", "WMAP9"] = "Planck15"
+    cosmology: Literal["Planck15", "Planck18", "WMAP9"] = Field(
+        "Planck15", description="Of the whole study: also turns the EoR's P(k) into brightness."
+    )

@@ -37,6 +37,8 @@ TRANSFER_COLUMNS = {
     "transfer error": lambda t: t.transfer_error,
     "coherence": lambda t: t.coherence,
     "coherence error": lambda t: t.coherence_error,
+    "retained": lambda t: t.retained,
+    "retained error": lambda t: t.retained_error,
     "baselines or groups": lambda t: t.n_samples,
 }
 

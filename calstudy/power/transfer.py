@@ -18,7 +18,17 @@ that what is left of the noise in D gives no bias.
 
 The *coherence* is the cross power with the signal, C(k) = Re <S* D> / P^S. If a calibration projects (D = M S with
 M = M* = M^2) and S is white, <D* D> = <S* M* M S> = <S* M S>: both are equal, and are the fraction of the mode outside
-of what the fit can absorb. T > C tells of signal that was moved from other modes; T < C^2 is impossible.
+of what the fit can absorb.
+
+A calibration also has a scale of its own: gains times sqrt(s) and a model divided by s fit as well, and whatever
+chooses s (the paper's prior on the summed model) errs by some percent. It multiplies the residual by 1/s, hence C by
+1/s and T by 1/s^2, and so is a part of P^R / P^S that is no loss. Their combination
+
+    retained = C^2 / T = <S* D>^2 / (<S* S> <D* D>),
+
+the squared coherence of residual and signal, is free of it: 1 if nothing but the scale was changed, and for a
+projection of white S the fraction that it leaves. (Between different baselines of a redundant group C^2 / T is free of
+the scale as well, but not such a fraction.)
 
 Numerator and denominator hold the same sky, so that most of the sample variance cancels. What remains is estimated
 from the scatter of independent samples within a bin, taking each baseline or redundant group as one sample (it is one
@@ -26,7 +36,7 @@ patch of the uv plane, whose delays share the taper): for sums x_i of P^D and y_
 
     T = sum x_i / sum y_i,   var T = n / (n - 1) sum (x_i - T y_i)^2 / (sum y_i)^2
 
-(the estimator of a ratio from clusters, Cochran 1977, section 6.3).
+(the estimator of a ratio from clusters, Cochran 1977, section 6.3), and likewise, to first order, for C^2 / T.
 """
 
 from __future__ import annotations
@@ -62,8 +72,10 @@ class TransferFunction:
         T = P^D / P^S and its standard deviation, (Nk,).
     coherence, coherence_error
         C = Re <S* D> / P^S and its standard deviation, (Nk,).
+    retained, retained_error
+        C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,).
     signal
-        Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,).
+        Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins.
     n_samples
         Baselines, or redundant groups, in each bin, (Nk,) int.
     """
@@ -74,6 +86,8 @@ class TransferFunction:
     transfer_error: np.ndarray = field(metadata={"unit": ""})
     coherence: np.ndarray = field(metadata={"unit": ""})
     coherence_error: np.ndarray = field(metadata={"unit": ""})
+    retained: np.ndarray = field(metadata={"unit": ""})
+    retained_error: np.ndarray = field(metadata={"unit": ""})
     signal: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     n_samples: np.ndarray = field(metadata={"unit": ""})
 
@@ -178,18 +192,19 @@ def spherical_transfer(injection: Injection, edges: Sequence[float], buffer: flo
     bins = np.searchsorted(limits, np.hypot(signal.k_perp[:, None], signal.k_parallel), side="left") - 1
     bins[(bins >= limits.size - 1) | (outside_wedge(signal, buffer) == inside)] = -1
     samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
-    transfer, coherence = (
-        _ratio(numerator, signal, bins, samples, limits.size - 1) for numerator in (injection.response, injection.cross)
-    )
+    sums = _Sums.of(injection, bins, samples, limits.size - 1)
+    transfer, coherence, retained = sums.ratio(sums.response), sums.ratio(sums.cross), sums.retained()
     return TransferFunction(
         k=(limits[1:] + limits[:-1]) / 2,
         bin_edges=limits,
-        transfer=transfer.value,
-        transfer_error=transfer.error,
-        coherence=coherence.value,
-        coherence_error=coherence.error,
-        signal=transfer.total,
-        n_samples=transfer.n_samples,
+        transfer=transfer[0],
+        transfer_error=transfer[1],
+        coherence=coherence[0],
+        coherence_error=coherence[1],
+        retained=retained[0],
+        retained_error=retained[1],
+        signal=sums.total(sums.signal),
+        n_samples=sums.n_samples,
     )
 
 
@@ -203,10 +218,8 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
     bins = row[:, None] * (column.max() + 1) + column
     samples = 2 * np.arange(row.size)[:, None] + (step < 0)
     shape = (lengths.size, column.max() + 1)
-    transfer, coherence = (
-        _ratio(numerator, signal, bins, samples, lengths.size * shape[1])
-        for numerator in (injection.response, injection.cross)
-    )
+    sums = _Sums.of(injection, bins, samples, lengths.size * shape[1])
+    transfer, coherence = sums.ratio(sums.response), sums.ratio(sums.cross)
     pairs = np.bincount(row, signal.n_pairs)
     length = np.bincount(row, signal.n_pairs * signal.length) / pairs
     return TransferMap(
@@ -215,40 +228,77 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
         k_perp=np.bincount(row, signal.n_pairs * signal.k_perp) / pairs,
         delay=spacing * np.arange(shape[1]),
         k_parallel=np.bincount(column, np.abs(signal.k_parallel)) / np.bincount(column),
-        transfer=transfer.value.reshape(shape),
-        transfer_error=transfer.error.reshape(shape),
-        coherence=coherence.value.reshape(shape),
-        coherence_error=coherence.error.reshape(shape),
+        transfer=transfer[0].reshape(shape),
+        transfer_error=transfer[1].reshape(shape),
+        coherence=coherence[0].reshape(shape),
+        coherence_error=coherence[1].reshape(shape),
         horizon_delay=length / constants.c.value,
     )
 
 
 @dataclass(frozen=True)
-class _Ratio:
-    value: np.ndarray
-    error: np.ndarray
-    total: np.ndarray
-    n_samples: np.ndarray
+class _Sums:
+    """Sums of powers over the modes of each sample in each bin, all of length Nsums.
 
-
-def _ratio(numerator: DelaySpectra, signal: DelaySpectra, bins: np.ndarray, samples: np.ndarray, n_bins: int) -> _Ratio:
-    """Return the ratio of sums in each bin, with the error that the scatter of the samples gives it.
-
-    `bins` (-1: left out) and `samples` number the modes, (Nu, Nd) each.
+    Attributes
+    ----------
+    owner
+        Bin of each sum.
+    n_samples
+        Number of samples in each bin, (n_bins,).
+    signal, response, cross
+        Sums of the real parts, each pair of baselines counting the same.
     """
-    used = bins >= 0
-    weights = np.broadcast_to(signal.n_pairs[:, None], bins.shape)[used]
-    labels = np.stack([bins[used], samples[used]])
-    (owner, _), index = np.unique(labels, axis=1, return_inverse=True)
-    x, y = (np.bincount(index, weights * part.power.real[used]) for part in (numerator, signal))
-    n_samples = np.bincount(owner, minlength=n_bins)
-    total = np.bincount(owner, y, minlength=n_bins)
-    value = np.divide(np.bincount(owner, x, n_bins), total, out=np.full(n_bins, np.nan), where=total != 0)
-    scatter = np.bincount(owner, (x - value[owner] * y) ** 2, minlength=n_bins)
-    variance = np.full(n_bins, np.nan)
-    known = (n_samples > 1) & (total != 0)
-    variance[known] = (n_samples / np.maximum(n_samples - 1, 1) * scatter)[known] / total[known] ** 2
-    return _Ratio(value, np.sqrt(variance), total, n_samples)
+
+    owner: np.ndarray
+    n_samples: np.ndarray
+    signal: np.ndarray
+    response: np.ndarray
+    cross: np.ndarray
+
+    @classmethod
+    def of(cls, injection: Injection, bins: np.ndarray, samples: np.ndarray, n_bins: int) -> _Sums:
+        """Add up; `bins` (-1: left out) and `samples` number the modes, (Nu, Nd) each."""
+        used = bins >= 0
+        weights = np.broadcast_to(injection.signal.n_pairs[:, None], bins.shape)[used]
+        (owner, _), index = np.unique(np.stack([bins[used], samples[used]]), axis=1, return_inverse=True)
+        signal, response, cross = (
+            np.bincount(index, weights * part.power.real[used])
+            for part in (injection.signal, injection.response, injection.cross)
+        )
+        return cls(owner, np.bincount(owner, minlength=n_bins), signal, response, cross)
+
+    def total(self, sums: np.ndarray) -> np.ndarray:
+        """Return the sum over the samples of each bin, (n_bins,); NaN for empty bins."""
+        return np.where(self.n_samples > 0, np.bincount(self.owner, sums, self.n_samples.size), np.nan)
+
+    def ratio(self, numerator: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ratio of a sum to that of the signal in each bin, and its standard deviation."""
+        total = self.total(self.signal)
+        value = self.total(numerator) / total
+        return value, self._scatter((numerator - value[self.owner] * self.signal) / total[self.owner])
+
+    def retained(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return C^2 / T in each bin, and its standard deviation."""
+        signal, response, cross = (self.total(part) for part in (self.signal, self.response, self.cross))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = cross**2 / (signal * response)
+            relative = (
+                2 * self.cross / cross[self.owner]
+                - self.signal / signal[self.owner]
+                - self.response / response[self.owner]
+            )
+            known = np.isfinite(value)
+            error = np.abs(value) * self._scatter(relative)
+        return np.where(known, value, np.nan), np.where(known, error, np.nan)
+
+    def _scatter(self, deviations: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of the sum over samples of deviations that add up to zero in each bin."""
+        squares = np.bincount(self.owner, deviations**2, self.n_samples.size)
+        factor = np.full(squares.size, np.nan)
+        known = self.n_samples > 1
+        factor[known] = self.n_samples[known] / (self.n_samples[known] - 1)
+        return np.sqrt(factor * squares)
 
 
 def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
@@ -268,8 +318,8 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
     if any(not np.array_equal(other.bin_edges, first.bin_edges) for other in transfers):
         raise ValueError("the transfer functions have different bins, expected the same")
     signal = np.stack([item.signal for item in transfers])
-    total = signal.sum(axis=0)
-    weights = np.divide(signal, total, out=np.full_like(signal, np.nan), where=total != 0)
+    total = _sum_present(signal)
+    weights = signal / total
 
     def mean(name: str) -> np.ndarray:
         return _sum_present(weights * np.stack([getattr(item, name) for item in transfers]))
@@ -283,6 +333,8 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
         transfer_error=error("transfer_error"),
         coherence=mean("coherence"),
         coherence_error=error("coherence_error"),
+        retained=mean("retained"),
+        retained_error=error("retained_error"),
         signal=total,
         n_samples=np.sum([item.n_samples for item in transfers], axis=0),
     )

@@ -89,11 +89,13 @@ class FastestEngine:
 def make_engine(settings: SimulationSettings) -> Engine:
     """Return the engine named in the settings; `auto` takes the fastest that handles each request."""
     from calstudy.simulate.dense import DenseEngine
+    from calstudy.simulate.matvis_engine import MatvisEngine
     from calstudy.simulate.nufft import FftvisEngine
     from calstudy.simulate.reference import PyuvsimEngine
 
     engines = {
         "dense": lambda: DenseEngine(settings.precision),
+        "matvis": lambda: MatvisEngine(settings.precision),
         "fftvis": lambda: FftvisEngine(settings.precision),
         "pyuvsim": PyuvsimEngine,
     }

@@ -7,7 +7,6 @@ which the paper puts its beam-interpolation artefacts at -45 dB and the 21 cm si
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -20,9 +19,19 @@ from calstudy.visibilities import baseline_vectors, to_cube
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
-logger = logging.getLogger(__name__)
-
 Taper = Literal["blackman-harris", "dolph-chebyshev"]
+MAIN_LOBES: dict[Taper, int] = {"blackman-harris": 4, "dolph-chebyshev": 8}
+"""Half width of each taper's main lobe, in units of 1 / bandwidth: what a floor must start beyond."""
+
+SIDELOBES = 200
+"""Sidelobes of the Dolph-Chebyshev taper below its peak, in dB of power."""
+
+
+def make_window(taper: Taper, n_channels: int) -> np.ndarray:
+    """Return a taper, (n_channels,)."""
+    if taper == "blackman-harris":
+        return windows.blackmanharris(n_channels)
+    return windows.chebwin(n_channels, SIDELOBES)
 
 
 @dataclass(frozen=True)
@@ -81,10 +90,7 @@ def delay_floor(
     cube = to_cube(foregrounds)
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
     width = float(np.diff(foregrounds.freq_array).mean())
-    window = (
-        windows.blackmanharris(cube.shape[2]) if taper == "blackman-harris" else windows.chebwin(cube.shape[2], 200)
-    )
-    spectrum = np.fft.fft(cube * window[:, None], axis=2)
+    spectrum = np.fft.fft(cube * make_window(taper, cube.shape[2])[:, None], axis=2)
     power = np.mean(np.abs(spectrum) ** 2, axis=(0, 3))
     delays = np.abs(np.fft.fftfreq(cube.shape[2], width))
     beyond = delays > (lengths / speed_of_light + buffer)[:, None]
@@ -100,16 +106,3 @@ def delay_floor(
         ratios = np.array([mean[outside].mean(), mean[outside].max()]) / mean.max()
         levels[:, index] = 5 * np.log10(np.maximum(ratios, np.finfo(float).tiny))
     return DelayFloor(edges, *levels, buffer, taper)
-
-
-def warn_if_above(floor: DelayFloor, level_db: float) -> None:
-    """Log a warning if the floor reaches above a level (amplitude dB), such as that of the EoR asked for."""
-    if np.nanmax(floor.rms_db) > level_db:
-        worst = int(np.nanargmax(floor.rms_db))
-        logger.warning(
-            "the delay floor of the foregrounds is %.1f dB for baselines of %.0f-%.0f m, above the EoR level %.1f dB",
-            floor.rms_db[worst],
-            floor.edges[worst],
-            floor.edges[worst + 1],
-            level_db,
-        )

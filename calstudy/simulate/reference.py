@@ -44,20 +44,31 @@ class PyuvsimEngine:
         tabulated = beam.at(template.freq_array)
         products = _products(tabulated)
         columns = [products.index(number) for number in template.polarization_array]
-        cube = ranks.share(_visibilities, sky, tabulated, template)
+        cube = np.empty((template.Nblts, template.Nfreqs, len(products)), dtype=np.complex128)
+        for indices, values in ranks.share(_visibilities, sky, tabulated, template):
+            cube[tuple(indices.T)] = values
         return cube.reshape(template.Ntimes, template.Nbls, template.Nfreqs, -1)[..., columns]
 
 
-def _visibilities(rank: int, count: int, sky: SkyModel, tabulated, template: UVData) -> np.ndarray:
-    """Return the visibilities of a rank's share, (Nblts, Nfreqs, Nproducts) complex128, zero outside it."""
+def _visibilities(rank: int, count: int, sky: SkyModel, tabulated, template: UVData) -> tuple[np.ndarray, np.ndarray]:
+    """Return a rank's share: indices of sample and channel, (N, 2), and visibilities, (N, Nproducts) complex128.
+
+    `pyuvsim.run_uvdata_uvsim` prints, and installs an excepthook; this is its loop, and gives the same bits.
+    """
+    use_bundled_earth_orientation()
     beams = BeamList([BeamInterface(tabulated, beam_type="efield")])
-    cube = np.zeros((template.Nblts, template.Nfreqs, len(_products(tabulated))), dtype=np.complex128)
-    share = _share(range(template.Nblts * template.Nfreqs), rank, count)
+    tasks = _share(range(template.Nblts * template.Nfreqs), rank, count)
+    indices, values = [], []
+    engine = UVEngine()
     with warnings.catch_warnings():
         # A 21 cm sky is a brightness difference.
         warnings.filterwarnings("ignore", "Some Stokes I values are negative", UserWarning)
-        _run_tasks(share, _catalog(sky, template.freq_array), beams, template, cube)
-    return cube
+        for task in uvdata_to_task_iter(tasks, template, _catalog(sky, template.freq_array), beams, None):
+            engine.set_task(task)
+            indices.append(task.uvdata_index[:2])
+            values.append(engine.make_visibility())
+    shape = (len(tasks), len(_products(tabulated)))
+    return np.array(indices, dtype=int).reshape(-1, 2), np.array(values, dtype=np.complex128).reshape(shape)
 
 
 def _products(beam) -> list[int]:
@@ -74,18 +85,6 @@ def _catalog(sky: SkyModel, frequencies: np.ndarray) -> SkyModelData:
     if sky.component_type == "healpix":
         sky.healpix_to_point()
     return SkyModelData(sky)
-
-
-def _run_tasks(tasks: range, catalog: SkyModelData, beams: BeamList, template: UVData, cube: np.ndarray) -> None:
-    """Fill the visibilities of some tasks in a cube (Nblts, Nfreqs, Nproducts).
-
-    `pyuvsim.run_uvdata_uvsim` needs MPI and prints; this is its loop, and gives the same bits.
-    """
-    use_bundled_earth_orientation()
-    engine = UVEngine()
-    for task in uvdata_to_task_iter(tasks, template, catalog, beams, None):
-        engine.set_task(task)
-        cube[task.uvdata_index] = engine.make_visibility()
 
 
 def _share(tasks: range, rank: int, count: int) -> range:

@@ -27,7 +27,7 @@ class Nodes(Section):
 class SimulationSettings(Section):
     """How the visibilities are computed."""
 
-    engine: Literal["auto", "dense", "fftvis", "pyuvsim"] = Field(
+    engine: Literal["auto", "dense", "matvis", "fftvis", "pyuvsim"] = Field(
         "auto", description="auto: the fastest that can do what is asked."
     )
     precision: Literal["single", "double"] = Field("double", description="Precision of the engine's inner products.")

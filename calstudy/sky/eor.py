@@ -7,7 +7,7 @@ from functools import cached_property
 import healpy
 import numpy as np
 from astropy import units
-from astropy.cosmology import Planck15
+from astropy.cosmology import FLRW, Planck15
 from pyradiosky import SkyModel
 from scipy.interpolate import CubicSpline
 
@@ -25,7 +25,7 @@ class EorField:
     """A Gaussian random sky of known P(k), any channels of it at a time.
 
     The flat spectrum is one independent normal number per pixel and channel, of variance σ²(ν) = P / V(ν), V being
-    the channel's own comoving voxel (paper §Simulations; Planck15, Mpc without h). A power law is correlated between
+    the channel's own comoving voxel (paper §Simulations; Mpc without h). A power law is correlated between
     channels; see `channel_covariance`.
 
     The field is not smoothed: neither by the channel (P is white up to the channel spacing's own Nyquist wavenumber,
@@ -39,6 +39,8 @@ class EorField:
         The `sky.eor` section.
     frequencies
         All channel centres of the study in Hz, equally spaced, shape (Nfreqs,).
+    cosmology
+        Turns P(k) into brightness; the power spectrum estimator must use the same.
 
     Raises
     ------
@@ -46,14 +48,14 @@ class EorField:
         If there are fewer than two channels, or they are not equally spaced.
     """
 
-    def __init__(self, settings: Eor, frequencies: np.ndarray) -> None:
+    def __init__(self, settings: Eor, frequencies: np.ndarray, cosmology: FLRW = Planck15) -> None:
         frequencies = np.asarray(frequencies, dtype=float)
         spacing = np.diff(frequencies)
         if not len(spacing) or spacing.min() <= 0 or np.ptp(spacing) > 1e-6 * spacing.mean():
             raise ValueError("frequencies: an EoR field needs at least two channels, equally spaced and increasing")
         self.settings = settings
         self.frequencies = frequencies
-        self.distance, self.depth = comoving_geometry(frequencies, float(spacing.mean()))
+        self.distance, self.depth = comoving_geometry(frequencies, float(spacing.mean()), cosmology)
 
     @property
     def n_pixels(self) -> int:
@@ -166,8 +168,10 @@ class EorField:
         return np.concatenate([amplitude * np.cos(turns), amplitude * np.sin(turns)], axis=1)
 
 
-def comoving_geometry(frequencies: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the comoving distance to 21 cm channels and their depth, in Mpc (Planck15), each of shape (Nfreqs,).
+def comoving_geometry(
+    frequencies: np.ndarray, width: float, cosmology: FLRW = Planck15
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the comoving distance to 21 cm channels and their depth, in Mpc without h, each of shape (Nfreqs,).
 
     Parameters
     ----------
@@ -177,8 +181,8 @@ def comoving_geometry(frequencies: np.ndarray, width: float) -> tuple[np.ndarray
         Channel width in Hz.
     """
     redshift = HYDROGEN_LINE / frequencies - 1
-    distance = Planck15.comoving_transverse_distance(redshift).to_value("Mpc")
-    per_redshift = Planck15.hubble_distance.to_value("Mpc") * Planck15.inv_efunc(redshift)
+    distance = cosmology.comoving_transverse_distance(redshift).to_value("Mpc")
+    per_redshift = cosmology.hubble_distance.to_value("Mpc") * cosmology.inv_efunc(redshift)
     return distance, per_redshift * width * HYDROGEN_LINE / frequencies**2
 
 

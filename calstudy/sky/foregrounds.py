@@ -121,10 +121,14 @@ def _population(settings: section.SyntheticSources) -> Catalogue:
     return Catalogue(names, right_ascension[order], declination[order], flux[order], np.full(len(flux), SPECTRAL_INDEX))
 
 
-def _in_g4jy_area(catalogue: Catalogue) -> np.ndarray:
-    directions = SkyCoord(catalogue.right_ascension, catalogue.declination, unit="rad", frame="icrs")
+def in_complete_area(directions: SkyCoord) -> np.ndarray:
+    """Return which directions, (N,), are where G4Jy is complete: south of +30° and 10° from the Galactic plane."""
     latitude = np.abs(directions.galactic.b.rad)
-    return (catalogue.declination < COMPLETE_DECLINATION) & (latitude >= COMPLETE_LATITUDE)
+    return (directions.icrs.dec.rad < COMPLETE_DECLINATION) & (latitude >= COMPLETE_LATITUDE)
+
+
+def _in_g4jy_area(catalogue: Catalogue) -> np.ndarray:
+    return in_complete_area(SkyCoord(catalogue.right_ascension, catalogue.declination, unit="rad", frame="icrs"))
 
 
 def _nearest(available: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -17,21 +17,27 @@ GAINS, SOLUTION = "gains.calh5", "solution.json"
 VISIBILITIES = ("model.uvh5", "residual.uvh5")
 
 
-def _integrations(data: UVData, index: int, count: int) -> UVData:
-    """Return the `index`-th of `count` runs of consecutive integrations, as equal as can be."""
-    edges = np.linspace(0, data.Ntimes, count + 1).round().astype(int)
-    first, last = edges[index] * data.Nbls, edges[index + 1] * data.Nbls
+def _integrations(data: UVData, index: int, count: int, together: int) -> UVData:
+    """Return the `index`-th of `count` runs of consecutive integrations, as equal as can be.
+
+    A run ends where one group of integrations that are solved `together` ends.
+    """
+    groups = -(-data.Ntimes // together)
+    edges = np.linspace(0, groups, count + 1).round().astype(int) * together
+    first, last = edges[index] * data.Nbls, min(edges[index + 1], data.Ntimes) * data.Nbls
     return data.select(blt_inds=np.arange(first, last), inplace=False, run_check=False)
 
 
 def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     """Calibrate a run of consecutive integrations."""
     index, count = job.settings["index"], job.settings["count"]
-    data = _integrations(read_visibilities(job.inputs["data"] / "data.uvh5"), index, count)
+    settings = CalibrationSettings.model_validate(job.settings["calibration"])
+    together = settings.integrations_per_solve
+    data = _integrations(read_visibilities(job.inputs["data"] / "data.uvh5"), index, count, together)
     sky_model = None
     if "sky_model" in job.inputs:
-        sky_model = _integrations(read_visibilities(job.inputs["sky_model"] / "visibilities.uvh5"), index, count)
-    settings = CalibrationSettings.model_validate(job.settings["calibration"])
+        sky_model = read_visibilities(job.inputs["sky_model"] / "visibilities.uvh5")
+        sky_model = _integrations(sky_model, index, count, together)
     result = calibrate(data, settings, sky_model)
     result.gains.write_calh5(job.output / GAINS)
     for name, uvd in zip(VISIBILITIES, (result.model, result.residual), strict=True):
@@ -53,13 +59,14 @@ def assemble(job: Job) -> Mapping[str, Any]:
     records = [record for folder in folders for record in read_json(folder / SOLUTION)["records"]]
     records.sort(key=lambda record: (record["polarization"], record["time"]))
     by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
-    for number, record in enumerate(records):
+    for record in records:
         by_status[record["status"]] += 1
-        record["integration"] = number % gains.Ntimes
+        record["integration"] = int(np.abs(gains.time_array - record["time"]).argmin())
     write_json(job.output / SOLUTION, {"by_status": by_status, "records": records})
     seconds = [record["seconds"] for record in records]
     return {
         "by_status": by_status,
+        "median_steps": float(np.median([record["n_steps"] for record in records])),
         "median_seconds_per_solve": float(np.median(seconds)),
         "warnings": _warnings(by_status, records),
     }

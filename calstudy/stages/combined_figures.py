@@ -16,19 +16,20 @@ from calstudy.instrument.settings import Layout
 from calstudy.stages.figures import spherical_column
 from calstudy.stages.registry import Job
 
+TITLES = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
+"""What is compared, from left to right, and how it is headed."""
+
 
 def _layouts(job: Job) -> tuple[Figure, Any]:
     panels = []
-    for settings in job.settings["layouts"]:
-        layout = make_layout(TypeAdapter(Layout).validate_python(settings))
-        panels.append(LayoutPanel(title=layout.name, numbers=layout.numbers, enu=layout.enu))
+    for role in TITLES:
+        layout = make_layout(TypeAdapter(Layout).validate_python(job.settings["layouts"][role]))
+        panels.append(LayoutPanel(title=TITLES[role], numbers=layout.numbers, enu=layout.enu))
     return draw_layouts(panels, stand_ins=job.settings["notes"]), panels
 
 
 def _spherical_comparison(job: Job) -> tuple[Figure, Any]:
-    columns = {
-        role: spherical_column(job.inputs[role], role, "outside-wedge") for role in ("minimally_redundant", "redundant")
-    }
+    columns = {role: spherical_column(job.inputs[role], title, "outside-wedge") for role, title in TITLES.items()}
     return draw_spherical_comparison(**columns, stand_ins=job.settings["notes"]), columns
 
 

@@ -79,9 +79,8 @@ def inspect_baselines(job: Job) -> list[BaselineSpectra]:
     residual = read_spectra(job.inputs["calibration"] / "residual.uvh5", pairs)
     model = first * second.conj() * read_spectra(job.inputs["calibration"] / "model.uvh5", pairs)
     spectra = {"residual": residual, "model": model}
-    spectra |= {
-        name: read_spectra(job.inputs[name] / "data.uvh5", pairs) for name in job.inputs if name != "calibration"
-    }
+    measured = [name for name in ("data", "noise", "uncorrupted") if name in job.inputs]
+    spectra |= {name: read_spectra(job.inputs[name] / "data.uvh5", pairs) for name in measured}
     shown = {name: rms_over_time(values, gains.frequency) for name, values in spectra.items()}
     delay = delays(gains.frequency.size, channel_width(gains.frequency))
     return [

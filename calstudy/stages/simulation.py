@@ -13,9 +13,10 @@ from pydantic import TypeAdapter
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.power.cosmology import make_cosmology
 from calstudy.simulate.chunks import Chunk, assemble, check_interpolation, plan_chunks, simulate_chunk
 from calstudy.simulate.engine import make_engine
-from calstudy.simulate.floor import DelayFloor, delay_floor
+from calstudy.simulate.floor import MAIN_LOBES, DelayFloor, delay_floor
 from calstudy.simulate.nodes import integration_times
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.eor import EorField
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
 SPEED_OF_LIGHT = 299792458.0
 SMOOTH_SPECTRA = ("flat", "spectral_index")
-# Width of the main lobe of each taper, in units of 1 / bandwidth: what the floor must start beyond.
-MAIN_LOBES = {"blackman-harris": 4, "dolph-chebyshev": 8}
 CHECKED = 2
 """Integrations, and channels, at which interpolated visibilities are compared with directly simulated ones."""
 
@@ -42,6 +41,7 @@ class _Scene:
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self._sky_settings = settings["sky"]
+        self._cosmology = settings.get("cosmology")
         self.is_eor = settings["component"] == "eor"
         self.instrument = InstrumentSettings.model_validate(settings["instrument"])
         self.simulation = SimulationSettings.model_validate(settings["simulation"])
@@ -51,7 +51,8 @@ class _Scene:
 
     @cached_property
     def _field(self) -> EorField:
-        return EorField(Eor.model_validate(self._sky_settings), self.template.freq_array)
+        settings = Eor.model_validate(self._sky_settings)
+        return EorField(settings, self.template.freq_array, make_cosmology(self._cosmology))
 
     @cached_property
     def _foregrounds(self) -> SkyModel:

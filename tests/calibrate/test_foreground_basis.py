@@ -49,8 +49,9 @@ def test_autocorrelations_get_the_minimum_delay():
     [
         (400.0, FREQUENCIES, BASIS, "fills all 64 channels of 400 kHz"),
         (340.0, FREQUENCIES, BASIS, "fills all 64 channels"),
-        (30.0, np.delete(FREQUENCIES, 20), BASIS, "evenly spaced"),
-        (30.0, FREQUENCIES[:1], BASIS, "evenly spaced"),
+        (30.0, FREQUENCIES + 150e3 * (np.arange(64) > 30), BASIS, "on an even grid"),
+        (30.0, FREQUENCIES[:1], BASIS, "on an even grid"),
+        (30.0, np.full(2, 160e6), BASIS, "on an even grid"),
         (0.0, FREQUENCIES, BasisSettings(min_delay="0 ns", buffer="0 ns"), "half-width is 0 s"),
     ],
 )

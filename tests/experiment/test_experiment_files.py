@@ -6,11 +6,23 @@ import pytest
 import yaml
 
 from calstudy.errors import ExperimentError, InputError
-from calstudy.experiment.files import apply_scale, dump, load, override, parse_override, parse_yaml, validate
+from calstudy.experiment.collection import Collection, load_study
+from calstudy.experiment.files import (
+    apply_scale,
+    dump,
+    load,
+    override,
+    parse_override,
+    parse_yaml,
+    read_mapping,
+    validate,
+)
 from calstudy.experiment.model import Experiment
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 HERE = Path(__file__).parent
+FILES = sorted(EXPERIMENTS.rglob("*.yaml"))
+SINGLE = [path for path in FILES if "experiments" not in read_mapping(path)]
 
 
 def faults_of(text: str) -> list[str]:
@@ -19,11 +31,12 @@ def faults_of(text: str) -> list[str]:
     return caught.value.faults
 
 
-@pytest.mark.parametrize("path", sorted(EXPERIMENTS.rglob("*.yaml")), ids=lambda path: path.stem)
-def test_shipped_experiments_are_valid_at_every_scale(path):
-    experiment = load(path)
-    for scale in experiment.scales:
-        assert load(path, scale).name == experiment.name
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_shipped_files_are_valid_at_every_scale(path):
+    study = load_study(path)
+    members = study.members.values() if isinstance(study, Collection) else [study]
+    for scale in set.intersection(*(set(experiment.scales) for experiment in members)):
+        assert load_study(path, scale).name == study.name
 
 
 def test_the_defaults_are_the_papers_numbers():
@@ -38,7 +51,7 @@ def test_the_defaults_are_the_papers_numbers():
     assert experiment.power.wedge_buffer == 1e-7
 
 
-@pytest.mark.parametrize("path", sorted(EXPERIMENTS.rglob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", SINGLE, ids=lambda path: path.stem)
 def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
     resolved = tmp_path / "resolved.yaml"
     experiment = load(path)
@@ -77,6 +90,19 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
             "sky.foregrounds.path = 'no.skyh5': no such file",
         ),
         ("{name: a, sky: {foregrounds: file}}", "sky.foregrounds.path: missing, and it has no default"),
+        (
+            "{name: a, outputs: {inspect: {antennas: [0, 40]}}}",
+            "outputs.inspect: names antenna 40, but the layout has 36",
+        ),
+        ("{name: a, outputs: {inspect: {antennas: [1, 1]}}}", "outputs.inspect: names an antenna twice in a pair"),
+        ("{name: a, outputs: {inspect: {baselines: [[0, -1]]}}}", "must be at least 0"),
+        ("{name: a, outputs: {inspect: {integration: 56}}}", "outputs.inspect.integration: 56 is not among the 56"),
+        ("{name: a, outputs: {figures: [gain]}}", "outputs.figures.0 = 'gain': not a choice, did you mean 'gains'?"),
+        (
+            "{name: a, outputs: {figures: [gains]}, variants: {eor: {components: [eor]}, residual: {components: "
+            "[foregrounds]}}}",
+            "variants.residual: must have foregrounds, gains: true and calibrate: true for the figure 'gains'",
+        ),
         ("{}", "name: missing, and it has no default"),
         ("{name: a b}", "name = 'a b': must match"),
         (

@@ -71,6 +71,8 @@ def test_a_signal_scaled_by_a_factor_has_the_squared_factor_as_transfer_and_itse
     assert found.transfer == pytest.approx([factor**2])
     assert found.coherence == pytest.approx([factor])
     assert found.transfer_error == pytest.approx([0], abs=1e-9)
+    assert found.retained == pytest.approx([1])
+    assert found.retained_error == pytest.approx([0], abs=1e-6)
 
 
 def test_no_loss_is_one_in_every_bin_and_cell(rng):
@@ -103,15 +105,19 @@ def random_projection(rng: np.random.Generator, lost: int) -> np.ndarray:
 
 
 def test_gains_that_absorb_some_of_all_baselines_lose_their_share_at_all_delays(rng):
-    lost = 10
+    lost, scale = 10, 1.07
     projections = [random_projection(rng, lost) for _ in range(CHANNELS)]
     found = []
     for _ in range(8):
         signal = noise(rng)
         left = np.stack([matrix @ column for matrix, column in zip(projections, signal.T, strict=True)], axis=1)
-        found.append(spherical_transfer(inject(signal, left, left), ONE_BIN, BUFFER, inside=False))
+        found.append(spherical_transfer(inject(signal, scale * left, scale * left), ONE_BIN, BUFFER, inside=False))
     pooled = pool(found)
-    for value, error in ((pooled.transfer, pooled.transfer_error), (pooled.coherence, pooled.coherence_error)):
+    for value, error in (
+        (pooled.transfer / scale**2, pooled.transfer_error),
+        (pooled.coherence / scale, pooled.coherence_error),
+        (pooled.retained, pooled.retained_error),
+    ):
         assert value[0] == pytest.approx(1 - lost / BASELINES, abs=4 * error[0])
         assert error[0] < 0.02
 
@@ -141,10 +147,11 @@ def test_noise_that_is_left_in_the_response_scatters_but_gives_no_bias():
             [
                 (found.transfer[0] - 0.64) / found.transfer_error[0],
                 (found.coherence[0] - 0.8) / found.coherence_error[0],
+                (found.retained[0] - 1) / found.retained_error[0],
             ]
         )
-    assert np.mean(pulls, axis=0) == pytest.approx([0, 0], abs=4 / np.sqrt(200))
-    assert np.std(pulls, axis=0) == pytest.approx([1, 1], abs=0.2)
+    assert np.mean(pulls, axis=0) == pytest.approx([0, 0, 0], abs=4 / np.sqrt(200))
+    assert np.std(pulls, axis=0) == pytest.approx([1, 1, 1], abs=0.2)
 
 
 def test_one_sample_has_no_error(rng):
@@ -185,7 +192,7 @@ def test_corrected_power_is_unbiased_with_both_errors_and_unknown_where_all_is_l
     edges = np.array([0.0, 1.0, 2.0, 3.0])
     ones = np.ones(3)
     transfer = TransferFunction(
-        (edges[1:] + edges[:-1]) / 2, edges, np.array([0.5, 1.0, 0.01]), 0.01 * ones, ones, ones, ones, ones
+        (edges[1:] + edges[:-1]) / 2, edges, np.array([0.5, 1.0, 0.01]), 0.01 * ones, *(6 * [ones])
     )
     power, error = correct(spectrum([50.0, 100.0, 1.0], 3.0, edges), transfer)
     assert power[:2] == pytest.approx([100.0, 100.0])

@@ -14,6 +14,7 @@ from simulation_cases import healpix_sky, local_coordinates, observe, point_sky,
 from calstudy.instrument.beams import ExactBeam
 from calstudy.simulate.dense import DenseEngine
 from calstudy.simulate.engine import FastestEngine, make_engine
+from calstudy.simulate.matvis_engine import MatvisEngine
 from calstudy.simulate.nufft import FftvisEngine
 from calstudy.simulate.reference import PyuvsimEngine
 from calstudy.simulate.settings import SimulationSettings
@@ -54,6 +55,13 @@ def test_fftvis_agrees_with_pyuvsim(name, request, sky, template):
     assert relative_error(FftvisEngine().simulate(sky, beam, template), expected) < 1e-10
 
 
+@pytest.mark.parametrize("name", ["embedded_beam", "dipole_beam"])
+def test_matvis_agrees_with_pyuvsim(name, request, sky, template):
+    beam, expected = pyuvsim_visibilities(name, request, sky, template)
+    assert relative_error(MatvisEngine().simulate(sky, beam, template), expected) < 1e-11
+    assert 1e-7 < relative_error(MatvisEngine("single").simulate(sky, beam, template), expected) < 1e-3
+
+
 def test_single_precision_is_single(sky, template, tile_beam):
     double = DenseEngine().simulate(sky, tile_beam, template)
     error = relative_error(DenseEngine("single").simulate(sky, tile_beam, template), double)
@@ -65,6 +73,7 @@ def test_channel_by_channel_healpix_sky_in_kelvin(template, tile_beam):
     expected = PyuvsimEngine().simulate(sky, tile_beam, template)
     assert relative_error(DenseEngine().simulate(sky, tile_beam, template), expected) < 1e-12
     assert relative_error(FftvisEngine().simulate(sky, tile_beam, template), expected) < 1e-10
+    assert relative_error(MatvisEngine().simulate(sky, tile_beam, template), expected) < 1e-11
 
 
 def test_polarizations_keep_their_place(sky, tile_beam):
@@ -124,7 +133,7 @@ def test_no_source_above_the_horizon_gives_zeros(template, tile_beam):
 
 def test_arguments_are_not_changed(sky, template, embedded_beam):
     sky_before, template_before = sky.copy(), template.copy()
-    for engine in (DenseEngine(), PyuvsimEngine(), FftvisEngine()):
+    for engine in (DenseEngine(), PyuvsimEngine(), FftvisEngine(), MatvisEngine()):
         engine.simulate(sky, embedded_beam, template)
         assert sky == sky_before, engine.name
         assert template == template_before, engine.name
@@ -144,7 +153,7 @@ def test_auto_takes_the_fastest_that_can(sky, template, tile_beam):
 
 
 def test_engines_are_chosen_by_name():
-    for name in ("dense", "fftvis", "pyuvsim"):
+    for name in ("dense", "matvis", "fftvis", "pyuvsim"):
         assert make_engine(SimulationSettings(engine=name)).name == name
 
 
@@ -152,9 +161,10 @@ def test_cross_hands_go_to_an_engine_that_has_them(sky, template, tile_beam):
     crossed = observe(channels=1, times=1, polarizations=("xx",))
     crossed.polarization_array = np.array([-7])
     auto = make_engine(SimulationSettings())
-    assert auto.choose(sky, tile_beam, crossed).name == "fftvis"
+    assert auto.choose(sky, tile_beam, crossed).name == "matvis"
     expected = PyuvsimEngine().simulate(sky, tile_beam, crossed)
-    assert relative_error(auto.simulate(sky, tile_beam, crossed), expected) < 1e-10
+    for engine in (auto, FftvisEngine()):
+        assert relative_error(engine.simulate(sky, tile_beam, crossed), expected) < 1e-10
 
 
 def test_a_galactic_sky_is_where_it_should_be(template, tile_beam):

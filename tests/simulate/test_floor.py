@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 import pytest
 from simulation_cases import observe, random_sky
 
 from calstudy.simulate.dense import DenseEngine
-from calstudy.simulate.floor import delay_floor, warn_if_above
+from calstudy.simulate.floor import delay_floor
 from calstudy.visibilities import baseline_vectors, from_cube
 
 
@@ -47,15 +45,6 @@ def test_smooth_foregrounds_reach_the_sidelobes_of_the_taper_and_no_more(templat
     assert delay_floor(foregrounds, buffer=300e-9, taper="dolph-chebyshev").worst_db < -70
     lengths = np.linalg.norm(baseline_vectors(template), axis=1)
     assert np.isfinite(blackman_harris.max_db).sum() == len(np.unique(np.digitize(lengths, blackman_harris.edges)))
-
-
-def test_the_warning_names_the_level_and_comes_only_above_it(template, caplog):
-    floor = delay_floor(tones(template, 1e-3, 1e-6), buffer=400e-9)
-    with caplog.at_level(logging.WARNING):
-        warn_if_above(floor, -20.0)
-        assert not caplog.records
-        warn_if_above(floor, -60.0)
-    assert "above the EoR level -60.0 dB" in caplog.text
 
 
 def test_channels_too_wide_for_the_buffer_are_an_error(template):

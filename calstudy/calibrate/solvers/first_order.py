@@ -16,13 +16,15 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
+from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.loss import foreground_model, likelihood, sum_prior
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, Prior
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.tensors import FitTensors
 
 Method = Literal["adamax", "adam", "sgd"]
+Schedule = Literal["constant", "cosine", "exponential"]
 Precision = Literal["single", "double"]
 
 # Decay of the first and second moment and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
@@ -31,7 +33,10 @@ STEPS_PER_CALL = 50
 
 
 class Parameters(NamedTuple):
-    """Unknowns or anything of their shape: gains (2, Nants, Nfreqs) and one (2, Nmembers, Nvec) per bucket."""
+    """Unknowns or anything of their shape: gains (2, Nants, Nfreqs) and one (2, Nmembers, Nvec) per piece.
+
+    Gains in a smooth basis are its coefficients, (2, Nants, Ngain). Where the foregrounds are frozen, there is no piece.
+    """
 
     gains: tf.Tensor
     coefficients: tuple[tf.Tensor, ...]
@@ -57,11 +62,49 @@ class Descent(NamedTuple):
 
 
 class FitData(NamedTuple):
-    """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's target (2,), in units of the rms."""
+    """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's target (2,), in units of the rms.
+
+    The model (2, Nbls, Nfreqs) is there only if it is frozen.
+    """
 
     visibilities: tf.Tensor
     weights: tf.Tensor
     target: tf.Tensor
+    model: tf.Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Optimizer:
+    """How a gradient becomes a step.
+
+    Attributes
+    ----------
+    method
+        Adamax, Adam (Kingma & Ba 2014) or plain gradient descent.
+    learning_rate
+        Size of the first step, for visibilities in units of their rms.
+    schedule
+        How the rate falls: not at all, along half a cosine, or by the same factor each step.
+    final_rate
+        Rate of the last step relative to the first, unless it is constant.
+    max_steps
+        The last step.
+    """
+
+    method: Method = "adamax"
+    learning_rate: float = 0.01
+    schedule: Schedule = "constant"
+    final_rate: float = 0.01
+    max_steps: int = 10_000
+
+    def rate(self, step: tf.Tensor) -> tf.Tensor:
+        """Return the learning rate of a step, counted from one; scalar of the dtype of `step`."""
+        done = (step - 1) / max(self.max_steps - 1, 1)
+        if self.schedule == "cosine":
+            return self.learning_rate * (self.final_rate + (1 - self.final_rate) * (1 + tf.cos(math.pi * done)) / 2)
+        if self.schedule == "exponential":
+            return self.learning_rate * tf.exp(math.log(self.final_rate) * done)
+        return tf.constant(self.learning_rate, step.dtype)
 
 
 def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
@@ -71,7 +114,7 @@ def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Paramet
 
 def update(
     method: Method,
-    learning_rate: float,
+    learning_rate: tf.Tensor,
     step: tf.Tensor,
     parameters: Parameters,
     moments: tuple[Parameters, Parameters],
@@ -101,24 +144,51 @@ def update(
 
 
 class Kernels:
-    """The compiled descent for one fit structure and one setting of the optimizer."""
+    """Loss, gradient and the compiled descent for one fit structure and one setting of the optimizer."""
 
-    def __init__(
-        self, structure: FitStructure, method: Method, learning_rate: float, precision: Precision, with_prior: bool
-    ) -> None:
+    def __init__(self, structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> None:
         self.dtype = tf.float32 if precision == "single" else tf.float64
         self.tensors = FitTensors(structure)
         self.projector = Projector(self.tensors)
+        self.space = GainSpace(structure.gain_vectors, self.dtype)
         self.bases = [tf.constant(basis.T, self.dtype) for basis in self.tensors.bases]
-        self._method, self._learning_rate, self._with_prior = method, learning_rate, with_prior
+        self._optimizer, self._with_prior = optimizer, prior == "sum"
         self.descend = tf.function(self._descend, jit_compile=True)
+
+    def load(
+        self, problem: CalibrationProblem, gains: np.ndarray
+    ) -> tuple[Parameters, FitData, float]:
+        """Return gains with the foregrounds that fit best, in weighted least squares, the data, and their unit."""
+        exact = self.tensors.load(problem, tf.float64)
+        start = pairs.to_pair(gains, tf.float64)
+        coefficients, model = (), None
+        if problem.frozen:
+            model = self.tensors.load_model(problem.sky_model, exact.scale, self.dtype)
+        else:
+            best = self.projector.project(start, exact.visibilities, exact.weights).model
+            parts = zip(self.tensors.slices, self.tensors.bases, strict=True)
+            coefficients = tuple(tf.cast(best[:, first:last] @ basis, self.dtype) for (first, last), basis in parts)
+        target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
+        measured = (exact.visibilities, exact.weights)
+        data = FitData(*(tf.cast(part, self.dtype) for part in measured), pairs.to_pair(target, self.dtype), model)
+        return Parameters(self.space.reduce(tf.cast(start, self.dtype)), coefficients), data, exact.scale
 
     def loss(self, parameters: Parameters, data: FitData) -> tf.Tensor:
         """Return the likelihood, plus the sum prior where the problem has it."""
+        gains = self.space.expand(parameters.gains)
+        if data.model is not None:
+            return likelihood(self.tensors, gains, tf.unstack(data.model), data.visibilities, data.weights)
         real, imaginary = foreground_model(parameters.coefficients, self.bases)
         model = self.tensors.to_baselines(real, axis=0), self.tensors.to_baselines(imaginary, axis=0)
-        value = likelihood(self.tensors, parameters.gains, model, data.visibilities, data.weights)
+        value = likelihood(self.tensors, gains, model, data.visibilities, data.weights)
         return value + sum_prior(self.tensors, model, data.weights, data.target) if self._with_prior else value
+
+    def estimate(self, parameters: Parameters, data: FitData, scale: float) -> Estimate:
+        """Return gains and model in the problem's order and unit."""
+        model = data.model
+        if model is None:
+            model = tf.stack(foreground_model(parameters.coefficients, self.bases))
+        return Estimate(pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload(model, scale))
 
     def loss_and_gradient(self, parameters: Parameters, data: FitData) -> tuple[tf.Tensor, Parameters]:
         """Return the loss and its gradient, of the shape of the parameters."""
@@ -137,7 +207,8 @@ class Kernels:
             better = value < now.best_loss
             best = _map(lambda new, old: tf.where(better, new, old), now.parameters, now.best)
             step = tf.cast(done + index + 1, self.dtype)
-            moved = update(self._method, self._learning_rate, step, now.parameters, now.moments, gradient)
+            rate = self._optimizer.rate(step)
+            moved = update(self._optimizer.method, rate, step, now.parameters, now.moments, gradient)
             descent = Descent(*moved, best, tf.where(better, value, now.best_loss))
             return index + 1, descent, tf.tensor_scatter_nd_update(losses, [[index]], [value])
 
@@ -147,11 +218,9 @@ class Kernels:
 
 
 @lru_cache(maxsize=4)
-def compiled(
-    structure: FitStructure, method: Method, learning_rate: float, precision: Precision, with_prior: bool
-) -> Kernels:
+def compiled(structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> Kernels:
     """Return the kernels of a structure and setting, compiled once for all its integrations."""
-    return Kernels(structure, method, learning_rate, precision, with_prior)
+    return Kernels(structure, optimizer, precision, prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,49 +236,37 @@ class FirstOrderState:
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """Adamax, Adam or gradient descent at a fixed rate, keeping the best parameters seen.
+    """Adamax, Adam or gradient descent, keeping the best parameters seen.
 
     Parameters
     ----------
-    method
-        The optimizer.
-    learning_rate
-        Step size, for visibilities in units of their rms.
+    optimizer
+        The method, its learning rate and how many steps it takes at most.
     tolerance
         Converged when the best loss, in units of the data's mean square, falls by less than this over
         `STEPS_PER_CALL` steps.
-    max_steps
-        Steps at most.
     precision
         Float32 or float64 throughout.
     """
 
-    method: Method = "adamax"
-    learning_rate: float = 0.01
+    optimizer: Optimizer = Optimizer()
     tolerance: float = 1e-14
-    max_steps: int = 10_000
     precision: Precision = "single"
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> FirstOrderState:
         """Start from the foregrounds that fit best, in weighted least squares, with the first gains."""
-        kernels = compiled(problem.structure, self.method, self.learning_rate, self.precision, problem.prior == "sum")
-        exact = kernels.tensors.load(problem, tf.float64)
-        gains = pairs.to_pair(problem.initial_gains if warm is None else warm.gains, tf.float64)
-        model = kernels.projector.project(gains, exact.visibilities, exact.weights).model
-        parts = zip(kernels.tensors.slices, kernels.tensors.bases, strict=True)
-        coefficients = tuple(tf.cast(model[:, start:end] @ basis, kernels.dtype) for (start, end), basis in parts)
-        parameters = Parameters(tf.cast(gains, kernels.dtype), coefficients)
-        target = pairs.to_pair(np.array(problem.prior_target / exact.scale), kernels.dtype)
-        data = FitData(tf.cast(exact.visibilities, kernels.dtype), tf.cast(exact.weights, kernels.dtype), target)
+        kernels = compiled(problem.structure, self.optimizer, self.precision, problem.prior)
+        gains = problem.initial_gains if warm is None else warm.gains
+        parameters, data, scale = kernels.load(problem, gains)
         loss = kernels.loss(parameters, data)
         zero = _map(tf.zeros_like, parameters)
         descent = Descent(parameters, (zero, zero), parameters, loss)
-        return FirstOrderState(kernels, data, exact.scale, descent, (float(loss),))
+        return FirstOrderState(kernels, data, scale, descent, (float(loss),))
 
     def step(self, state: FirstOrderState) -> FirstOrderState:
         """Take up to `STEPS_PER_CALL` steps."""
         done = len(state.history) - 1
-        n_steps = min(STEPS_PER_CALL, self.max_steps - done)
+        n_steps = min(STEPS_PER_CALL, self.optimizer.max_steps - done)
         descent, losses, final = state.kernels.descend(
             tf.constant(n_steps), tf.constant(done), state.descent, state.data
         )
@@ -229,7 +286,7 @@ class FirstOrder:
                 return Verdict(
                     "converged", f"the best loss fell by less than {self.tolerance:g} over {STEPS_PER_CALL} steps"
                 )
-        if n_steps >= self.max_steps:
+        if n_steps >= self.optimizer.max_steps:
             return Verdict("max-steps", f"not converged after {n_steps} steps")
         return None
 
@@ -239,8 +296,7 @@ class FirstOrder:
 
     def estimate(self, state: FirstOrderState) -> Estimate:
         """Return the best gains and foregrounds seen."""
-        model = tf.stack(foreground_model(state.descent.best.coefficients, state.kernels.bases))
-        return Estimate(pairs.to_complex(state.descent.best.gains), state.kernels.tensors.unload(model, state.scale))
+        return state.kernels.estimate(state.descent.best, state.data, state.scale)
 
     def memory(self, state: FirstOrderState) -> None:
         """Return nothing: only the gains carry over."""

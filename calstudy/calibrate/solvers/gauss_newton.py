@@ -15,9 +15,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
+from calstudy.calibrate.frozen import FrozenForegrounds
+from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.projection import Projection, Projector
 from calstudy.calibrate.solvers.conjugate_gradients import Operator, conjugate_gradients
@@ -25,12 +28,11 @@ from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.solvers.preconditioners import (
     antenna_blocks,
     antenna_degrees,
-    antenna_factors,
     channel_factors,
     solve_antennas,
     solve_channels,
 )
-from calstudy.calibrate.tensors import FitTensors, Measurements
+from calstudy.calibrate.tensors import FitTensors
 
 # Damping, relative to the diagonal, is this times the loss relative to the data, within the two bounds.
 DAMPING_PER_LOSS = 10.0
@@ -51,56 +53,118 @@ CG_REFRESH = 30
 ROUNDING_LOSS = 1e-15
 
 
-class Kernels:
-    """The compiled pieces of the solver for one fit structure."""
+class Reduced(NamedTuple):
+    """A problem for the gains alone.
 
-    def __init__(self, structure: FitStructure) -> None:
+    Attributes
+    ----------
+    gains
+        Where to start, (2, Nants, Nfreqs), float64.
+    measured
+        Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) whose sum is one, and the model if it is frozen; float64.
+    scale
+        Unit of the visibilities, their weighted rms.
+    loss_unit
+        Unit of the loss, in the unit of the data squared.
+    """
+
+    gains: tf.Tensor
+    measured: tuple[tf.Tensor, ...]
+    scale: float
+    loss_unit: float
+
+
+class Kernels:
+    """The compiled pieces of the solver for one fit structure.
+
+    Attributes
+    ----------
+    by_channel
+        Whether the antenna blocks of each channel are the preconditioner throughout: couplings between antennas remain
+        the strong ones where baselines share models, and are the only ones where the foregrounds are frozen.
+    """
+
+    def __init__(self, structure: FitStructure, frozen: bool = False) -> None:
         self.tensors = FitTensors(structure)
-        self.projector = Projector(self.tensors)
+        self.frozen = frozen
+        self.by_channel = (self.tensors.shared or frozen) and structure.gain_vectors is None
+        self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(self.tensors)
+        self.space = GainSpace(structure.gain_vectors, tf.float32)
+        self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
         self.project = self.projector.project
         self.channel_step = tf.function(self._channel_step)
         self.antenna_step = tf.function(self._antenna_step)
         self.blocks = tf.function(self._blocks)
-        self.factors = tf.function(antenna_factors)
+        self.factors = tf.function(self._factors)
         self.predicted_decrease = tf.function(self._predicted_decrease)
 
-    def _channel_step(self, projection: Projection, damping: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
+    def reduce(self, problem: CalibrationProblem, gains: np.ndarray) -> Reduced:
+        """Return a problem, and gains (Nants, Nfreqs) as close as their space allows, as tensors."""
+        data = self.tensors.load(problem, tf.float64)
+        total = float(tf.reduce_sum(data.weights))
+        measured = (data.visibilities, data.weights / total)
+        if problem.frozen:
+            measured += (self.tensors.load_model(problem.sky_model, data.scale, tf.float64),)
+        start = self.exact_space.expand(self.exact_space.reduce(pairs.to_pair(gains, tf.float64)))
+        return Reduced(start, measured, data.scale, total * data.scale**2)
+
+    def _channel_step(
+        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor
+    ) -> tuple[tf.Tensor, tf.Tensor]:
         """Return eta, and the decrease of the loss that its quadratic model promises."""
-        factors = channel_factors(self.projector, projection, damping)
-        eta, _ = self._solve(projection, damping, lambda values: solve_channels(factors, values), CG_CHANNEL_ITERATIONS)
+        factors = channel_factors(self.tensors, projection, damping)
+        eta, _ = self._solve(
+            projection, gains, damping, lambda values: solve_channels(factors, values), CG_CHANNEL_ITERATIONS
+        )
         return eta, pairs.inner_product(tf.cast(projection.descent, tf.float32), eta)
 
     def _antenna_step(
-        self, projection: Projection, factors: tf.Tensor, damping: tf.Tensor
+        self, projection: Projection, gains: tf.Tensor, factors: tf.Tensor, damping: tf.Tensor
     ) -> tuple[tf.Tensor, tf.Tensor]:
         """Return eta, and the iterations it took."""
-        return self._solve(projection, damping, lambda values: solve_antennas(factors, values), CG_ANTENNA_ITERATIONS)
+        return self._solve(
+            projection, gains, damping, lambda values: solve_antennas(factors, values), CG_ANTENNA_ITERATIONS
+        )
 
     def _solve(
-        self, projection: Projection, damping: tf.Tensor, preconditioner: Operator, iterations: int
+        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor, preconditioner: Operator, iterations: int
     ) -> tuple[tf.Tensor, tf.Tensor]:
-        diagonal = damping * antenna_degrees(self.projector, projection)
-        return conjugate_gradients(
-            lambda eta: self.projector.hessian_product(eta, projection) + diagonal * eta,
+        diagonal = damping * antenna_degrees(self.tensors, projection)
+        gains = tf.cast(gains, tf.float32)
+
+        def operator(coordinates: tf.Tensor) -> tf.Tensor:
+            eta = self.space.expand_relative(coordinates, gains)
+            image = self.projector.hessian_product(eta, projection) + diagonal * eta
+            return self.space.reduce_relative(image, gains)
+
+        coordinates, count = conjugate_gradients(
+            operator,
             preconditioner,
-            tf.cast(projection.descent, tf.float32),
+            self.space.reduce_relative(tf.cast(projection.descent, tf.float32), gains),
             tf.constant(CG_TOLERANCE),
             tf.constant(iterations),
         )
+        return self.space.expand_relative(coordinates, gains), count
 
     def _blocks(self, projection: Projection) -> tuple[tf.Tensor, tf.Tensor]:
-        blocks = antenna_blocks(self.projector, projection)
-        return blocks, antenna_degrees(self.projector, projection)
+        degrees = antenna_degrees(self.tensors, projection)
+        if self.frozen:
+            return tf.cast(tf.linalg.diag(degrees), tf.complex64), degrees
+        return antenna_blocks(self.tensors, projection), degrees
 
-    def _predicted_decrease(self, projection: Projection, factors: tf.Tensor) -> tf.Tensor:
-        descent = tf.cast(projection.descent, tf.float32)
+    def _factors(self, blocks: tf.Tensor, degrees: tf.Tensor, damping: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
+        damped = blocks + tf.cast(tf.linalg.diag(damping * degrees), blocks.dtype)
+        return tf.linalg.cholesky(self.space.reduce_blocks(damped, tf.cast(gains, tf.float32)))
+
+    def _predicted_decrease(self, projection: Projection, gains: tf.Tensor, factors: tf.Tensor) -> tf.Tensor:
+        descent = self.space.reduce_relative(tf.cast(projection.descent, tf.float32), tf.cast(gains, tf.float32))
         return pairs.inner_product(descent, solve_antennas(factors, descent))
 
 
 @lru_cache(maxsize=4)
-def compiled(structure: FitStructure) -> Kernels:
+def compiled(structure: FitStructure, frozen: bool = False) -> Kernels:
     """Return the kernels of a structure, compiled once for all its integrations."""
-    return Kernels(structure)
+    return Kernels(structure, frozen)
 
 
 class AntennaPreconditioner(NamedTuple):
@@ -118,8 +182,12 @@ class GaussNewtonState:
 
     Attributes
     ----------
+    scale
+        Unit of the visibilities, their weighted rms.
+    measured
+        Visibilities, weights whose sum is one, and the model if it is frozen.
     boost
-        Factor on the damping; grows tenfold whenever a step did not lower the loss.
+        Factor on the damping; grows tenfold whenever a step did not lower the loss, and shrinks again when one did.
     preconditioner
         The antenna blocks, once they are in use.
     predicted
@@ -127,8 +195,8 @@ class GaussNewtonState:
     """
 
     kernels: Kernels
-    data: Measurements
-    weights: tf.Tensor
+    scale: float
+    measured: tuple[tf.Tensor, ...]
     loss_unit: float
     gains: tf.Tensor
     projection: Projection
@@ -158,18 +226,21 @@ class GaussNewton:
     """
 
     tolerance: float = 1e-3
-    max_steps: int = 30
+    max_steps: int = 100
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and take over the preconditioner of the warm start."""
-        kernels = compiled(problem.structure)
-        data = kernels.tensors.load(problem, tf.float64)
-        total = float(tf.reduce_sum(data.weights))
-        weights = data.weights / total
-        gains = pairs.to_pair(problem.initial_gains if warm is None else warm.gains, tf.float64)
-        projection = kernels.project(gains, data.visibilities, weights)
+        kernels = compiled(problem.structure, problem.frozen)
+        reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
+        projection = kernels.project(reduced.gains, *reduced.measured)
         state = GaussNewtonState(
-            kernels, data, weights, total * data.scale**2, gains, projection, (float(projection.loss),)
+            kernels,
+            reduced.scale,
+            reduced.measured,
+            reduced.loss_unit,
+            reduced.gains,
+            projection,
+            (float(projection.loss),),
         )
         if warm is not None:
             state = replace(state, preconditioner=warm.memory)
@@ -180,13 +251,15 @@ class GaussNewton:
         kernels, preconditioner = state.kernels, state.preconditioner
         damping = tf.constant(state.damping, tf.float32)
         if preconditioner is None:
-            eta, promised = kernels.channel_step(state.projection, damping)
+            eta, promised = kernels.channel_step(state.projection, state.gains, damping)
         else:
-            eta, iterations = kernels.antenna_step(state.projection, preconditioner.factors, damping)
+            eta, iterations = kernels.antenna_step(
+                state.projection, state.gains, preconditioner.factors, damping
+            )
             if int(iterations) > CG_REFRESH:
                 preconditioner = None
         gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))
-        trial = kernels.project(gains, state.data.visibilities, state.weights)
+        trial = kernels.project(gains, *state.measured)
         loss = float(trial.loss)
         # Written so that a loss that is not a number is refused as well.
         if not loss <= state.history[-1]:
@@ -197,11 +270,11 @@ class GaussNewton:
             projection=trial,
             history=(*state.history, loss),
             n_accepted=state.n_accepted + 1,
-            boost=1.0,
+            boost=max(state.boost / 10, 1.0),
             preconditioner=preconditioner,
         )
-        # Group models leave no slow directions, so that the next step will bring less than this one did.
-        return replace(state, predicted=float(promised)) if kernels.tensors.shared else self._prepared(state)
+        # Without slow directions, the next step will bring less than this one did.
+        return replace(state, predicted=float(promised)) if kernels.by_channel else self._prepared(state)
 
     def terminate(self, state: GaussNewtonState) -> Verdict | None:
         """Judge convergence by the decrease of the loss that the next step is predicted to bring."""
@@ -216,9 +289,8 @@ class GaussNewton:
         if state.boost > MAX_BOOST:
             return Verdict("stalled", f"no step lowers the loss, though {fall:.1e} of itself is predicted")
         if n_steps >= self.max_steps:
-            return Verdict(
-                "max-steps", f"not converged after {n_steps} steps: {fall:.1e} of the loss is predicted to go"
-            )
+            hint = f": {fall:.1e} of the loss is predicted to go" if math.isfinite(fall) else ""
+            return Verdict("max-steps", f"not converged after {n_steps} steps{hint}")
         return None
 
     def losses(self, state: GaussNewtonState) -> Sequence[float]:
@@ -227,7 +299,7 @@ class GaussNewton:
 
     def estimate(self, state: GaussNewtonState) -> Estimate:
         """Return the current gains, and the foregrounds that fit best with them."""
-        model = state.kernels.tensors.unload(state.projection.model, state.data.scale)
+        model = state.kernels.tensors.unload(state.projection.model, state.scale)
         return Estimate(pairs.to_complex(state.gains), model)
 
     def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
@@ -237,18 +309,20 @@ class GaussNewton:
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
         """Bring the antenna blocks up to date with the state, and let them predict the decrease of the next step."""
         preconditioner = state.preconditioner
-        if state.kernels.tensors.shared or (preconditioner is None and state.n_accepted < CHANNEL_STEPS):
+        kernels = state.kernels
+        # Smooth gains couple all channels from the start.
+        early = state.n_accepted < CHANNEL_STEPS and kernels.space.vectors is None
+        if kernels.by_channel or (preconditioner is None and early):
             return state
         damping = max(state.damping, PRECONDITIONER_DAMPING)
         ratio = preconditioner.damping / damping if preconditioner else math.inf
         if not 1 / DAMPING_RATIO < ratio < DAMPING_RATIO:
-            blocks, degrees = preconditioner[:2] if preconditioner else state.kernels.blocks(state.projection)
-            factors = state.kernels.factors(blocks, degrees, tf.constant(damping, tf.float32))
+            blocks, degrees = preconditioner[:2] if preconditioner else kernels.blocks(state.projection)
+            factors = kernels.factors(blocks, degrees, tf.constant(damping, tf.float32), state.gains)
             preconditioner = AntennaPreconditioner(blocks, degrees, damping, factors)
         state = replace(state, preconditioner=preconditioner)
         # A boosted damping shrinks the prediction without bringing the minimum any closer.
         if state.boost > 1:
             return state
-        return replace(
-            state, predicted=float(state.kernels.predicted_decrease(state.projection, preconditioner.factors))
-        )
+        fall = kernels.predicted_decrease(state.projection, state.gains, preconditioner.factors)
+        return replace(state, predicted=float(fall))

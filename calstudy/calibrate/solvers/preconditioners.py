@@ -12,29 +12,27 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.projection import Projection, Projector
+from calstudy.calibrate.projection import Projection
 from calstudy.calibrate.tensors import FitTensors
 
 # Antennas and channels with hardly any data count as having this fraction of the mean.
 DEGREE_FLOOR = 1e-4
 
 
-def antenna_degrees(projector: Projector, projection: Projection) -> tf.Tensor:
+def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
     """Return sum_b D |F|^2 of each antenna and channel, floored, shape (Nants, Nfreqs), float32."""
-    tensors = projector.tensors
     power = projection.curvature * pairs.squared_modulus(projection.baseline_model)
     degree = tf.math.unsorted_segment_sum(power, tensors.first, tensors.n_antennas)
     degree += tf.math.unsorted_segment_sum(power, tensors.second, tensors.n_antennas)
     return tf.maximum(degree, DEGREE_FLOOR * tf.reduce_mean(degree))
 
 
-def channel_factors(projector: Projector, projection: Projection, damping: tf.Tensor) -> tf.Tensor:
+def channel_factors(tensors: FitTensors, projection: Projection, damping: tf.Tensor) -> tf.Tensor:
     """Return Cholesky factors of the damped antenna blocks of each channel, shape (2, Nfreqs, Nants, Nants).
 
     Foregrounds are held fixed in these blocks, so that real and imaginary parts of eta decouple: the blocks are the
     degree plus and minus the coupling matrix.
     """
-    tensors = projector.tensors
     power = tf.transpose(projection.curvature * pairs.squared_modulus(projection.baseline_model))
     index = tf.stack([tensors.first, tensors.second], axis=1)
     shape = [tensors.n_antennas, tensors.n_antennas, tensors.n_frequencies]
@@ -99,14 +97,13 @@ def antenna_rows(tensors: FitTensors) -> AntennaRows:
     return AntennaRows(*padded)
 
 
-def antenna_blocks(projector: Projector, projection: Projection) -> tf.Tensor:
+def antenna_blocks(tensors: FitTensors, projection: Projection) -> tf.Tensor:
     """Return the channel blocks of each antenna, Hermitian, shape (Nants, Nfreqs, Nfreqs), complex64, undamped.
 
     Each baseline adds diag(K) - (D F) Q W Q^T (D F)^* to both its antennas, conjugated for the first. With the kernel
     as a sum of squares, the second terms of an antenna are one product of a long thin matrix with itself. Couplings
     between baselines that share a foreground model are left out; the blocks stay positive.
     """
-    tensors = projector.tensors
     sequences = tf.concat(
         [
             tf.reshape(tf.reshape(root, [-1, basis.shape[1]]) @ tf.constant(basis.T, tf.float32), [-1, basis.shape[0]])
@@ -131,15 +128,10 @@ def antenna_blocks(projector: Projector, projection: Projection) -> tf.Tensor:
         tf.constant(table.row, tf.int32),
         tf.constant(table.baseline, tf.int32),
         tf.constant(table.sign, tf.float32),
-        antenna_degrees(projector, projection),
+        antenna_degrees(tensors, projection),
     )
     # One antenna at a time: the temporaries of several would be large.
     return tf.map_fn(block, inputs, fn_output_signature=tf.complex64, parallel_iterations=1)
-
-
-def antenna_factors(blocks: tf.Tensor, degrees: tf.Tensor, damping: tf.Tensor) -> tf.Tensor:
-    """Return Cholesky factors of the antennas' blocks with `damping` times the degrees added to the diagonal."""
-    return tf.linalg.cholesky(blocks + tf.cast(tf.linalg.diag(damping * degrees), blocks.dtype))
 
 
 def solve_antennas(factors: tf.Tensor, values: tf.Tensor) -> tf.Tensor:

@@ -1,0 +1,77 @@
+"""The space in which gains are sought: any gain in any channel, or combinations of smooth functions of frequency.
+
+Solvers that iterate on relative changes eta of the gains, g (1 + eta), see a smooth basis B through the change of
+coordinates eta = (c B^T) / g.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import tensorflow as tf
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.basis import channel_grid, dpss_vectors, restrict
+
+
+def gain_vectors(frequencies: np.ndarray, delay: float, eigenvalue_cutoff: float) -> np.ndarray:
+    """Return orthonormal sequences that hold gains with delays up to `delay` s, shape (Nfreqs, Ngain).
+
+    Parameters
+    ----------
+    frequencies
+        Channel centres on an even grid, gaps allowed, Hz, shape (Nfreqs,).
+    delay
+        Half-width in s; the basis is all of the channels if they do not resolve it.
+    eigenvalue_cutoff
+        Sequences with a smaller spectral concentration are left out.
+    """
+    grid = channel_grid(frequencies)
+    if delay * grid.width >= 0.5:
+        return np.eye(len(frequencies))
+    vectors = dpss_vectors(grid.n_channels, grid.n_channels * grid.width * delay, eigenvalue_cutoff)
+    return restrict(vectors, grid, eigenvalue_cutoff)
+
+
+class GainSpace:
+    """Coordinates of the gains: pairs (2, Nants, Nfreqs) themselves, or coefficients (2, Nants, Ngain) of a basis.
+
+    Parameters
+    ----------
+    vectors
+        Orthonormal, (Nfreqs, Ngain), or None for no restriction.
+    dtype
+        Of all tensors that pass through.
+    """
+
+    def __init__(self, vectors: np.ndarray | None, dtype: tf.DType) -> None:
+        self.vectors = None if vectors is None else tf.constant(vectors, dtype)
+
+    def expand(self, coordinates: tf.Tensor) -> tf.Tensor:
+        """Return what has these coordinates, (2, Nants, Nfreqs)."""
+        if self.vectors is None:
+            return coordinates
+        return tf.einsum("pac,fc->paf", coordinates, self.vectors)
+
+    def reduce(self, values: tf.Tensor) -> tf.Tensor:
+        """Return the coordinates of the closest gains, in least squares; the transpose of `expand`."""
+        return values if self.vectors is None else tf.einsum("paf,fc->pac", values, self.vectors)
+
+    def expand_relative(self, coordinates: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
+        """Return eta for a change of the gains with these coordinates."""
+        if self.vectors is None:
+            return coordinates
+        return pairs.conjugate_multiply(gains, self.expand(coordinates)) / pairs.squared_modulus(gains)
+
+    def reduce_relative(self, values: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
+        """Apply the transpose of `expand_relative`."""
+        if self.vectors is None:
+            return values
+        return self.reduce(pairs.multiply(gains, values) / pairs.squared_modulus(gains))
+
+    def reduce_blocks(self, blocks: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
+        """Return per-antenna matrices (Nants, Nfreqs, Nfreqs) on eta as matrices on coordinates, complex."""
+        if self.vectors is None:
+            return blocks
+        inverse = tf.complex(gains[0], -gains[1]) / tf.cast(pairs.squared_modulus(gains), blocks.dtype)
+        columns = inverse[:, :, None] * tf.cast(self.vectors, blocks.dtype)
+        return tf.matmul(columns, blocks @ columns, adjoint_a=True)

@@ -1,0 +1,105 @@
+"""What a calibration gives back: products in standard formats, and how every solve went."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pyuvdata import UVCal, UVData
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SolveRecord:
+    """How one solve went; fields without a word here as in `calstudy.calibrate.solution.Solution`.
+
+    Attributes
+    ----------
+    integration
+        Index of the first integration.
+    n_integrations
+        How many consecutive ones were solved together.
+    time
+        Julian date of the first.
+    polarization
+        Polarization number of the AIPS convention, such as -5 for XX.
+    peak_memory
+        Largest resident memory of the process during the solve, bytes.
+    """
+
+    integration: int
+    n_integrations: int
+    time: float
+    polarization: int
+    status: str
+    message: str
+    n_steps: int
+    loss_history: np.ndarray
+    seconds: float
+    peak_memory: int
+
+    def summary(self) -> dict[str, Any]:
+        """Return everything but the full loss history, as plain JSON types."""
+        losses = self.loss_history
+        return {
+            "integration": self.integration,
+            "n_integrations": self.n_integrations,
+            "time": self.time,
+            "polarization": self.polarization,
+            "status": self.status,
+            "message": self.message,
+            "n_steps": self.n_steps,
+            "first_loss": _number(losses[0]) if losses.size else None,
+            "last_loss": _number(losses[-1]) if losses.size else None,
+            "seconds": self.seconds,
+            "peak_memory": self.peak_memory,
+        }
+
+    def detail(self) -> dict[str, Any]:
+        """Return the summary with the full loss history."""
+        return {**self.summary(), "loss_history": [_number(loss) for loss in self.loss_history]}
+
+
+def _number(value: float) -> float | None:
+    """Return a float that JSON can hold, None for what it cannot."""
+    return float(value) if np.isfinite(value) else None
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """What `calstudy.calibrate.calamity.calibrate` returns.
+
+    Attributes
+    ----------
+    gains
+        Gains g of each antenna, channel and integration, gain convention ``divide``: V = g_a g_b* m. Flagged where
+        an antenna has no data in a channel, and where a solve was skipped or failed; unity there.
+    model
+        The intrinsic foregrounds F, in the unit of the data.
+    residual
+        R = V / (g_a g_b*) - F, zero where flagged.
+    solutions
+        One record per solve, polarization by polarization, each in the order of time.
+    """
+
+    gains: UVCal
+    model: UVData
+    residual: UVData
+    solutions: tuple[SolveRecord, ...]
+
+    @property
+    def unconverged(self) -> tuple[SolveRecord, ...]:
+        """The solves that did not reach the minimum."""
+        return tuple(record for record in self.solutions if record.status != "converged")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the number of solves by status, total seconds, and every record, as plain JSON types."""
+        statuses = [record.status for record in self.solutions]
+        return {
+            "solves": len(statuses),
+            "by_status": {status: statuses.count(status) for status in sorted(set(statuses))},
+            "seconds": sum(record.seconds for record in self.solutions),
+            "records": [record.summary() for record in self.solutions],
+        }

@@ -1,0 +1,141 @@
+"""L-BFGS on the gains, foregrounds eliminated exactly (scipy's implementation of Byrd et al. 1995).
+
+Gains are scaled by the square root of what their antenna adds to the curvature of the loss, so that all unknowns have
+about the same, which is what the method starts from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import tensorflow as tf
+from scipy.optimize import OptimizeResult, minimize
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.projection import Projection
+from calstudy.calibrate.solvers.gauss_newton import Kernels, Reduced, compiled
+from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
+from calstudy.calibrate.solvers.preconditioners import antenna_degrees
+
+# Steps over which the decrease of the loss is judged: single steps are at times short.
+WINDOW = 10
+
+
+@dataclass(frozen=True, eq=False)
+class LbfgsState:
+    """One point of the iteration; losses are relative to the weighted square of the data.
+
+    Attributes
+    ----------
+    coordinates
+        Of the gains in their space, times `unit`, float64.
+    unit
+        Scale of each antenna's coordinates, (1, Nants, 1), float64.
+    message
+        What scipy said at the end; None before.
+    """
+
+    kernels: Kernels
+    reduced: Reduced
+    coordinates: np.ndarray
+    unit: np.ndarray
+    history: tuple[float, ...]
+    message: str | None = None
+
+    def project(self, coordinates: np.ndarray) -> tuple[tf.Tensor, Projection]:
+        """Return the gains with these coordinates, and the foregrounds eliminated there."""
+        gains = self.kernels.exact_space.expand(tf.constant(coordinates / self.unit))
+        return gains, self.kernels.project(gains, *self.reduced.measured)
+
+
+@dataclass(frozen=True)
+class Lbfgs:
+    """Limited-memory quasi-Newton iteration on the gains.
+
+    Parameters
+    ----------
+    tolerance
+        Converged when `WINDOW` steps together lower the loss by less than this of itself.
+    max_steps
+        Steps at most.
+    memory_size
+        Pairs of steps and gradients that are kept.
+    """
+
+    tolerance: float = 1e-3
+    max_steps: int = 2000
+    memory_size: int = 20
+
+    def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> LbfgsState:
+        """Project at the first gains."""
+        kernels = compiled(problem.structure, problem.frozen)
+        reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
+        projection = kernels.project(reduced.gains, *reduced.measured)
+        degrees = antenna_degrees(kernels.tensors, projection).numpy().mean(axis=1)
+        unit = np.sqrt(degrees / degrees.mean())[None, :, None].astype(np.float64)
+        coordinates = kernels.exact_space.reduce(reduced.gains).numpy() * unit
+        return LbfgsState(kernels, reduced, coordinates, unit, (float(projection.loss),))
+
+    def step(self, state: LbfgsState) -> LbfgsState:
+        """Take all steps: the memory of the method lives within one call."""
+        history, shape = list(state.history), state.coordinates.shape
+        # The loss is small, and scipy's line search has absolute tolerances.
+        first = max(history[0], np.finfo(float).tiny)
+
+        def value(point: np.ndarray) -> tuple[float, np.ndarray]:
+            gains, projection = state.project(point.reshape(shape))
+            slope = -2 * pairs.multiply(projection.descent, gains) / pairs.squared_modulus(gains)
+            slope = state.kernels.exact_space.reduce(slope).numpy() / state.unit
+            return float(projection.loss) / first, np.ravel(slope) / first
+
+        def judge(intermediate_result: OptimizeResult) -> None:
+            history.append(intermediate_result.fun * first)
+            if self._settled(history):
+                raise StopIteration
+
+        options = {"maxiter": self.max_steps, "maxfun": 10 * self.max_steps, "maxcor": self.memory_size}
+        found = minimize(
+            value,
+            np.ravel(state.coordinates),
+            jac=True,
+            method="L-BFGS-B",
+            callback=judge,
+            options=options | {"ftol": 0.0, "gtol": 0.0},
+        )
+        return replace(
+            state, coordinates=found.x.reshape(shape), history=tuple(history), message=str(found.message).strip()
+        )
+
+    def _settled(self, history: Sequence[float]) -> bool:
+        return len(history) > WINDOW and history[-1 - WINDOW] - history[-1] < self.tolerance * history[-1]
+
+    def terminate(self, state: LbfgsState) -> Verdict | None:
+        """Judge by the decrease over the last steps."""
+        n_steps = len(state.history) - 1
+        if not math.isfinite(state.history[-1]):
+            return Verdict("failed", f"the loss is not finite after {n_steps} steps")
+        if state.message is None:
+            return None
+        if self._settled(state.history):
+            return Verdict("converged", f"the last {WINDOW} steps lowered the loss by less than {self.tolerance:g}")
+        if n_steps >= self.max_steps:
+            return Verdict("max-steps", f"not converged after {n_steps} steps")
+        return Verdict("stalled", f"no step lowers the loss any more after {n_steps} steps ({state.message})")
+
+    def losses(self, state: LbfgsState) -> Sequence[float]:
+        """Return the loss history in the unit of the data squared."""
+        return [loss * state.reduced.loss_unit for loss in state.history]
+
+    def estimate(self, state: LbfgsState) -> Estimate:
+        """Return the current gains, and the foregrounds that fit best with them."""
+        gains, projection = state.project(state.coordinates)
+        return Estimate(
+            pairs.to_complex(gains), state.kernels.tensors.unload(projection.model, state.reduced.scale)
+        )
+
+    def memory(self, state: LbfgsState) -> None:
+        """Return nothing: only the gains carry over."""

@@ -1,0 +1,51 @@
+"""Where a solve starts: unity, or gains from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pyuvdata import UVCal, UVData
+
+from calstudy.errors import InputError
+from calstudy.gains import gains_for
+
+
+def read_gains(path: Path) -> UVCal:
+    """Read a CalH5 or calfits file; InputError if it is neither."""
+    try:
+        return UVCal.from_file(path)
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise InputError(f"gains {str(path)!r}: not a readable CalH5 or calfits file ({error})") from None
+
+
+def starting_gains(data: UVData, numbers: np.ndarray, gains: UVCal | None) -> np.ndarray:
+    """Return the gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
+
+    Parameters
+    ----------
+    data
+        The visibilities.
+    numbers
+        Antenna numbers of the rows.
+    gains
+        Unity if None. Of several integrations the closest in time is taken; flagged, zero and infinite gains count as
+        unity.
+
+    Raises
+    ------
+    InputError
+        If an antenna, channel or polarization of the data has no gain, or the gains are delays.
+    """
+    times = np.unique(data.time_array)
+    if gains is None:
+        return np.ones((len(numbers), data.Nfreqs, times.size, data.Npols), complex)
+    if gains.cal_type != "gain":
+        raise InputError(f"gains: holds {gains.cal_type} solutions; gains by channel are needed")
+    values = gains_for(gains, data)
+    rows = {int(number): row for row, number in enumerate(data.telescope.antenna_numbers)}
+    values = values[[rows[int(number)] for number in numbers]]
+    centres = gains.time_array if gains.time_array is not None else np.mean(gains.time_range, axis=1)
+    closest = np.abs(centres[None] - times[:, None]).argmin(axis=1)
+    values = values[:, :, closest]
+    return np.where(np.isfinite(values) & (values != 0), values, 1)

@@ -1,0 +1,136 @@
+"""Signal loss against what was varied: one panel per block of a sweep."""
+
+from __future__ import annotations
+
+import itertools
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from calstudy.figures import style
+from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
+
+if TYPE_CHECKING:
+    from calstudy.power.transfer import TransferFunction
+
+SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
+"""Marker and colour of each band of k, from small k up."""
+COLUMNS = 2
+PANEL_HEIGHT = 1.9
+LABEL_WIDTH = 15
+"""Characters of a value in one line below its points."""
+
+
+@dataclass(frozen=True)
+class SweepPanel:
+    """Transfer functions outside the wedge for the values of one field, or of the combinations of several.
+
+    Attributes
+    ----------
+    field
+        What was varied: dotted path.
+    note
+        What was set besides, for the title; may be empty.
+    values
+        The values as they were written.
+    transfers
+        One per value, all in the same bands of k.
+    """
+
+    field: str
+    note: str
+    values: list[str]
+    transfers: list[TransferFunction]
+
+
+@style.journal_style()
+def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> Figure:
+    """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
+
+    Dashes are C^2 / T: what is retained apart from the scale of the gains (see `calstudy.power.transfer`).
+
+    Parameters
+    ----------
+    panels
+        At least one; at most five bands of k.
+    stand_ins
+        See `calstudy.figures.style.note_stand_ins`.
+
+    Raises
+    ------
+    ValueError
+        If there is no panel, or the transfer functions have different bands.
+    """
+    if not panels:
+        raise ValueError("a figure of a sweep has no panel, expected at least one")
+    edges = panels[0].transfers[0].bin_edges
+    if any(not np.array_equal(item.bin_edges, edges) for panel in panels for item in panel.transfers):
+        raise ValueError("the transfer functions of a sweep have different bands of k, expected the same")
+    columns = min(COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    width = style.ONE_COLUMN if columns == 1 else style.TWO_COLUMNS
+    figure = style.new_figure(width, 0.5 + PANEL_HEIGHT * rows)
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    top = max(1.1, 1.05 * max(_highest(panel) for panel in panels))
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        _draw_panel(axes, panel)
+        axes.set_ylim(min(0.0, 1.1 * min(_lowest(item) for item in panels)), top)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
+    for axes in grid[:, 0]:
+        axes.set_ylabel(TRANSFER)
+    _add_legend(figure, grid.flat[0], edges, columns)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _highest(panel: SweepPanel) -> float:
+    return max(float(np.nanmax(item.transfer, initial=0.0)) for item in panel.transfers)
+
+
+def _lowest(panel: SweepPanel) -> float:
+    return min(float(np.nanmin(item.transfer, initial=0.0)) for item in panel.transfers)
+
+
+def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
+    bands = panel.transfers[0].k.size
+    positions = np.arange(len(panel.values))
+    for band, (marker, colour) in enumerate(SERIES[:bands]):
+        values = np.array([item.transfer[band] for item in panel.transfers])
+        errors = np.array([item.transfer_error[band] for item in panel.transfers])
+        known = np.isfinite(values)
+        shift = 0.1 * (band - (bands - 1) / 2)
+        axes.errorbar(
+            (positions + shift)[known],
+            values[known],
+            yerr=SIGMAS_95 * np.nan_to_num(errors[known]),
+            fmt=marker,
+            color=colour,
+            elinewidth=0.7,
+        )
+        retained = np.array([item.retained[band] for item in panel.transfers])
+        axes.plot(positions + shift, retained, "_", color=colour, markersize=7, linestyle=":", linewidth=0.6)
+    axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
+    axes.set_xlim(-0.5, len(panel.values) - 0.5)
+    axes.set_xticks(positions, [textwrap.fill(text, LABEL_WIDTH) for text in panel.values], fontsize=style.SMALL_SIZE)
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlabel(panel.field)
+    axes.set_title(panel.note)
+
+
+def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> None:
+    labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
+    handles = [
+        axes.errorbar([], [], yerr=[], fmt=marker, color=colour, elinewidth=0.7)
+        for (marker, colour), _ in zip(SERIES, labels, strict=False)
+    ]
+    labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
+    handles.append(Line2D([], [], color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6))
+    labels.append("free of the flux scale")
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)

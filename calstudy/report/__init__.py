@@ -1,0 +1,1 @@
+"""One page about a run: what was studied, how it went, what came out."""

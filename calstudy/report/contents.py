@@ -1,0 +1,317 @@
+"""What a run folder holds, as the tables of its report."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from calstudy.errors import InputError
+from calstudy.progress import duration
+
+MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
+FIRST_FIGURES = ("sweep", "layout", "wedge", "spherical", "signal-loss", "gains", "model", "data", "baselines")
+CAPTIONS = {
+    "sweep": "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars.",
+    "layout": "The array.",
+    "gains": "Gains of two antennas: true, recovered, and their ratio.",
+    "model": "Foregrounds of one baseline: true and fitted.",
+    "data": "Data of one baseline, fitted gains times model, and what is left.",
+    "baselines": "RMS over time of delay-transformed visibilities of several baselines.",
+    "wedge": "Cylindrical power spectra; negative values in blue.",
+    "spherical": "Spherical power spectra with 95 % bars; open where negative.",
+    "signal-loss": "What the calibration leaves of the EoR: T = P^R / P^S, per k and per baseline length and delay.",
+    "reflections": "Delay transform of the true gains.",
+}
+REGIONS = {"outside-wedge": "outside the wedge", "inside-wedge": "inside the wedge"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report.
+
+    Attributes
+    ----------
+    title
+        Heading.
+    columns
+        Names of the columns.
+    rows
+        Texts.
+    note
+        A sentence below the heading, may be empty.
+    verdicts
+        Index of the column whose texts are PASS or FAIL and are coloured, or None.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    verdicts: int | None = None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the report: its name, what it shows, and the png."""
+
+    name: str
+    caption: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class Contents:
+    """All that a report shows.
+
+    Attributes
+    ----------
+    title, description
+        Of the experiment, sweep or collection.
+    facts
+        Short statements by name: when, where, which versions.
+    stand_ins, warnings
+        Sentences.
+    pictures, tables
+        In the order of the page.
+    parts
+        Other run folders that this one consists of: name and relative path of their reports.
+    experiment
+        The resolved experiment file, or an empty text.
+    """
+
+    title: str
+    description: str
+    facts: Mapping[str, str]
+    stand_ins: Sequence[str]
+    warnings: Sequence[str]
+    pictures: Sequence[Picture]
+    tables: Sequence[Table]
+    parts: Sequence[tuple[str, str]] = field(default=())
+    experiment: str = ""
+
+
+def read_contents(folder: Path) -> Contents:
+    """Read a run folder.
+
+    Parameters
+    ----------
+    folder
+        Of a finished run of an experiment, a sweep or a collection.
+
+    Raises
+    ------
+    InputError
+        If it is not the folder of a finished run.
+    """
+    manifest = _manifest(folder)
+    products = manifest.get("products", [])
+    experiment = folder / EXPERIMENT
+    text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
+    tables = [
+        _claims(folder),
+        _summary(folder),
+        _signal_loss(folder),
+        _convergence(products),
+        _simulation(products),
+        _stages(products),
+    ]
+    return Contents(
+        title=manifest["name"],
+        description=manifest.get("description") or _description(text),
+        facts=_facts(manifest),
+        stand_ins=manifest.get("stand_ins", []),
+        warnings=[f"{label}: {text}" for label, text in _warnings(products)],
+        pictures=_pictures(folder),
+        tables=[table for table in tables if table is not None],
+        parts=_parts(manifest),
+        experiment=text,
+    )
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{folder}: not the folder of a finished run ({MANIFEST}: {error.strerror})") from None
+    except ValueError:
+        raise InputError(f"{path}: not valid JSON; the same run again writes it anew") from None
+    if not isinstance(manifest, dict) or "name" not in manifest:
+        raise InputError(f"{path}: not the manifest of a run")
+    return manifest
+
+
+def _description(experiment: str) -> str:
+    import yaml
+
+    return (yaml.safe_load(experiment) or {}).get("description", "") if experiment else ""
+
+
+def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
+    facts = {"finished": manifest.get("finished"), "commit": manifest.get("git_commit")}
+    machine = manifest.get("machine", {})
+    if machine:
+        facts["machine"] = f"{machine['cores']} cores, {machine['memory_gb']} GB, {machine['system']}"
+    seeds = manifest.get("seeds", {})
+    facts["seeds"] = ", ".join(f"{name} {value}" for name, value in seeds.items())
+    versions = manifest.get("versions", {})
+    facts["versions"] = ", ".join(f"{name} {value}" for name, value in versions.items() if value)
+    return {name: str(value) for name, value in facts.items() if value}
+
+
+def _warnings(products: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    return [
+        (f"{item['stage']} ({item['label']})", text)
+        for item in products
+        for text in item.get("notes", {}).get("warnings", [])
+    ]
+
+
+def _pictures(folder: Path) -> list[Picture]:
+    found = {path.stem: path for path in (folder / "figures").glob("*.png")}
+    order = [name for name in FIRST_FIGURES if name in found] + sorted(set(found) - set(FIRST_FIGURES))
+    return [Picture(name, CAPTIONS.get(name, ""), found[name]) for name in order]
+
+
+def _parts(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
+    points = [
+        (item["folder"].rpartition("/")[2], f"{item['folder']}/report.html") for item in manifest.get("points", [])
+    ]
+    return points + [(name, f"../{folder}/report.html") for name, folder in manifest.get("members", {}).items()]
+
+
+def _claims(folder: Path) -> Table | None:
+    path = folder / CLAIMS
+    if not path.is_file():
+        return None
+    claims = json.loads(path.read_text(encoding="utf-8"))
+    evaluated = [claim for claim in claims if claim["measured"] is not None]
+    if not evaluated:
+        return None
+    rows = [
+        (
+            claim["section"],
+            claim["sentence"],
+            claim["quantity"],
+            with_error(claim["measured"], claim["uncertainty"]),
+            claim["threshold"],
+            claim["verdict"],
+        )
+        for claim in evaluated
+    ]
+    others = len(claims) - len(evaluated)
+    note = f"{others} further claims were not evaluated; claims.md says why." if others else ""
+    columns = ("section", "the paper says", "measured is", "measured", "holds if", "verdict")
+    return Table("Claims of the paper", columns, rows, note, verdicts=5)
+
+
+def with_error(value: float | None, error: float | None) -> str:
+    """Write a number with its uncertainty, three digits each."""
+    if value is None:
+        return ""
+    return f"{value:.3g} ± {error:.2g}" if error else f"{value:.3g}"
+
+
+def _read_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _band(row: Mapping[str, str]) -> str:
+    return f"{float(row['k from [h/Mpc]']):g} to {float(row['k to [h/Mpc]']):g}"
+
+
+def _cell(row: Mapping[str, str], name: str) -> str:
+    value, error = float(row[name]), float(row[f"{name} error"])
+    return "no modes" if value != value else f"{value:.3f} ± {error:.3f}"
+
+
+def _signal_loss(folder: Path) -> Table | None:
+    paths = {region: folder / "tables" / f"transfer-bands.{region}.csv" for region in REGIONS}
+    if not all(path.is_file() for path in paths.values()):
+        return None
+    outside, inside = (_read_csv(path) for path in paths.values())
+    rows = [
+        (_band(out), _cell(out, "transfer"), _cell(out, "retained"), _cell(within, "transfer"))
+        for out, within in zip(outside, inside, strict=True)
+    ]
+    note = (
+        "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR. "
+        "What is retained is the same without the error of the calibration's flux scale. One standard deviation."
+    )
+    columns = ("k (h/Mpc)", "T outside the wedge", "retained outside", "T inside the wedge")
+    return Table("Signal loss", columns, rows, note)
+
+
+def _summary(folder: Path) -> Table | None:
+    path = folder / "tables" / SUMMARY
+    if not path.is_file():
+        return None
+    rows = [row for row in _read_csv(path) if row["region"] == "outside-wedge"]
+    bands = list(dict.fromkeys(_band(row) for row in rows))
+    points: dict[str, dict[str, str]] = {}
+    for row in rows:
+        points.setdefault(row["point"], {})[_band(row)] = _cell(row, "transfer")
+    cells = [(point, *(found[band] for band in bands)) for point, found in points.items()]
+    columns = ("point", *(f"k = {band} h/Mpc" for band in bands))
+    return Table(
+        "Signal loss of every point", columns, cells, "T = P^R / P^S outside the wedge, one standard deviation."
+    )
+
+
+def _convergence(products: Sequence[Mapping[str, Any]]) -> Table | None:
+    found = [item for item in products if item["stage"] == "calibrate"]
+    rows = [
+        (
+            item["label"],
+            ", ".join(f"{count} {status}" for status, count in item["notes"]["by_status"].items()),
+            f"{item['notes']['median_steps']:g}" if "median_steps" in item["notes"] else "",
+            f"{item['notes']['median_seconds_per_solve']:.2f} s",
+        )
+        for item in found
+    ]
+    columns = ("calibration of", "solves", "median steps", "median time per solve")
+    return Table("Solver convergence", columns, rows) if rows else None
+
+
+def _simulation(products: Sequence[Mapping[str, Any]]) -> Table | None:
+    rows = []
+    for item in products:
+        if item["stage"] == "simulate":
+            check = item["notes"].get("interpolation")
+            floors = item["notes"].get("delay_floor", {})
+            rows.append(
+                (
+                    item["label"],
+                    f"{check['max_error']:.1e}" if check else "not interpolated",
+                    ", ".join(f"{floor['worst_db']} dB ({taper})" for taper, floor in floors.items()),
+                )
+            )
+    columns = ("component", "largest interpolation error", "delay floor beyond the horizon")
+    note = "Errors relative to the rms; the floor is that of the worst baseline."
+    return Table("Accuracy of the simulation", columns, rows, note) if rows else None
+
+
+def _stages(products: Sequence[Mapping[str, Any]]) -> Table | None:
+    stages: dict[str, list[Mapping[str, Any]]] = {}
+    for item in products:
+        if "cpu_seconds" in item:
+            stages.setdefault(item["stage"], []).append(item)
+    rows = [
+        (
+            stage,
+            str(len(items)),
+            str(sum(item["made_by_this_run"] for item in items)),
+            duration(sum(item["seconds"] for item in items)),
+            duration(sum(item["cpu_seconds"] for item in items)),
+            f"{max(item['peak_memory_bytes'] for item in items) / 1e9:.2f} GB",
+        )
+        for stage, items in stages.items()
+    ]
+    columns = ("stage", "products", "made by this run", "time", "cpu time", "peak memory of the process")
+    note = "Time and memory when each product was made, by this run or an earlier one."
+    return Table("Stages", columns, rows, note) if rows else None

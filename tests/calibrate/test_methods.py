@@ -1,0 +1,203 @@
+"""Other solvers, schedules, smooth gains, frozen skies and joint solves reach the minima they must."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tensorflow as tf
+from conftest import FREQUENCIES, complex_normal, make_toy, scattered
+from test_solvers import in_the_span, product_error
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.basis import dpss_vectors
+from calstudy.calibrate.gain_space import GainSpace, gain_vectors
+from calstudy.calibrate.problem import flag_weights, gain_products
+from calstudy.calibrate.projection import Projector
+from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton
+from calstudy.calibrate.solvers.interface import WarmStart, solve, solve_warm
+from calstudy.calibrate.solvers.lbfgs import Lbfgs
+from calstudy.calibrate.structure import repeat_structure
+from calstudy.calibrate.tensors import FitTensors
+
+
+@pytest.fixture(scope="module")
+def converged(toy):
+    problem = toy.problem()
+    return problem, solve(problem, GaussNewton(tolerance=3e-4))
+
+
+def test_lbfgs_reaches_the_minimum_of_gauss_newton(converged):
+    problem, best = converged
+    found = solve(problem, Lbfgs(tolerance=3e-4))
+    assert found.status == "converged", found.message
+    assert 0.99 * best.loss_history[-1] < found.loss_history[-1] < 1.05 * best.loss_history[-1]
+    onwards = solve_warm(problem, GaussNewton(tolerance=3e-4), WarmStart(found.gains, None))[0]
+    assert onwards.loss_history[-1] == pytest.approx(best.loss_history[-1], rel=2e-3)
+
+
+def test_lbfgs_says_when_it_ran_out_of_steps(toy):
+    solution = solve(toy.problem(), Lbfgs(max_steps=3))
+    assert (solution.status, solution.n_steps) == ("max-steps", 3)
+    assert solution.loss_history[-1] < solution.loss_history[0]
+
+
+@pytest.mark.parametrize("schedule", ["constant", "cosine", "exponential"])
+def test_schedules_start_and_end_where_they_should(schedule):
+    optimizer = Optimizer(learning_rate=0.02, schedule=schedule, final_rate=0.1, max_steps=101)
+    rates = [float(optimizer.rate(tf.constant(step, tf.float64))) for step in (1.0, 51.0, 101.0)]
+    middle = {"constant": 0.02, "cosine": 0.02 * 0.55, "exponential": 0.02 * np.sqrt(0.1)}[schedule]
+    last = 0.02 if schedule == "constant" else 0.002
+    assert rates == pytest.approx([0.02, middle, last], rel=1e-9)
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "exponential"])
+def test_a_falling_rate_reaches_the_minimum_where_the_constant_one_jitters(converged, schedule):
+    problem, best = converged
+    losses = {}
+    for name in (schedule, "constant"):
+        optimizer = Optimizer(learning_rate=0.03, schedule=name, final_rate=1e-3, max_steps=8000)
+        solution = solve(problem, FirstOrder(optimizer, precision="double", tolerance=0.0))
+        losses[name] = np.median(solution.loss_history[-50:])
+    assert losses[schedule] < 1.2 * best.loss_history[-1] < losses["constant"]
+
+
+def smooth_toy(delay=400e-9):
+    """Gains in the span of sequences up to a delay."""
+    toy = make_toy(scattered(8))
+    vectors = gain_vectors(FREQUENCIES, delay, 1e-12)
+    rng = np.random.default_rng(21)
+    gains = 1 + 0.3 * complex_normal(rng, (8, vectors.shape[1])) @ vectors.T
+    return replace(toy, gains=gains), vectors
+
+
+def test_coordinates_of_smooth_gains_are_adjoint():
+    toy, vectors = smooth_toy()
+    space, gains = GainSpace(vectors, tf.float64), pairs.to_pair(toy.gains, tf.float64)
+    rng = np.random.default_rng(22)
+    c = pairs.to_pair(complex_normal(rng, (8, vectors.shape[1])), tf.float64)
+    y = pairs.to_pair(complex_normal(rng, toy.gains.shape), tf.float64)
+    left = float(pairs.inner_product(space.expand_relative(c, gains), y))
+    assert left == pytest.approx(float(pairs.inner_product(c, space.reduce_relative(y, gains))), rel=1e-12)
+    change = pairs.to_complex(space.expand_relative(c, gains)) * toy.gains
+    assert np.abs(change - pairs.to_complex(c) @ vectors.T).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [GaussNewton(tolerance=1e-4), Lbfgs(tolerance=3e-4), FirstOrder(Optimizer("adamax", 0.02, "cosine", 1e-3, 8000))],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_smooth_gains_stay_smooth_and_fit_as_well(solver):
+    toy, vectors = smooth_toy()
+    problem = toy.problem(replace(toy.structure, gain_vectors=vectors), prior="none")
+    solution = solve(problem, solver)
+    outside = solution.gains - solution.gains @ vectors @ vectors.T
+    assert np.abs(outside).max() < 1e-5
+    used = solve(toy.problem(), GaussNewton()).loss_history[-1]
+    noise = np.sum(problem.weights * np.abs(gain_products(toy.gains, toy.antennas) * toy.noise) ** 2)
+    assert used < solution.loss_history.min() < 1.1 * noise
+
+
+def test_a_frozen_sky_gives_the_true_gains(quiet):
+    sky = in_the_span(quiet)
+    data = gain_products(quiet.gains, quiet.antennas) * sky
+    for solver, limit in ((GaussNewton(), 1e-5), (Lbfgs(tolerance=1e-9), 1e-3)):
+        problem = quiet.problem(visibilities=data, sky_model=sky, frozen=True)
+        solution = solve(problem, solver)
+        assert product_error(problem, solution) < limit
+        assert np.abs(solution.model - sky).max() < 1e-12 * np.abs(sky).max()
+        turned = solution.gains * np.exp(-1j * np.angle(np.sum(solution.gains * quiet.gains.conj(), axis=0)))
+        assert np.abs(turned - quiet.gains).max() < 10 * limit
+
+
+def test_a_frozen_problem_needs_a_sky(toy):
+    with pytest.raises(ValueError, match="sky_model: is needed"):
+        toy.problem(frozen=True)
+
+
+def joint_problem(toys):
+    """Integrations of the same gains under different skies, stacked."""
+    first = toys[0]
+    structure = repeat_structure(first.structure, len(toys))
+    data = np.concatenate([gain_products(first.gains, toy.antennas) * (toy.foregrounds + toy.noise) for toy in toys])
+    return first.problem(structure, visibilities=data, weights=flag_weights(np.zeros(data.shape, bool)))
+
+
+def test_joint_solves_share_gains_and_lose_less_of_the_noise():
+    positions = scattered(8)
+    toys = [make_toy(positions, seed=seed) for seed in (1, 2, 3)]
+    toys = [replace(toy, gains=toys[0].gains) for toy in toys]
+    solution = solve(joint_problem(toys), GaussNewton())
+    assert solution.status == "converged", solution.message
+    assert solution.gains.shape == toys[0].gains.shape
+    products = np.tile(gain_products(solution.gains, toys[0].antennas), (3, 1))
+    true = np.tile(gain_products(toys[0].gains, toys[0].antennas), (3, 1))
+    data = true * np.concatenate([toy.foregrounds + toy.noise for toy in toys])
+    joint = np.mean(np.abs(data - products * solution.model) ** 2)
+    alone = []
+    for toy in toys:
+        problem = toy.problem()
+        one = solve(problem, GaussNewton())
+        alone.append(np.mean(np.abs(problem.visibilities - gain_products(one.gains, toy.antennas) * one.model) ** 2))
+    assert joint > 1.2 * np.mean(alone)
+
+
+def test_pieces_of_any_size_give_the_same_projection(toy):
+    structure = toy.structure
+    gains = pairs.to_pair(toy.gains, tf.float64)
+    results = []
+    for piece in (1, 3, 512):
+        tensors = FitTensors(structure, piece)
+        data = tensors.load(toy.problem(), tf.float64)
+        results.append(Projector(tensors).project(gains, data.visibilities, data.weights))
+    for other in results[:2]:
+        assert float(other.loss) == pytest.approx(float(results[2].loss), rel=1e-12)
+        assert np.abs(other.model - results[2].model).max() < 1e-11 * np.abs(results[2].model).max()
+        assert np.abs(other.descent - results[2].descent).max() < 1e-11 * np.abs(results[2].descent).max()
+
+
+def test_gaps_in_frequency_are_flagged_channels(toy):
+    from conftest import BASIS
+
+    from calstudy.calibrate.basis import make_basis
+    from calstudy.calibrate.problem import FitStructure
+
+    present = np.ones(64, bool)
+    present[[10, 11, 30, 31, 32, 33, 50]] = False
+    lengths = np.linalg.norm(toy.vectors, axis=1)
+    gappy = FitStructure.per_baseline(toy.antennas, 8, make_basis(lengths, FREQUENCIES[present], BASIS))
+    flags = np.broadcast_to(~present, toy.foregrounds.shape)
+    whole = solve(toy.problem(weights=flag_weights(flags)), GaussNewton(tolerance=1e-4))
+    problem = toy.problem(
+        gappy,
+        visibilities=toy.visibilities[:, present],
+        weights=flag_weights(flags)[:, present],
+        initial_gains=np.ones((8, present.sum()), complex),
+    )
+    part = solve(problem, GaussNewton(tolerance=1e-4))
+    assert part.loss_history[-1] == pytest.approx(whole.loss_history[-1], rel=1e-3)
+    product = gain_products(part.gains, toy.antennas) * part.model
+    expected = (gain_products(whole.gains, toy.antennas) * whole.model)[:, present]
+    assert np.linalg.norm(product - expected) < 1e-4 * np.linalg.norm(expected)
+
+
+def test_gains_prior_keeps_the_size_of_the_first_gains(toy):
+    start = 1.7 * np.ones(toy.gains.shape, complex)
+    solution = solve(toy.problem(prior="gains", initial_gains=start), GaussNewton())
+    assert np.exp(np.mean(np.log(np.abs(solution.gains)))) == pytest.approx(1.7, rel=1e-9)
+
+
+def test_warm_start_of_lbfgs(converged):
+    problem, best = converged
+    again = solve_warm(problem, Lbfgs(), WarmStart(best.gains, None))[0]
+    assert again.status == "converged"
+    assert again.n_steps < 100
+
+
+def test_wide_delays_leave_gains_free():
+    assert gain_vectors(FREQUENCIES, 2e-6, 1e-12).shape == (64, 64)
+    assert gain_vectors(FREQUENCIES, 200e-9, 1e-12).shape[1] < 40
+    assert dpss_vectors(64, 64 * 400e3 * 200e-9, 1e-12).shape[0] == 64

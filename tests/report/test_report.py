@@ -1,0 +1,221 @@
+"""The report: complete, self-contained, and safe whatever a run is called."""
+
+import base64
+import csv
+import html.parser
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from calstudy.errors import InputError
+from calstudy.report.contents import read_contents, with_error
+from calstudy.report.page import write_report
+
+# One red pixel.
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR4nGP4z8DwHwAFAAH/iZk9HQAAAABJRU5ErkJggg=="
+)
+
+
+def product(stage: str, label: str, **notes) -> dict:
+    return {
+        "stage": stage,
+        "label": label,
+        "key": "0",
+        "notes": notes,
+        "seconds": 30.0,
+        "cpu_seconds": 61.0,
+        "peak_memory_bytes": 2_500_000_000,
+        "made_by_this_run": True,
+        "inputs": {},
+    }
+
+
+MANIFEST = {
+    "name": "demo",
+    "finished": "2026-01-02T03:04:05+00:00",
+    "stand_ins": ["beam: <gaussian> & so on"],
+    "seeds": {"sky.eor.seed": 2},
+    "git_commit": "abc",
+    "versions": {"numpy": "2.4", "matvis": None},
+    "machine": {"cores": 2, "memory_gb": 8.0, "system": "Linux", "python": "3.11"},
+    "products": [
+        product("calibrate", "V even", by_status={"converged": 7, "max-steps": 1}, median_steps=4.0,
+                median_seconds_per_solve=0.25, warnings=["1 of 8 solves did not converge"]),
+        product("simulate", "foregrounds", interpolation={"max_error": 1.5e-11},
+                delay_floor={"hann": {"worst_db": -55.5}}),
+        product("simulate", "eor", interpolation=None),
+        product("figure", "wedge"),
+        product("figure", "spherical"),
+    ],
+}  # fmt: skip
+
+CLAIM = {
+    "name": "a", "section": "Results", "sentence": "R agrees with S.", "quantity": "pull", "measured": 1.234,
+    "uncertainty": 0.1, "threshold": "<= 2", "why": "", "verdict": "PASS", "runs": ["demo"], "reason": "",
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "manifest.json").write_text(json.dumps(MANIFEST))
+    (tmp_path / "experiment.yaml").write_text("name: demo\ndescription: What it is <about>\n")
+    (tmp_path / "figures").mkdir()
+    for name in ("wedge", "spherical", "zebra"):
+        (tmp_path / "figures" / f"{name}.png").write_bytes(PNG)
+    (tmp_path / "tables").mkdir()
+    return tmp_path
+
+
+class Page(html.parser.HTMLParser):
+    """Collects tags, attributes and text of a page, and checks that tags are closed."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.words = ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.attributes += [(tag, name, value) for name, value in attributes]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words += data
+
+
+def page_of(folder: Path) -> Page:
+    return Page(write_report(folder).read_text())
+
+
+def test_the_page_needs_nothing_but_itself(folder):
+    page = page_of(folder)
+    references = [value for _, name, value in page.attributes if name in ("src", "href")]
+    assert references
+    assert all(value.startswith(("data:image/png;base64,", "#")) for value in references)
+    assert "url(" not in page.words
+    assert "@import" not in page.words
+    assert not any(tag in ("script", "link") for tag, _, _ in page.attributes)
+
+
+def test_figures_are_in_the_page_as_they_are_in_the_folder(folder):
+    page = page_of(folder)
+    images = [value.split(",")[1] for tag, name, value in page.attributes if (tag, name) == ("img", "src")]
+    assert [base64.b64decode(image) for image in images] == [PNG] * 3
+    assert page.words.index("wedge") < page.words.index("spherical") < page.words.index("zebra")
+
+
+def test_text_of_a_run_is_text_and_not_markup(folder):
+    page = page_of(folder)
+    assert "beam: <gaussian> & so on" in page.words
+    assert "What it is <about>" in page.words
+
+
+def rows(folder: Path, title: str) -> list[tuple[str, ...]]:
+    return [tuple(row) for table in read_contents(folder).tables if table.title == title for row in table.rows]
+
+
+def test_convergence_simulation_and_stages_are_told(folder):
+    assert rows(folder, "Solver convergence") == [("V even", "7 converged, 1 max-steps", "4", "0.25 s")]
+    assert rows(folder, "Accuracy of the simulation") == [
+        ("foregrounds", "1.5e-11", "-55.5 dB (hann)"),
+        ("eor", "not interpolated", ""),
+    ]
+    assert rows(folder, "Stages")[-1] == ("figure", "2", "2", "60 s", "2 min", "2.50 GB")
+    assert read_contents(folder).warnings == ["calibrate (V even): 1 of 8 solves did not converge"]
+
+
+def test_claims_are_a_table_if_there_are_any(folder):
+    assert rows(folder, "Claims of the paper") == []
+    unknown = {**CLAIM, "measured": None, "uncertainty": None, "verdict": "not evaluated"}
+    failed = {**CLAIM, "verdict": "FAIL"}
+    (folder / "claims.json").write_text(json.dumps([CLAIM, unknown, failed]))
+    found = rows(folder, "Claims of the paper")
+    assert [row[-1] for row in found] == ["PASS", "FAIL"]
+    assert found[0][3] == "1.23 ± 0.1"
+    page = page_of(folder)
+    assert ("td", "class", "FAIL") in page.attributes
+    assert "1 further claims were not evaluated" in page.words
+
+
+def transfer_csv(path: Path, values: list[float]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        names = ("transfer", "transfer error", "retained", "retained error")
+        writer.writerow(["k from [h/Mpc]", "k to [h/Mpc]", *names])
+        for index, value in enumerate(values):
+            writer.writerow([0.1 * (index + 1), 0.1 * (index + 2), value, 0.01, value, 0.02])
+
+
+def test_signal_loss_is_a_table_if_it_was_measured(folder):
+    assert rows(folder, "Signal loss") == []
+    transfer_csv(folder / "tables" / "transfer-bands.outside-wedge.csv", [0.25, 0.9])
+    transfer_csv(folder / "tables" / "transfer-bands.inside-wedge.csv", [0.03, float("nan")])
+    assert rows(folder, "Signal loss") == [
+        ("0.1 to 0.2", "0.250 ± 0.010", "0.250 ± 0.020", "0.030 ± 0.010"),
+        ("0.2 to 0.3", "0.900 ± 0.010", "0.900 ± 0.020", "no modes"),
+    ]
+
+
+def test_a_sweep_and_a_collection_lead_to_the_reports_of_their_parts(folder):
+    points = [{"folder": "points/01-buffer=0ns", "changes": {}}]
+    (folder / "manifest.json").write_text(
+        json.dumps({"name": "both", "points": points, "members": {"hex": "hex-12345678"}, "products": []})
+    )
+    links = [value for tag, name, value in page_of(folder).attributes if (tag, name) == ("a", "href")]
+    assert "points/01-buffer=0ns/report.html" in links
+    assert "../hex-12345678/report.html" in links
+
+
+def test_the_summary_of_a_sweep_has_a_row_per_point(folder):
+    names = ["point", "changes", "region", "k from [h/Mpc]", "k to [h/Mpc]", "transfer", "transfer error"]
+    with (folder / "tables" / "summary.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(names)
+        for point in ("01-a", "02-b"):
+            for region, low, value in (
+                ("outside-wedge", 0.1, 0.5),
+                ("outside-wedge", 0.2, 0.75),
+                ("inside-wedge", 0.1, 0.1),
+            ):
+                writer.writerow([point, "x = 1", region, low, low + 0.1, value, 0.01])
+    assert rows(folder, "Signal loss of every point") == [
+        (point, "0.500 ± 0.010", "0.750 ± 0.010") for point in ("01-a", "02-b")
+    ]
+
+
+def test_what_is_no_run_folder_is_told(folder, tmp_path_factory):
+    empty = tmp_path_factory.mktemp("empty")
+    with pytest.raises(InputError, match="not the folder of a finished run"):
+        write_report(empty)
+    (folder / "manifest.json").write_text("{")
+    with pytest.raises(InputError, match="not valid JSON"):
+        write_report(folder)
+    (folder / "manifest.json").write_text("[]")
+    with pytest.raises(InputError, match="not the manifest"):
+        write_report(folder)
+
+
+def test_the_same_folder_gives_the_same_page(folder):
+    first = write_report(folder).read_bytes()
+    assert write_report(folder).read_bytes() == first
+    assert sorted(path.name for path in folder.iterdir() if path.name.startswith(".")) == []
+    shutil.rmtree(folder / "figures")
+    assert not re.search("Figures", page_of(folder).words)
+
+
+def test_numbers_have_as_many_digits_as_mean_something():
+    assert with_error(None, None) == ""
+    assert with_error(0.123456, None) == "0.123"
+    assert with_error(0.123456, 0.0123) == "0.123 ± 0.012"

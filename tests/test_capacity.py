@@ -1,0 +1,88 @@
+"""Runs are fitted to the memory there is, without changing what they make."""
+
+from pathlib import Path
+
+import pytest
+from tiny import tiny
+
+from calstudy import capacity
+from calstudy.capacity import fit, parse_memory
+from calstudy.errors import InputError
+from calstudy.estimates import estimate
+from calstudy.experiment.files import load, override, validate
+from calstudy.experiment.model import Experiment
+from calstudy.tasks import Graph
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+
+
+@pytest.fixture
+def paper(tmp_path) -> Experiment:
+    """The paper's study at full scale, with an empty store."""
+    return load(EXPERIMENTS / "minredundant.yaml", None, [f"outputs.store={tmp_path / 'store'}"])
+
+
+def largest_piece(experiment: Experiment) -> float:
+    return max(estimate(task).memory for task in Graph(experiment).eor.inputs.values())
+
+
+@pytest.mark.parametrize(("text", "size"), [("6 GB", 6e9), ("500MB", 5e8), (" 1.5 GB ", 1.5e9), ("2 TB", 2e12)])
+def test_an_amount_of_memory_is_a_number_and_a_unit(text, size):
+    assert parse_memory(text) == size
+
+
+@pytest.mark.parametrize("text", ["6", "6 G", "GB", "-1 GB", "0 GB", "1.2.3 GB", "six GB"])
+def test_other_texts_are_refused(text):
+    with pytest.raises(InputError, match="--max-memory"):
+        parse_memory(text)
+
+
+def test_less_memory_means_smaller_pieces_and_fewer_workers(paper):
+    plenty, many = fit(paper, 8, "100 GB")
+    assert (plenty, many) == (paper, 8)
+    little, few = fit(paper, 8, "8 GB")
+    assert little.simulation.chunks > paper.simulation.chunks
+    assert largest_piece(little) < largest_piece(paper)
+    assert 1 <= few < 8
+    costs = [estimate(task).memory for task in Graph(little).tasks]
+    assert few * max(costs) < 8e9
+
+
+def test_smaller_pieces_are_the_same_products(paper):
+    little, _ = fit(paper, 8, "8 GB")
+    before, after = Graph(paper), Graph(little)
+    assert [task.key for task in before.targets] == [task.key for task in after.targets]
+    assert before.eor.key == after.eor.key
+    assert not {t.key for t in before.eor.inputs.values()} & {t.key for t in after.eor.inputs.values()}
+
+
+def test_what_cannot_fit_is_refused_in_one_sentence(paper):
+    with pytest.raises(InputError, match=r"--max-memory leaves 0\.2 GB .* needs about \d\.\d GB"):
+        fit(paper, None, "1 GB")
+
+
+def test_free_memory_is_the_default(paper, monkeypatch):
+    monkeypatch.setattr(capacity, "free_memory", lambda: 1.5e9)
+    with pytest.raises(InputError, match=r"this machine has 0\.7 GB"):
+        fit(paper, None, None)
+    monkeypatch.setattr(capacity, "free_memory", lambda: 200e9)
+    monkeypatch.setattr(capacity, "cores", lambda: 5)
+    assert fit(paper, None, None)[1] == 5
+
+
+def test_workers_asked_for_without_a_limit_are_given(paper, monkeypatch):
+    monkeypatch.setattr(capacity, "free_memory", lambda: 6e9)
+    assert fit(paper, 16, None)[1] == 16
+
+
+def test_a_cluster_is_taken_as_it_is(paper, monkeypatch):
+    monkeypatch.setattr(capacity, "free_memory", lambda: 1)
+    assert fit(paper, None, None, "tcp://somewhere:8786") == (paper, 1)
+
+
+def test_the_number_of_chunks_in_a_file_does_not_change_the_product(tmp_path):
+    keys = {
+        Graph(validate(override(tiny(tmp_path), "simulation.chunks", count), tmp_path)).foregrounds.key
+        for count in (1, 2, 16, 32)
+    }
+    assert len(keys) == 1

@@ -1,0 +1,35 @@
+"""Neither the number of chunks nor that of workers changes the visibilities, to 1e-12 of their rms."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyuvdata import UVData
+from tiny import tiny
+
+from calstudy.execution import Crew, execute, schedule
+from calstudy.experiment.files import override, validate
+from calstudy.store import Store
+from calstudy.tasks import Graph
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+
+def visibilities(folder: Path, chunks: int, workers: int) -> list[np.ndarray]:
+    """Return F and S of the tiny study."""
+    folder.mkdir()
+    graph = Graph(validate(override(tiny(folder), "simulation.chunks", chunks), folder))
+    store = Store(folder / "store")
+    store.prepare()
+    targets = [graph.foregrounds, graph.eor]
+    products = execute(schedule(targets, store).todo, store, Crew(workers, folder / "run.log"))
+    return [UVData.from_file(products[task.key].path / "visibilities.uvh5").data_array for task in targets]
+
+
+def test_chunks_and_workers_change_nothing(tmp_path):
+    whole = visibilities(tmp_path / "whole", chunks=1, workers=1)
+    pieces = visibilities(tmp_path / "pieces", chunks=5, workers=2)
+    for one, other in zip(whole, pieces, strict=True):
+        rms = np.sqrt(np.mean(np.abs(one) ** 2))
+        assert rms > 0
+        assert np.abs(one - other).max() < 1e-12 * rms
