@@ -7,6 +7,9 @@ from typing import Any
 
 from calstudy.tasks import Graph, Task
 
+WITHOUT_SKY = ("layout", "reflections")
+"""Figures of nothing that a stand-in for sky, beam or scale enters."""
+
 
 def figure_task(graph: Graph, name: str) -> Task:
     """Return the task that draws one figure of an experiment.
@@ -18,7 +21,8 @@ def figure_task(graph: Graph, name: str) -> Task:
     name
         One of `calstudy.experiment.model.FigureName`.
     """
-    settings = {"figure": name, "notes": list(graph.footnotes), **FIGURE_SETTINGS[name](graph)}
+    notes = [] if name in WITHOUT_SKY else list(graph.footnotes)
+    settings = {"figure": name, "notes": notes, **FIGURE_SETTINGS[name](graph)}
     return Task("figure", name, settings, FIGURE_INPUTS[name](graph))
 
 

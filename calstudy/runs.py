@@ -67,13 +67,15 @@ def run_folder(experiment: Experiment) -> Path:
 
     The same experiment has the same folder; a changed one never overwrites it.
     """
-    content = experiment.model_dump(mode="json", exclude={"outputs": {"store", "runs"}, "scales": True, "simulation": {"chunks"}})
+    without = {"outputs": {"store", "runs"}, "scales": True, "simulation": {"chunks"}}
+    content = experiment.model_dump(mode="json", exclude=without)
     return experiment.outputs.runs.expanduser().resolve() / f"{experiment.name}-{digest_json(content)[:8]}"
 
 
 def open_folder(folder: Path) -> None:
     """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
-    known = {"report.html", "points", "figures", "tables", "claims.json", "claims.md", MANIFEST, "experiment.yaml", "run.log"}
+    results = {"report.html", "figures", "tables", "points", "claims.json", "claims.md"}
+    known = results | {MANIFEST, "experiment.yaml", "run.log"}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in folder.iterdir() if path.name not in known)

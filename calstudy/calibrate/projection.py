@@ -18,6 +18,9 @@ from calstudy.calibrate.tensors import FitTensors
 
 # Regularizes N relative to its mean diagonal: far below any signal, enough for models with most channels flagged.
 RIDGE = 1e-12
+# The same for the kernel in float32, which rounding would blow up where flags leave foregrounds undetermined; it only
+# makes foregrounds answer a little less there, in the Gauss-Newton matrix but not in the residual.
+KERNEL_RIDGE = 1e-6
 # Singular values kept in the common basis of all buckets, relative to the largest.
 SPAN_CUTOFF = 1e-9
 
@@ -85,15 +88,17 @@ class Projector:
         self._overlaps = [tf.constant(basis.T @ common, tf.float32) for basis in tensors.bases]
         self.project = tf.function(self._project)
 
-    def _normal_cholesky(self, curvature: tf.Tensor, basis: tf.Tensor) -> tf.Tensor:
-        """Return the Cholesky factors of N for the models of one bucket, shape (Nmembers, Nvec, Nvec)."""
+    def _normal_choleskys(self, curvature: tf.Tensor, basis: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return the Cholesky factors of N for the models of one piece, (Nmembers, Nvec, Nvec), with either ridge."""
         n_frequencies, n_vectors = basis.shape
         weighted = tf.reshape(curvature[:, None, :] * tf.transpose(basis), [-1, n_frequencies])
         normal = tf.reshape(weighted @ basis, [-1, n_vectors, n_vectors])
         mean = tf.reduce_mean(tf.linalg.diag_part(normal), -1)[:, None, None]
         # A model without any data gets the identity, and with it coefficients of zero.
-        ridge = tf.where(mean > 0, RIDGE * mean, 1.0)
-        return tf.linalg.cholesky(normal + ridge * tf.eye(n_vectors, dtype=normal.dtype))
+        identity = tf.where(mean > 0, mean, 1.0) * tf.eye(n_vectors, dtype=normal.dtype)
+        empty = tf.where(mean > 0, tf.zeros_like(mean), tf.ones_like(mean)) * identity
+        exact, kernel = (tf.linalg.cholesky(normal + empty + ridge * identity) for ridge in (RIDGE, KERNEL_RIDGE))
+        return exact, kernel
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
         pieces: list[_Piece] = []
@@ -126,14 +131,14 @@ class Projector:
         else:
             group_curvature = tf.math.segment_sum(curvature, owner)
             matched = tf.stack([tf.math.segment_sum(part, owner) for part in tf.unstack(matched)])
-        factor = self._normal_cholesky(group_curvature, basis)
+        factor, kernel = self._normal_choleskys(group_curvature, basis)
         n_frequencies, n_vectors = basis.shape
         projected = tf.reshape(tf.reshape(matched, [-1, n_frequencies]) @ basis, [2, -1, n_vectors])
         coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
         coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
         model = tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, n_frequencies])
         identity = tf.eye(n_vectors, batch_shape=[end - start], dtype=tf.float64)
-        root = tf.cast(tf.linalg.triangular_solve(factor, identity), tf.float32)
+        root = tf.cast(tf.linalg.triangular_solve(kernel, identity), tf.float32)
         spread = tf.reshape(tf.reshape(root, [-1, n_vectors]) @ overlap, [-1, n_vectors, self.rank])
         baseline_model = model if owner is None else tf.gather(model, owner, axis=1)
         residual = visibilities - pairs.multiply(products, baseline_model)

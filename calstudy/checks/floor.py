@@ -12,6 +12,7 @@ from scipy.constants import speed_of_light
 from calstudy.checks.beam import INTERPOLATIONS, interpolated, require_tabulated
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.simulate.chunks import simulate_visibilities
 from calstudy.simulate.engine import make_engine
 from calstudy.simulate.floor import MAIN_LOBES, DelayFloor, delay_floor, make_window
 from calstudy.simulate.nodes import integration_times
@@ -69,12 +70,14 @@ def compare_floors(
     times = integration_times(whole)
     template = subset_template(whole, times[len(times) // 2 :][:1], whole.freq_array)
     sky = make_foregrounds(experiment.sky.foregrounds, whole.freq_array).sky
-    engine = make_engine(experiment.simulation)
+    settings = experiment.simulation
+    engine = make_engine(settings)
     floors = {}
     for name in INTERPOLATIONS:
         tell(name)
         beam = interpolated(instrument.beam, instrument.channels, name)
-        floors[name] = _measure(from_cube(template, engine.simulate(sky, beam, template)))
+        cube = simulate_visibilities(engine, sky, beam, template, settings, smooth_in_frequency=False)
+        floors[name] = _measure(from_cube(template, cube))
     return floors
 
 

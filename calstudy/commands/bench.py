@@ -52,3 +52,32 @@ def simulate(
     show(title, headings, rows, console)
     if output is not None:
         write(output, headings, rows)
+
+
+@bench_app.command()
+def calibrate(
+    antennas: Annotated[int, typer.Option(min=3)] = 36,
+    channels: Annotated[int, typer.Option(min=64)] = 384,
+    integrations: Annotated[int, typer.Option(min=1, help="Solved one from the other.")] = 56,
+    adamax_steps: Annotated[
+        int, typer.Option(min=0, help="Steps the paper's Adamax is given to come within 0.2 % of the minimum.")
+    ] = 20_000,
+    device: Annotated[str, typer.Option(help="cpu or gpu.")] = "cpu",
+    threads: Annotated[int, typer.Option(min=1, help="Processor cores to use.")] = 1,
+    output: Annotated[Path | None, typer.Option(help="Also write the table: a name ending in .md or .csv.")] = None,
+) -> None:
+    """Time steps and solves of the calibrator against the paper's solver, on a synthetic problem."""
+    from calstudy.bench.tables import require_writable, show, write
+    from calstudy.quiet import load_tensorflow
+
+    if output is not None:
+        require_writable(output)
+    load_tensorflow(threads)
+    from calstudy.bench.calibration import HEADINGS, measure
+    from calstudy.bench.calibration_case import Case
+
+    rows = measure(Case(antennas=antennas, channels=channels), integrations, adamax_steps, device)
+    table = [(row.name, row.value, row.note) for row in rows]
+    show("calibrator", HEADINGS, table, Console(highlight=False))
+    if output is not None:
+        write(output, HEADINGS, table)

@@ -21,8 +21,13 @@ from calstudy.sky.counts import draw_population
 
 SMALL = {
     "name": "small",
-    "instrument": {"layout": {"kind": "mwa-compact-minredundant", "count": 5}, "times": {"count": 3}},
+    "instrument": {
+        "layout": {"kind": "mwa-compact-minredundant", "count": 5},
+        "channels": {"width": "320 kHz", "count": 96},
+        "times": {"count": 3},
+    },
     "sky": {"foregrounds": {"kind": "g4jy-and-counts", "count": 300}},
+    "simulation": {"chunks": 2},
 }
 
 

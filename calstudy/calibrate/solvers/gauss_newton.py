@@ -187,7 +187,7 @@ class GaussNewtonState:
     measured
         Visibilities, weights whose sum is one, and the model if it is frozen.
     boost
-        Factor on the damping; grows tenfold whenever a step did not lower the loss, and shrinks again when one did.
+        Factor on the damping; grows tenfold whenever a step did not lower the loss.
     preconditioner
         The antenna blocks, once they are in use.
     predicted
@@ -270,7 +270,7 @@ class GaussNewton:
             projection=trial,
             history=(*state.history, loss),
             n_accepted=state.n_accepted + 1,
-            boost=max(state.boost / 10, 1.0),
+            boost=1.0,
             preconditioner=preconditioner,
         )
         # Without slow directions, the next step will bring less than this one did.

@@ -1,0 +1,128 @@
+"""Synthetic integrations of the paper's problem, made in seconds: point sources, random gains, thermal noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.constants import speed_of_light
+
+from calstudy.calibrate.basis import make_basis
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
+from calstudy.calibrate.settings import BasisSettings
+
+FIRST_CHANNEL, BAND = 167.075e6, 30.72e6
+SIDEREAL_RATE = 7.2921e-5
+SOURCES = 150
+
+
+@dataclass(frozen=True)
+class Case:
+    """How large a problem is.
+
+    Attributes
+    ----------
+    antennas, channels
+        Their numbers; the band is the paper's 30.72 MHz however many channels it has.
+    extent
+        Diameter of the array in m.
+    gain_scatter, noise, eor
+        Scatter of the gains per channel, noise and EoR over the rms of the foregrounds.
+    integration
+        Seconds between integrations.
+    seed
+        Of all that is random.
+    """
+
+    antennas: int = 36
+    channels: int = 384
+    extent: float = 176.0
+    gain_scatter: float = 0.1
+    noise: float = 1e-3
+    eor: float = 0.0
+    integration: float = 2.0
+    seed: int = 1
+
+    @property
+    def frequencies(self) -> np.ndarray:
+        """Channel centres, Hz, (channels,)."""
+        return FIRST_CHANNEL + BAND / self.channels * np.arange(self.channels)
+
+
+class Simulation:
+    """Antennas, sky and gains of a case.
+
+    Attributes
+    ----------
+    positions
+        East, north, up in m, (Nants, 3).
+    antennas
+        Baselines as pairs of antenna indices, (Nbls, 2).
+    gains
+        True gains, constant in time, (Nants, Nfreqs).
+    """
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        rng = np.random.default_rng(case.seed)
+        radius = case.extent / 2 * np.sqrt(rng.uniform(0, 1, case.antennas))
+        angle = rng.uniform(0, 2 * np.pi, case.antennas)
+        # Two antennas at the rim make the longest baseline what it is said to be.
+        radius[:2], angle[:2] = case.extent / 2, (0.0, np.pi)
+        self.positions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(case.antennas)])
+        self.antennas = np.column_stack(np.triu_indices(case.antennas, 1))
+        self._east, self._north, self._flux = _sky(rng)
+        shape = (case.antennas, case.channels)
+        self.gains = 1 + case.gain_scatter * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+        self._rms = float(np.sqrt(np.mean(np.abs(self.foregrounds(0)) ** 2)))
+
+    def structure(self, basis: BasisSettings | None = None) -> FitStructure:
+        """Return the structure of per-baseline modelling."""
+        lengths = np.linalg.norm(self.positions[self.antennas[:, 1]] - self.positions[self.antennas[:, 0]], axis=1)
+        found = make_basis(lengths, self.case.frequencies, basis or BasisSettings())
+        return FitStructure.per_baseline(self.antennas, self.case.antennas, found)
+
+    def foregrounds(self, integration: int) -> np.ndarray:
+        """Return the foregrounds F of one integration as the sky drifts, (Nbls, Nfreqs), complex."""
+        angle = SIDEREAL_RATE * self.case.integration * integration
+        east = self._east + angle * np.sqrt(np.maximum(1 - self._east**2 - self._north**2, 0))
+        up = np.sqrt(np.maximum(1 - east**2 - self._north**2, 0))
+        delay = self.positions @ np.stack([east, self._north, up]) / speed_of_light
+        first, second = self.antennas.T
+        result = np.empty((len(self.antennas), self.case.channels), complex)
+        for channel, frequency in enumerate(self.case.frequencies):
+            width = 0.25 * 182e6 / frequency
+            beam = np.exp(-(np.arccos(up) ** 2) / (2 * width**2)) + 0.01 * up
+            fringe = np.exp(2j * np.pi * frequency * delay)
+            matrix = (fringe * (beam * self._flux * (frequency / 182e6) ** -0.8)) @ fringe.conj().T
+            result[:, channel] = matrix[second, first]
+        return result
+
+    def signal(self, integration: int) -> np.ndarray:
+        """Return a stand-in for the EoR, white in frequency and independent by baseline, (Nbls, Nfreqs)."""
+        del integration
+        rng = np.random.default_rng([self.case.seed, 17])
+        return self.case.eor * self._rms * _complex_normal(rng, (len(self.antennas), self.case.channels))
+
+    def problem(self, integration: int, structure: FitStructure, realization: int = 0) -> CalibrationProblem:
+        """Return the problem of one integration, from unity gains; realizations differ in their noise."""
+        rng = np.random.default_rng([self.case.seed, 3, integration, realization])
+        shape = (len(self.antennas), self.case.channels)
+        sky = self.foregrounds(integration) + self.signal(integration)
+        measured = sky + self.case.noise * self._rms * _complex_normal(rng, shape)
+        return CalibrationProblem(
+            structure,
+            gain_products(self.gains, self.antennas) * measured,
+            flag_weights(np.zeros(shape, bool)),
+            np.ones(self.gains.shape, complex),
+        )
+
+
+def _complex_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
+
+
+def _sky(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return direction cosines and flux densities of sources all over the sky but its rim, where they would set."""
+    radius, angle = 0.98 * np.sqrt(rng.uniform(0, 1, SOURCES)), rng.uniform(0, 2 * np.pi, SOURCES)
+    return radius * np.cos(angle), radius * np.sin(angle), rng.pareto(1.5, SOURCES) + 1

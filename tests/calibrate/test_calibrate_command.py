@@ -1,0 +1,114 @@
+"""``calstudy calibrate`` from file to files: results, exit codes, and one sentence for every mistake."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from pyuvdata import UVCal, UVData
+from test_calamity import make_uvdata
+
+from calstudy import cli
+from calstudy.calibrate.output import FIGURE_FILES
+
+OPTIONS = ["--buffer", "50 ns", "--set", "basis.min_delay=50 ns"]
+
+
+@pytest.fixture
+def data(toy, tmp_path):
+    path = tmp_path / "data.uvh5"
+    uvd = make_uvdata(toy, 2)
+    uvd.flag_array[5, :7] = True
+    uvd.write_uvh5(str(path))
+    return path
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run the command and return its exit code and what it wrote to standard error."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["calstudy", "calibrate", *map(str, arguments)])
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return end.value.code, capsys.readouterr().err
+
+    return run
+
+
+def test_everything_is_written_and_readable(command, data, tmp_path):
+    code, _ = command(data, *OPTIONS, "--output", "out", "--calfits")
+    assert code == 0
+    out = tmp_path / "out"
+    names = {path.name for path in out.iterdir()}
+    assert names == {"gains.calh5", "gains.calfits", "model.uvh5", "residual.uvh5", "solution.json", *FIGURE_FILES}
+    gains, fits = UVCal.from_file(str(out / "gains.calh5")), UVCal.from_file(str(out / "gains.calfits"))
+    assert np.allclose(gains.gain_array, fits.gain_array, rtol=1e-5)
+    model, residual = (UVData.from_file(str(out / name)) for name in ("model.uvh5", "residual.uvh5"))
+    original = UVData.from_file(str(data))
+    assert np.array_equal(residual.flag_array, original.flag_array)
+    first, second = (np.searchsorted(gains.ant_array, numbers) for numbers in (model.ant_1_array, model.ant_2_array))
+    time = np.repeat([0, 1], model.Nbls)
+    products = gains.gain_array[first, :, time] * gains.gain_array[second, :, time].conj()
+    used = ~original.flag_array
+    rebuilt = products * (model.data_array + residual.data_array)
+    assert np.abs(rebuilt - original.data_array)[used].max() < 1e-5 * np.abs(original.data_array).max()
+
+
+def test_the_log_tells_every_solve(command, data, tmp_path):
+    command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
+    log = json.loads((tmp_path / "out" / "solution.json").read_text())
+    assert log["by_status"] == {"converged": 1}
+    (record,) = log["records"]
+    assert len(record["loss_history"]) == record["n_steps"] + 1
+    assert record["seconds"] > 0 and record["peak_memory"] > 1e8
+    assert log["settings"]["basis"]["buffer"].startswith("5e-08")
+    assert log["settings"]["prior"] == "gains"
+
+
+def test_results_are_never_overwritten_unasked(command, data, tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "gains.calh5").write_text("precious")
+    code, error = command(data, *OPTIONS, "--output", "out")
+    assert code == 2
+    assert error == "calstudy: --output out: holds gains.calh5 already; use --overwrite or another folder\n"
+    assert (folder / "gains.calh5").read_text() == "precious"
+    assert command(data, *OPTIONS, "--output", "out", "--overwrite")[0] == 0
+    assert UVCal.from_file(str(folder / "gains.calh5")).Ntimes == 2
+
+
+def test_not_converging_is_exit_code_3_and_says_which(command, data):
+    code, error = command(data, *OPTIONS, "--set", "solver.max_steps=1", "--output", "out")
+    assert code == 3
+    assert "2 of 2 solves did not converge" in error
+    assert "integration 1, polarization -5: max-steps, not converged after 1 steps" in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["none.uvh5"], "none.uvh5: no such file or folder"),
+        (["data.uvh5", "--solver", "newton"], "solver: 'newton' is not a choice"),
+        (["data.uvh5", "--buffer", "50"], "basis.buffer: '50' has no unit"),
+        (["data.uvh5", "--set", "bufer=3"], "bufer: unknown key"),
+        (["data.uvh5", "--redundant", "--gains-only"], "--redundant and --gains-only: choose one"),
+        (["data.uvh5", "--gains-only", *OPTIONS], "'sky-based' needs a sky model"),
+        (["data.uvh5", "--gains", "no.calh5"], "no.calh5: no such file"),
+        (["data.uvh5", "--weights", "no.h5"], "--weights no.h5: neither flags, nsamples or autos, nor a file"),
+        (["data.uvh5", "--select", "antennas=3"], "--select antennas: '3' is not in the data"),
+        (["data.uvh5", "--buffer", "2000 ns"], "fills all 64 channels"),
+        (["data.uvh5", "--set", "autos=true"], "the data hold no autocorrelations"),
+        (["data.uvh5", "--gains", "data.uvh5", *OPTIONS], "not a readable CalH5 or calfits file"),
+    ],
+)
+def test_mistakes_are_one_sentence(command, data, arguments, sentence):
+    code, error = command(*arguments)
+    assert code == 2
+    # The plan that precedes the solves is not a complaint.
+    complaints = [line for line in error.splitlines() if line.startswith("calstudy:")]
+    assert len(complaints) == 1 and sentence in complaints[0]
+    assert "Traceback" not in error

@@ -1,0 +1,152 @@
+"""Data of any shape become what calibration needs; nothing is invented, and everything that was changed is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pyuvdata import UVData
+from test_calamity import make_uvdata
+
+from calstudy.calibrate.reading import match_sky_model, prepare, read_visibilities
+from calstudy.calibrate.selection import Selection, parse_selection, select
+from calstudy.errors import InputError
+from calstudy.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
+
+
+@pytest.fixture
+def data(toy):
+    return make_uvdata(toy, 3)
+
+
+def test_complete_data_are_left_as_they_are(data):
+    prepared, notes = prepare(data)
+    assert notes == []
+    assert np.array_equal(to_cube(prepared), to_cube(data))
+    assert np.array_equal(antenna_pairs(prepared), antenna_pairs(data))
+
+
+@pytest.mark.parametrize("order", ["baseline", "random"])
+def test_any_order_becomes_time_major(data, order):
+    shuffled = data.copy()
+    if order == "baseline":
+        shuffled.reorder_blts(order="baseline", minor_order="time")
+    else:
+        shuffled.reorder_blts(order=np.random.default_rng(1).permutation(data.Nblts))
+    before = shuffled.copy()
+    prepared, notes = prepare(shuffled)
+    assert notes == []
+    assert shuffled == before
+    assert np.array_equal(to_cube(prepared), to_cube(data))
+    prepared.check()
+
+
+def test_missing_samples_are_flagged(data):
+    keep = np.delete(np.arange(data.Nblts), [3, 40, 41])
+    prepared, notes = prepare(data.select(blt_inds=keep, inplace=False))
+    require_rectangular(prepared)
+    prepared.check()
+    assert notes == ["3 of 84 samples of a baseline at a time were missing and are flagged."]
+    flags = flag_cube(prepared).reshape(84, 64)
+    assert flags[[3, 40, 41]].all() and not np.delete(flags, [3, 40, 41], 0).any()
+    present = np.delete(np.arange(84), [3, 40, 41])
+    assert np.array_equal(to_cube(prepared).reshape(84, -1)[present], to_cube(data).reshape(84, -1)[present])
+    assert np.array_equal(prepared.time_array, data.time_array)
+    assert np.array_equal(prepared.uvw_array, data.uvw_array)
+    assert np.array_equal(prepared.baseline_array, data.baseline_array)
+
+
+def test_values_that_are_not_finite_are_flagged_and_counted(data):
+    data.data_array[5, 3] = np.nan
+    data.data_array[6, 4] = np.inf
+    data.flag_array[6, 4] = True
+    prepared, notes = prepare(data)
+    assert prepared.flag_array[5, 3].all()
+    assert notes == ["1 samples are not finite (NaN or infinite) and were flagged."]
+
+
+def test_data_without_common_times_are_refused(data):
+    keep = [row for row in range(data.Nblts) if row % 28 < 2 or row < 28]
+    with pytest.raises(InputError, match="only 38 % of the samples are present"):
+        prepare(data.select(blt_inds=keep, inplace=False))
+
+
+def test_cross_hands_are_left_out_and_told(toy):
+    both = make_uvdata(toy, 1, polarizations=(-5, -6))
+    crossed = both.copy()
+    crossed.polarization_array = np.array([-7, -8])
+    crossed.check()
+    prepared, notes = prepare(both + crossed)
+    assert list(prepared.polarization_array) == [-5, -6]
+    assert notes == ["Polarizations en, ne are not calibrated."]
+    with pytest.raises(InputError, match="no parallel hands"):
+        prepare(crossed)
+
+
+def test_phased_data_are_unphased(data):
+    phased = data.copy()
+    phased.phase(ra=0.3, dec=-0.4, cat_name="field", phase_frame="icrs")
+    prepared, notes = prepare(phased)
+    assert len(notes) == 1 and "drift scan" in notes[0]
+    assert np.abs(to_cube(prepared) - to_cube(data)).max() < 1e-6 * np.abs(to_cube(data)).max()
+
+
+def test_sky_models_are_matched_and_turned(data):
+    sky = data.copy()
+    sky.conjugate_bls(np.arange(0, 84, 2))
+    sky.reorder_blts(order="baseline", minor_order="time")
+    part = select(data, Selection(times=(1, 2), lengths=(0.0, 12.0)))
+    prepared, _ = prepare(part)
+    matched = match_sky_model(prepare(sky)[0], prepared)
+    assert np.array_equal(to_cube(matched), to_cube(prepared))
+    short = prepare(sky, Selection(frequencies=(170e6, None)))[0]
+    with pytest.raises(InputError, match="lacks channels"):
+        match_sky_model(short, prepared)
+    with pytest.raises(InputError, match="lacks integrations"):
+        match_sky_model(prepare(sky, Selection(times=(0, 0)))[0], prepared)
+    with pytest.raises(InputError, match=r"lacks 4 baseline\(s\) of the data, such as"):
+        match_sky_model(prepare(sky, Selection(antennas=("10", "12", "14", "16")))[0], prepare(
+            data, Selection(antennas=("10", "12", "14", "16", "18")))[0])
+
+
+def test_selections_are_read_and_applied(data):
+    selection = parse_selection(
+        ["antennas=10,ant12,16", "times=1..", "frequencies=165 MHz..170 MHz", "polarizations=ee", "lengths=0 m..500 m"]
+    )
+    assert selection.times == (1, None)
+    part = select(data, selection)
+    assert (part.Nants_data, part.Ntimes, part.Npols) == (3, 2, 1)
+    assert part.freq_array.min() >= 165e6 and part.freq_array.max() <= 170e6
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("antenna=3", "write one of antennas="),
+        ("times=3", "write a range such as times=0..9"),
+        ("times=a..b", "not a whole number"),
+        ("frequencies=100..200", "has no unit"),
+        ("antennas=999", "'999' is not in the data"),
+        ("polarizations=xy", "not in the data, which have ee"),
+        ("times=50..", "no integrations in this range"),
+        ("lengths=900 m..", "no baselines"),
+    ],
+)
+def test_bad_selections_are_one_sentence(data, text, match):
+    with pytest.raises(InputError, match=match):
+        select(data, parse_selection([text]))
+
+
+def test_files_come_back_as_written(data, tmp_path):
+    data.write_uvh5(str(tmp_path / "a.uvh5"))
+    assert np.array_equal(read_visibilities([tmp_path / "a.uvh5"]).data_array, data.data_array)
+    parts = [data.select(times=[time], inplace=False) for time in np.unique(data.time_array)]
+    paths = [tmp_path / f"{index}.uvh5" for index in range(3)]
+    for part, path in zip(parts, paths, strict=True):
+        part.write_uvh5(str(path))
+    assert read_visibilities(paths).Ntimes == 3
+    (tmp_path / "note.uvh5").write_text("no data")
+    with pytest.raises(InputError, match="cannot be read as visibilities"):
+        read_visibilities([tmp_path / "note.uvh5"])
+    with pytest.raises(InputError, match="no such file"):
+        read_visibilities([tmp_path / "none.uvh5"])
+    assert isinstance(data, UVData)
