@@ -170,9 +170,7 @@ def _against_paper(
     steps = steps_to(problem, ABOVE_FLOOR * floor, adamax_steps)
     counted = steps or adamax_steps
     bound = "" if steps else "at least "
-    rows.append(
-        Row("Adamax 0.01, steps to 0.2 % above the minimum", f"{steps}" if steps else f"not in {adamax_steps}")
-    )
+    rows.append(Row("Adamax 0.01, steps to 0.2 % above the minimum", f"{steps}" if steps else f"not in {adamax_steps}"))
     rows.append(Row("Adamax 0.01, paper-style, to 0.2 %", f"{bound}{counted * paper:.0f} s"))
     rows.append(Row("that over the default solver, cold", f"{bound}{counted * paper / cold_seconds:.0f}"))
     return rows

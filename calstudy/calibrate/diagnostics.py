@@ -59,7 +59,9 @@ def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarr
     gains = result.gains
     flags = gains.flag_array[..., polarization]
     used = np.flatnonzero(~flags.all(axis=(1, 2)))
-    used = used[np.unique(np.linspace(0, used.size - 1, min(used.size, MAX_ANTENNAS)).astype(int))] if used.size else used
+    used = (
+        used[np.unique(np.linspace(0, used.size - 1, min(used.size, MAX_ANTENNAS)).astype(int))] if used.size else used
+    )
     values = np.where(flags[used], np.nan, gains.gain_array[used, :, :, polarization])
     times = np.flatnonzero(~flags.all(axis=(0, 1)))
     middle = times[times.size // 2] if times.size else 0

@@ -18,9 +18,9 @@ from calstudy.calibrate.tensors import FitTensors
 
 # Regularizes N relative to its mean diagonal: far below any signal, enough for models with most channels flagged.
 RIDGE = 1e-12
-# The same for the kernel in float32, which rounding would blow up where flags leave foregrounds undetermined; it only
-# makes foregrounds answer a little less there, in the Gauss-Newton matrix but not in the residual.
-KERNEL_RIDGE = 1e-6
+# The same for the kernel in float32, whose rounding would swamp the damping where flags leave foregrounds undetermined.
+# One iteration of Tikhonov's regularization keeps what it takes from well determined ones to its square.
+KERNEL_RIDGE = 1e-3
 # Singular values kept in the common basis of all buckets, relative to the largest.
 SPAN_CUTOFF = 1e-9
 
@@ -44,8 +44,8 @@ class Projection(NamedTuple):
         W of each model, shape (Nmodels, Q, Q), float32: foregrounds answer a weighted change y of the visibilities of
         their group with ``Q W Q^T y``, where Q is the common basis.
     roots
-        For each piece the inverse Cholesky factors of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel
-        without the common basis is ``Q W Q^T = (L^-1 A^T)^T (L^-1 A^T)``.
+        For each piece roots R of the inverse of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel without the
+        common basis is ``Q W Q^T = (R A^T)^T (R A^T)``.
     """
 
     loss: tf.Tensor
@@ -88,17 +88,22 @@ class Projector:
         self._overlaps = [tf.constant(basis.T @ common, tf.float32) for basis in tensors.bases]
         self.project = tf.function(self._project)
 
-    def _normal_choleskys(self, curvature: tf.Tensor, basis: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return the Cholesky factors of N for the models of one piece, (Nmembers, Nvec, Nvec), with either ridge."""
+    def _factor(self, curvature: tf.Tensor, basis: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return, for the models of one piece, the Cholesky factors of N and a root R of the kernel, N^-1 ~ R^T R.
+
+        Both have the shape (Nmembers, Nvec, Nvec). With the ridge e and M = N + e, the kernel is M^-1 (1 + e M^-1).
+        """
         n_frequencies, n_vectors = basis.shape
         weighted = tf.reshape(curvature[:, None, :] * tf.transpose(basis), [-1, n_frequencies])
         normal = tf.reshape(weighted @ basis, [-1, n_vectors, n_vectors])
         mean = tf.reduce_mean(tf.linalg.diag_part(normal), -1)[:, None, None]
+        identity = tf.eye(n_vectors, batch_shape=tf.shape(normal)[:1], dtype=normal.dtype)
         # A model without any data gets the identity, and with it coefficients of zero.
-        identity = tf.where(mean > 0, mean, 1.0) * tf.eye(n_vectors, dtype=normal.dtype)
-        empty = tf.where(mean > 0, tf.zeros_like(mean), tf.ones_like(mean)) * identity
-        exact, kernel = (tf.linalg.cholesky(normal + empty + ridge * identity) for ridge in (RIDGE, KERNEL_RIDGE))
-        return exact, kernel
+        normal += tf.where(mean > 0, RIDGE * mean, 1.0) * identity
+        ridge = KERNEL_RIDGE * mean
+        root = tf.linalg.triangular_solve(tf.linalg.cholesky(normal + ridge * identity), identity)
+        again = tf.linalg.cholesky(identity + ridge * tf.matmul(root, root, transpose_b=True))
+        return tf.linalg.cholesky(normal), tf.matmul(again, root, transpose_a=True)
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
         pieces: list[_Piece] = []
@@ -120,7 +125,7 @@ class Projector:
     def _project_piece(self, index: int, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> _Piece:
         """Eliminate the foregrounds of one piece of models."""
         tensors, basis, overlap = self.tensors, self._bases[index], self._overlaps[index]
-        (start, end), (first, last) = tensors.slices[index], tensors.baseline_slices[index]
+        start, (first, last) = tensors.slices[index][0], tensors.baseline_slices[index]
         visibilities, weights = visibilities[:, first:last], weights[first:last]
         products = tensors.gain_products(gains, first, last)
         curvature = weights * pairs.squared_modulus(products)
@@ -131,14 +136,13 @@ class Projector:
         else:
             group_curvature = tf.math.segment_sum(curvature, owner)
             matched = tf.stack([tf.math.segment_sum(part, owner) for part in tf.unstack(matched)])
-        factor, kernel = self._normal_choleskys(group_curvature, basis)
+        factor, root = self._factor(group_curvature, basis)
         n_frequencies, n_vectors = basis.shape
         projected = tf.reshape(tf.reshape(matched, [-1, n_frequencies]) @ basis, [2, -1, n_vectors])
         coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
         coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
         model = tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, n_frequencies])
-        identity = tf.eye(n_vectors, batch_shape=[end - start], dtype=tf.float64)
-        root = tf.cast(tf.linalg.triangular_solve(kernel, identity), tf.float32)
+        root = tf.cast(root, tf.float32)
         spread = tf.reshape(tf.reshape(root, [-1, n_vectors]) @ overlap, [-1, n_vectors, self.rank])
         baseline_model = model if owner is None else tf.gather(model, owner, axis=1)
         residual = visibilities - pairs.multiply(products, baseline_model)

@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 
 # With fewer of its samples present, a data set has no common times and baselines worth speaking of.
 MIN_PRESENT = 0.5
+EVERYTHING = Selection()
 
 
 def read_visibilities(paths: Sequence[Path]) -> UVData:
@@ -51,7 +52,7 @@ def _first_sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else 'no reason given'}"
 
 
-def prepare(data: UVData, selection: Selection = Selection()) -> tuple[UVData, list[str]]:
+def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:
     """Select, unphase, order and fill a data set; the given one is not changed.
 
     Parameters

@@ -160,5 +160,7 @@ def _polarization(data: UVData, name: str) -> int:
     for shown, number in zip(data.get_pols(), list(data.polarization_array), strict=True):
         numbers[shown.lower()] = int(number)
     if name.lower() not in numbers:
-        raise InputError(f"--select polarizations: {name!r} is not in the data, which have {', '.join(data.get_pols())}")
+        raise InputError(
+            f"--select polarizations: {name!r} is not in the data, which have {', '.join(data.get_pols())}"
+        )
     return numbers[name.lower()]

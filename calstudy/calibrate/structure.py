@@ -66,9 +66,7 @@ def repeat_structure(structure: FitStructure, count: int) -> FitStructure:
         return structure
     n_models = structure.basis.n_models
     offsets = n_models * np.arange(count)[:, None]
-    buckets = tuple(
-        replace(bucket, members=(bucket.members + offsets).ravel()) for bucket in structure.basis.buckets
-    )
+    buckets = tuple(replace(bucket, members=(bucket.members + offsets).ravel()) for bucket in structure.basis.buckets)
     return replace(
         structure,
         antennas=np.tile(structure.antennas, (count, 1)),

@@ -15,7 +15,6 @@ import tensorflow as tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 
-
 # Models of one bucket that are worked on at a time: bounds the temporaries, which have the size of their bases.
 PIECE = 512
 

@@ -64,7 +64,8 @@ def _from_autos(data: UVData, fitted: np.ndarray) -> np.ndarray:
     missing = sorted(set(antennas[fitted].ravel().tolist()) - set(autos))
     if missing:
         raise InputError(
-            f"weights: 'autos' needs autocorrelations, which the data lack for antenna(s) {', '.join(map(str, missing))}"
+            "weights: 'autos' needs autocorrelations, which the data lack for antenna(s) "
+            f"{', '.join(map(str, missing))}"
         )
     power = np.where(flag_cube(data), 0, np.nan_to_num(to_cube(data).real))
     inverse = np.where(power > 0, 1 / np.where(power > 0, power, 1), 0)

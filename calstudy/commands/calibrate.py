@@ -37,8 +37,8 @@ Weighting = Annotated[str | None, typer.Option(help="flags (default), nsamples, 
 Select = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="KEY=VALUE", help="antennas=0,1,12  lengths='14 m..60 m'  times=0..9  frequencies='120 MHz..'  "
-        "polarizations=xx"
+        metavar="KEY=VALUE",
+        help="antennas=0,1,12  lengths='14 m..60 m'  times=0..9  frequencies='120 MHz..'  polarizations=xx",
     ),
 ]
 Set = Annotated[

@@ -96,10 +96,10 @@ def floor(file: File, scale: Scale = None, overrides: Set = None, folder: Folder
         floors = compare_floors(experiment, lambda name: status.update(f"simulating with interpolation: {name}"))
     tapers = ("dolph-chebyshev", "blackman-harris")
     rows = [
-        (name, *(f"{value:.1f}" for taper in tapers for value in (_worst(measured, taper))))
+        (name, *(f"{value:.1f}" for taper in tapers for value in _worst(measured, taper)))
         for name, measured in floors.items()
     ]
-    headings = ("interpolation", *(f"{taper}, {kind}" for taper in tapers for kind in ("rms", "peak")))
+    headings = ("interpolation", "Dolph-Chebyshev: rms", "peak", "Blackman-Harris: rms", "peak")
     show("highest floor of any baseline length, dB of brightness", headings, rows, console)
     figure = draw_delay_floors(floors, experiment.corruption.eor_level, _notes(experiment, "sky", "beam", "reduced"))
     _save(figure, floors, folder, "delay_floor")

@@ -48,8 +48,10 @@ def draw_delay_floors(
     left.set(xlabel=style.DELAY, ylabel="brightness relative to peak (dB)", ylim=(-105, 3))
     left.margins(x=0)
     right.set(xlabel=style.BASELINE_LENGTH)
-    for line, label in ((":", "Blackman–Harris"), ("-", "Dolph–Chebyshev"), ("-.", "paper's artefacts")):
+    for line, label in (("-", "Dolph–Chebyshev"), (":", "Blackman–Harris"), ("-.", "paper's artefacts")):
         right.plot([], [], color=style.GREY, linestyle=line, label=label)
+    if eor_level is not None:
+        right.plot([], [], color=style.BLACK, linewidth=0.6, label="EoR asked for")
     right.legend(loc="upper right")
     left.legend(loc="upper right")
     style.note_stand_ins(figure, stand_ins)

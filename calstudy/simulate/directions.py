@@ -46,15 +46,20 @@ class SourceTracks:
         distinct = np.unique(times_jd)
         nodes = distinct if count >= len(distinct) else chebyshev_nodes(distinct[0], distinct[-1], count)
         self._nodes = nodes
-        coordinates = (
-            sky.skycoord if sky.component_type == "point" else SkyCoord(*sky.get_lon_lat(), frame=sky.hpx_frame)
-        )
+        coordinates = sky_coordinates(sky)
         self._vectors = np.stack([_enu(coordinates, location, time) for time in nodes])
 
     def at(self, time_jd: float, components: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Return unit vectors towards the components in east, north, up, (3, Ncomponents)."""
         weights = interpolation_matrix(self._nodes, np.array([time_jd]))[0]
         return np.tensordot(weights, self._vectors[:, :, components], axes=1)
+
+
+def sky_coordinates(sky: SkyModel) -> SkyCoord:
+    """Return where the components are, (Ncomponents,): points, or centres of HEALPix pixels, in the sky's own frame."""
+    if sky.component_type == "point":
+        return sky.skycoord
+    return SkyCoord(*sky.get_lon_lat(), frame=sky.hpx_frame)
 
 
 def _enu(coordinates: SkyCoord, location: EarthLocation, time_jd: float) -> np.ndarray:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
-from astropy.coordinates import ICRS, SkyCoord
+from astropy.coordinates import ICRS
 from astropy.time import Time
 from matvis.wrapper import simulate_vis
 from pyradiosky import SkyModel
@@ -11,9 +13,10 @@ from pyuvdata import BeamInterface, UVBeam, UVData
 
 from calstudy.errors import InputError
 from calstudy.instrument.telescope import use_bundled_earth_orientation
-from calstudy.simulate.brightness import is_polarized, stokes_i
+from calstudy.simulate.brightness import stokes_i
+from calstudy.simulate.directions import sky_coordinates
+from calstudy.simulate.feeds import refusal, select_polarizations
 from calstudy.simulate.nodes import integration_times
-from calstudy.simulate.nufft import FEED_PAIRS
 from calstudy.visibilities import antenna_indices, require_rectangular
 
 # matvis splits its sources so that a block takes about this much memory (bytes).
@@ -36,14 +39,7 @@ class MatvisEngine:
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
         """Return why this engine cannot do what is asked, or None if it can."""
-        if is_polarized(sky):
-            return "the matvis engine is given unpolarized skies only"
-        unknown = [int(number) for number in template.polarization_array if int(number) not in FEED_PAIRS]
-        if unknown:
-            return f"polarization number {unknown[0]} is not linear"
-        if list(beam.at(template.freq_array[:1]).feed_array) != ["x", "y"]:
-            return "matvis needs a beam with feeds x and y"
-        return None
+        return refusal(self.name, sky, beam, template)
 
     def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`.
@@ -57,32 +53,32 @@ class MatvisEngine:
         reason = self.refusal(sky, beam, template)
         if reason:
             raise InputError(reason)
-        coordinates = (
-            sky.skycoord if sky.component_type == "point" else SkyCoord(*sky.get_lon_lat(), frame=sky.hpx_frame)
-        )
-        coordinates = coordinates.transform_to(ICRS())
+        coordinates = sky_coordinates(sky).transform_to(ICRS())
         telescope = template.telescope
         used, pairs = np.unique(antenna_indices(template), return_inverse=True)
         positions = telescope.get_enu_antpos()[used]
-        tabulated = beam.at(template.freq_array)
         use_bundled_earth_orientation()
-        visibilities = simulate_vis(
+        simulate_positive = partial(
+            simulate_vis,
             ants=dict(enumerate(positions)),
-            fluxes=np.ascontiguousarray(stokes_i(sky, template.freq_array).T),
             ra=coordinates.ra.rad,
             dec=coordinates.dec.rad,
             freqs=template.freq_array,
             times=Time(integration_times(template), format="jd", scale="utc", location=telescope.location),
-            beams=[_as_splines(tabulated)],
+            beams=[_as_splines(beam.at(template.freq_array))],
             telescope_loc=telescope.location,
             polarized=True,
             precision=self._precision,
             antpairs=pairs.reshape(-1, 2),
             max_memory=BLOCK_MEMORY,
         )
+        flux = np.ascontiguousarray(stokes_i(sky, template.freq_array).T)
         # (Nfreqs, Ntimes, Nbls, feed, feed)
-        rows, columns = np.array([FEED_PAIRS[int(number)] for number in template.polarization_array]).T
-        return visibilities.transpose(1, 2, 0, 3, 4)[..., rows, columns].astype(np.complex128)
+        visibilities = simulate_positive(fluxes=np.maximum(flux, 0))
+        if flux.min() < 0:
+            # matvis takes the square root of fluxes, and those of a 21 cm sky have both signs.
+            visibilities -= simulate_positive(fluxes=np.maximum(-flux, 0))
+        return select_polarizations(visibilities.transpose(1, 2, 0, 3, 4), template).astype(np.complex128)
 
 
 class _SplineBeam(UVBeam):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from astropy.coordinates import ICRS, SkyCoord
+from astropy.coordinates import ICRS
 from astropy.time import Time
 from fftvis.wrapper import simulate_vis
 from pyradiosky import SkyModel
@@ -11,12 +11,11 @@ from pyuvdata import BeamInterface, UVBeam, UVData
 
 from calstudy.errors import InputError
 from calstudy.instrument.telescope import use_bundled_earth_orientation
-from calstudy.simulate.brightness import is_polarized, stokes_i
+from calstudy.simulate.brightness import stokes_i
+from calstudy.simulate.directions import sky_coordinates
+from calstudy.simulate.feeds import refusal, select_polarizations
 from calstudy.simulate.nodes import integration_times
 from calstudy.visibilities import antenna_pairs, require_rectangular
-
-# Row and column of fftvis' matrix of feeds that hold each polarization number.
-FEED_PAIRS = {-5: (0, 0), -6: (1, 1), -7: (0, 1), -8: (1, 0)}
 
 # fftvis treats an array flatter than this (m) as flat: at 200 MHz, a phase of 4e-12.
 FLATNESS = 1e-12
@@ -39,14 +38,7 @@ class FftvisEngine:
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
         """Return why this engine cannot do what is asked, or None if it can."""
-        if is_polarized(sky):
-            return "the fftvis engine is given unpolarized skies only"
-        unknown = [int(number) for number in template.polarization_array if int(number) not in FEED_PAIRS]
-        if unknown:
-            return f"polarization number {unknown[0]} is not linear"
-        if list(beam.at(template.freq_array[:1]).feed_array) != ["x", "y"]:
-            return "fftvis needs a beam with feeds x and y"
-        return None
+        return refusal(self.name, sky, beam, template)
 
     def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`.
@@ -60,10 +52,7 @@ class FftvisEngine:
         reason = self.refusal(sky, beam, template)
         if reason:
             raise InputError(reason)
-        coordinates = (
-            sky.skycoord if sky.component_type == "point" else SkyCoord(*sky.get_lon_lat(), frame=sky.hpx_frame)
-        )
-        coordinates = coordinates.transform_to(ICRS())
+        coordinates = sky_coordinates(sky).transform_to(ICRS())
         telescope = template.telescope
         positions = dict(zip(telescope.antenna_numbers.tolist(), telescope.get_enu_antpos(), strict=True))
         pairs = antenna_pairs(template).tolist()
@@ -91,5 +80,4 @@ class FftvisEngine:
             coord_method="CoordinateRotationAstropy",
         )
         # (Nfreqs, Ntimes, feed, feed, Nbls)
-        rows, columns = np.array([FEED_PAIRS[int(number)] for number in template.polarization_array]).T
-        return visibilities.transpose(1, 4, 0, 2, 3)[..., rows, columns].astype(np.complex128)
+        return select_polarizations(visibilities.transpose(1, 4, 0, 2, 3), template).astype(np.complex128)

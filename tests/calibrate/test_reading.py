@@ -104,8 +104,10 @@ def test_sky_models_are_matched_and_turned(data):
     with pytest.raises(InputError, match="lacks integrations"):
         match_sky_model(prepare(sky, Selection(times=(0, 0)))[0], prepared)
     with pytest.raises(InputError, match=r"lacks 4 baseline\(s\) of the data, such as"):
-        match_sky_model(prepare(sky, Selection(antennas=("10", "12", "14", "16")))[0], prepare(
-            data, Selection(antennas=("10", "12", "14", "16", "18")))[0])
+        match_sky_model(
+            prepare(sky, Selection(antennas=("10", "12", "14", "16")))[0],
+            prepare(data, Selection(antennas=("10", "12", "14", "16", "18")))[0],
+        )
 
 
 def test_selections_are_read_and_applied(data):

@@ -50,7 +50,9 @@ def test_adamax_descends_to_the_same_minimum(converged):
     from_unity = solve(problem, FirstOrder(Optimizer(learning_rate=3e-3, max_steps=8000), precision="double"))
     assert 0.99 * best.loss_history[-1] < from_unity.loss_history.min() < 1.2 * best.loss_history[-1]
     warm = WarmStart(best.gains, None)
-    onwards = solve_warm(problem, FirstOrder(Optimizer(learning_rate=1e-4, max_steps=3000), precision="double"), warm)[0]
+    onwards = solve_warm(problem, FirstOrder(Optimizer(learning_rate=1e-4, max_steps=3000), precision="double"), warm)[
+        0
+    ]
     assert onwards.loss_history.min() == pytest.approx(best.loss_history[-1], rel=0.02)
 
 
@@ -72,7 +74,9 @@ def test_solution_at_the_truth_is_exact(quiet):
 
 
 @pytest.mark.parametrize(
-    "solver", [GaussNewton(max_steps=1), FirstOrder(Optimizer(max_steps=1)), FirstOrder(Optimizer(max_steps=70))], ids=lambda s: repr(s)[:20]
+    "solver",
+    [GaussNewton(max_steps=1), FirstOrder(Optimizer(max_steps=1)), FirstOrder(Optimizer(max_steps=70))],
+    ids=lambda s: repr(s)[:20],
 )
 def test_not_converging_is_a_status_with_a_sentence(toy, solver):
     solution = solve(toy.problem(), solver)

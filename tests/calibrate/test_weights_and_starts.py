@@ -54,7 +54,9 @@ def test_auto_weights_are_inverse_variances():
     ratio = weights / expected
     assert np.allclose(ratio, ratio[:, :1, :1], rtol=1e-10)
     with pytest.raises(InputError, match="'autos' needs autocorrelations, which the data lack for antenna"):
-        calibrate(make_uvdata(make_toy(scattered(5)), 1), SETTINGS.model_copy(update={"weights": AutoWeights(kind="autos")}))
+        calibrate(
+            make_uvdata(make_toy(scattered(5)), 1), SETTINGS.model_copy(update={"weights": AutoWeights(kind="autos")})
+        )
 
 
 def uvflag(data, values, path):

@@ -35,7 +35,7 @@ STEPS_PER_CALL = 50
 class Parameters(NamedTuple):
     """Unknowns or anything of their shape: gains (2, Nants, Nfreqs) and one (2, Nmembers, Nvec) per piece.
 
-    Gains in a smooth basis are its coefficients, (2, Nants, Ngain). Where the foregrounds are frozen, there is no piece.
+    Gains in a smooth basis are its coefficients, (2, Nants, Ngain). With frozen foregrounds there is no piece.
     """
 
     gains: tf.Tensor
@@ -155,9 +155,7 @@ class Kernels:
         self._optimizer, self._with_prior = optimizer, prior == "sum"
         self.descend = tf.function(self._descend, jit_compile=True)
 
-    def load(
-        self, problem: CalibrationProblem, gains: np.ndarray
-    ) -> tuple[Parameters, FitData, float]:
+    def load(self, problem: CalibrationProblem, gains: np.ndarray) -> tuple[Parameters, FitData, float]:
         """Return gains with the foregrounds that fit best, in weighted least squares, the data, and their unit."""
         exact = self.tensors.load(problem, tf.float64)
         start = pairs.to_pair(gains, tf.float64)

@@ -253,9 +253,7 @@ class GaussNewton:
         if preconditioner is None:
             eta, promised = kernels.channel_step(state.projection, state.gains, damping)
         else:
-            eta, iterations = kernels.antenna_step(
-                state.projection, state.gains, preconditioner.factors, damping
-            )
+            eta, iterations = kernels.antenna_step(state.projection, state.gains, preconditioner.factors, damping)
             if int(iterations) > CG_REFRESH:
                 preconditioner = None
         gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))

@@ -133,9 +133,7 @@ class Lbfgs:
     def estimate(self, state: LbfgsState) -> Estimate:
         """Return the current gains, and the foregrounds that fit best with them."""
         gains, projection = state.project(state.coordinates)
-        return Estimate(
-            pairs.to_complex(gains), state.kernels.tensors.unload(projection.model, state.reduced.scale)
-        )
+        return Estimate(pairs.to_complex(gains), state.kernels.tensors.unload(projection.model, state.reduced.scale))
 
     def memory(self, state: LbfgsState) -> None:
         """Return nothing: only the gains carry over."""
