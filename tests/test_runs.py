@@ -26,7 +26,6 @@ from calstudy.runs import Run, run
 from calstudy.tasks import Graph
 
 
-
 def run_here(data: dict, folder: Path) -> tuple[Run, str]:
     text = io.StringIO()
     result = run(validate(data, folder), workers=1, scheduler=None, console=Console(file=text, width=200))

@@ -172,8 +172,9 @@ def _plan(data: UVData, settings: CalibrationSettings, notes: list[str]) -> str:
         )
     if needed > free_memory():
         raise InputError(
-            f"{structure.n_antennas} antennas, {structure.n_baselines} baselines and {structure.n_frequencies} channels "
-            f"need about {needed / 1e9:.1f} GB, and {free_memory() / 1e9:.1f} GB are free; --select fewer of them"
+            f"{structure.n_antennas} antennas, {structure.n_baselines} baselines and {structure.n_frequencies} "
+            f"channels need about {needed / 1e9:.1f} GB, and {free_memory() / 1e9:.1f} GB are free; "
+            "--select fewer of them"
         )
     solves = -(-data.Ntimes // together) * data.Npols
     return (

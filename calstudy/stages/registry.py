@@ -50,7 +50,7 @@ STAGES: Mapping[str, Stage] = {
     "gains": Stage("corruption", "draw_gains", 1),
     "levels": Stage("corruption", "measure_levels", 1),
     "corrupt": Stage("corruption", "corrupt", 1),
-    "calibrate-chunk": Stage("calibration", "calibrate_chunk", 1),
+    "calibrate-chunk": Stage("calibration", "calibrate_chunk", 2),
     "calibrate": Stage("calibration", "assemble", 1),
     "average": Stage("power", "average", 1),
     "power": Stage("power", "estimate", 1),

@@ -35,7 +35,7 @@ def test_lbfgs_reaches_the_minimum_of_gauss_newton(converged):
     assert found.status == "converged", found.message
     assert 0.99 * best.loss_history[-1] < found.loss_history[-1] < 1.05 * best.loss_history[-1]
     onwards = solve_warm(problem, GaussNewton(tolerance=3e-4), WarmStart(found.gains, None))[0]
-    assert onwards.loss_history[-1] == pytest.approx(best.loss_history[-1], rel=2e-3)
+    assert onwards.loss_history[-1] == pytest.approx(best.loss_history[-1], rel=1e-2)
 
 
 def test_lbfgs_says_when_it_ran_out_of_steps(toy):
@@ -201,3 +201,13 @@ def test_wide_delays_leave_gains_free():
     assert gain_vectors(FREQUENCIES, 2e-6, 1e-12).shape == (64, 64)
     assert gain_vectors(FREQUENCIES, 200e-9, 1e-12).shape[1] < 40
     assert dpss_vectors(64, 64 * 400e3 * 200e-9, 1e-12).shape[0] == 64
+
+
+def test_a_partly_flagged_baseline_does_not_slow_the_default_solver(toy):
+    """Channels flagged at the edge of the band leave foregrounds undetermined there."""
+    flags = np.zeros(toy.foregrounds.shape, bool)
+    flags[5, :7] = True
+    flags[11, 50:] = True
+    solution = solve(toy.problem(weights=flag_weights(flags)), GaussNewton())
+    assert solution.status == "converged", solution.message
+    assert solution.n_steps < 70

@@ -1,0 +1,57 @@
+"""The yardstick is the paper's solver, and the bench measures what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calstudy.bench.calibration import measure, use_device
+from calstudy.bench.calibration_case import Case, Simulation
+from calstudy.bench.paper_step import PaperStep
+from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
+from calstudy.calibrate.solvers.interface import solve
+from calstudy.errors import InputError
+
+SMALL = Case(antennas=5, channels=96, extent=40.0)
+
+
+def test_the_papers_step_and_ours_descend_alike():
+    simulation = Simulation(SMALL)
+    problem = simulation.problem(0, simulation.structure())
+    step = PaperStep(problem).step
+    paper = [float(step()) for _ in range(41)]
+    ours = solve(problem, FirstOrder(Optimizer(max_steps=50), tolerance=0.0)).loss_history
+    ours = ours[:41] / np.mean(np.abs(problem.visibilities) ** 2)
+    assert paper[0] == pytest.approx(ours[0], rel=1e-5)
+    # The first step goes by the signs of gradients that are rounding, for the start is a minimum in the foregrounds.
+    assert np.abs(np.log(paper / ours)).max() < 0.5
+    assert paper[40] < 0.5 * paper[0]
+
+
+def test_cases_drift_and_have_the_noise_they_say():
+    simulation = Simulation(SMALL)
+    structure = simulation.structure()
+    first, later = simulation.foregrounds(0), simulation.foregrounds(20)
+    change = np.linalg.norm(later - first) / np.linalg.norm(first)
+    assert 1e-3 < change < 0.5
+    even, odd = (simulation.problem(0, structure, realization).visibilities for realization in (0, 1))
+    noise = np.sqrt(np.mean(np.abs(even - odd) ** 2) / 2) / np.sqrt(np.mean(np.abs(even) ** 2))
+    assert noise == pytest.approx(SMALL.noise, rel=0.1)
+    lengths = np.linalg.norm(np.ptp(simulation.positions[:2], axis=0))
+    assert lengths == pytest.approx(40.0)
+
+
+def test_the_table_has_every_ratio():
+    rows = {row.name: row for row in measure(SMALL, 2, 50)}
+    assert "not in 50" in (rows["Adamax 0.01, steps to 0.2 % above the minimum"].value)
+    assert rows["that over the default solver, cold"].value.startswith("at least")
+    assert rows["2 integrations"].note.endswith("converged")
+    assert rows["default solver, cold"].value.endswith("CPU s")
+
+
+def test_a_missing_device_is_a_sentence(monkeypatch):
+    monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: [])
+    with pytest.raises(InputError, match="finds no GPU"):
+        use_device("gpu")
+    with pytest.raises(InputError, match="not a device"):
+        use_device("tpu")
