@@ -14,7 +14,7 @@ from calstudy import ranks
 from calstudy.errors import InputError
 from calstudy.perform import Order, perform
 from calstudy.resources import cores
-from calstudy.store import Product, Store
+from calstudy.store import Product, Store, digest_json
 from calstudy.tasks import Task, unique
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def _submit(tasks: Sequence[Task], store: Store, client: Client) -> dict[Future,
             _perform_after,
             Order.of(task, store),
             needed,
-            key=f"{task.stage}-{task.key}",
+            key=f"{task.stage}-{task.key}-{digest_json(str(store.root))[:8]}",
             priority=-priority,
             pure=False,
         )

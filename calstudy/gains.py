@@ -69,14 +69,16 @@ def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
     Returns
     -------
     ndarray, complex128, shape (Nants_telescope, Nfreqs, Ntimes of `cal`, Npols)
-        In the order of `template.telescope.antenna_numbers`; NaN for antennas that are in no baseline of the template
-        and not in `cal`.
+        In the order of `template.telescope.antenna_numbers` and in the convention "divide"; NaN where they are flagged,
+        and for antennas that are in no baseline of the template and not in `cal`.
 
     Raises
     ------
     InputError
-        If an antenna, a channel or a polarization of the template is missing from `cal`.
+        If `cal` holds delays, or lacks an antenna, a channel or a polarization of the template.
     """
+    if cal.cal_type != "gain":
+        raise InputError(f"gains: holds {cal.cal_type} solutions; gains by channel are needed")
     used = np.unique(antenna_pairs(template))
     missing = np.setdiff1d(used, cal.ant_array)
     if missing.size:
@@ -96,5 +98,6 @@ def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
     for row, number in enumerate(template.telescope.antenna_numbers):
         if number in cal.ant_array:
             antenna = int(np.flatnonzero(cal.ant_array == number)[0])
-            gains[row] = cal.gain_array[antenna][channels][:, :, feeds]
-    return gains.conj() ** -1 if cal.gain_convention == "multiply" else gains
+            flagged = cal.flag_array[antenna][channels][:, :, feeds]
+            gains[row] = np.where(flagged, np.nan, cal.gain_array[antenna][channels][:, :, feeds])
+    return 1 / gains if cal.gain_convention == "multiply" else gains

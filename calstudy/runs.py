@@ -78,7 +78,7 @@ def open_folder(folder: Path) -> None:
     known = results | {MANIFEST, "experiment.yaml", "run.log"}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        strangers = sorted(path.name for path in folder.iterdir() if path.name not in known)
+        strangers = sorted(path.name for path in folder.iterdir() if path.name not in known and path.name[0] != ".")
         (folder / "run.log").touch()
     except OSError as error:
         raise InputError(f"outputs.runs = {str(folder.parent)!r}: cannot be written ({error.strerror})") from None
@@ -211,9 +211,7 @@ def fill_folder(folder: Path, graph: Graph, products: dict[str, Product], made: 
     return Run(folder, own_products, own_made, tuple(graph.tasks))
 
 
-def run(
-    experiment: Experiment, workers: int = 1, scheduler: str | None = None, console: Console | None = None
-) -> Run:
+def run(experiment: Experiment, workers: int = 1, scheduler: str | None = None, console: Console | None = None) -> Run:
     """Make the figures and spectra of an experiment, reusing every product that is in the store.
 
     Parameters

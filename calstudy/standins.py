@@ -17,8 +17,10 @@ def _sky(experiment: Experiment) -> str | None:
 
 
 def _beam(experiment: Experiment) -> str | None:
-    kind = experiment.instrument.beam.kind
-    return None if kind == "mwa-embedded-element" else f"beam: {kind}, not the MWA embedded element"
+    beam = experiment.instrument.beam
+    if beam.kind != "mwa-embedded-element":
+        return f"beam: {beam.kind}, not the MWA embedded element"
+    return f"beam: {beam.path.name}, not the MWA embedded element's own file" if beam.path else None
 
 
 def _scale(experiment: Experiment) -> str | None:

@@ -135,7 +135,7 @@ class Store:
         """
         parent = self.root / stage
         parent.mkdir(exist_ok=True)
-        for leftover in parent.glob(f".building-{key}-*"):
+        for leftover in (*parent.glob(f".building-{key}-*"), *parent.glob(f".discarded-{key}-*")):
             shutil.rmtree(leftover, ignore_errors=True)
         folder = parent / f".building-{key}-{uuid4().hex}"
         folder.mkdir()

@@ -13,6 +13,7 @@ from calstudy.experiment.collection import Collection
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.sweep import Sweep, expand
 from calstudy.plans import show_claims, show_collection_result, show_plan, show_result
+from calstudy.preflight import require_basis_fits
 from calstudy.runs import run, run_folder
 from calstudy.sweep_runs import run_sweep
 from calstudy.sweep_tasks import SweepGraph
@@ -45,6 +46,14 @@ def fit_study(
     fitted = {name: fit(experiment, workers, max_memory, scheduler) for name, experiment in study.members.items()}
     members = {name: experiment for name, (experiment, _) in fitted.items()}
     return dataclasses.replace(study, members=members), min(count for _, count in fitted.values())
+
+
+def _experiments(study: Study) -> list[Experiment]:
+    if isinstance(study, Collection):
+        return list(study.members.values())
+    if isinstance(study, Sweep):
+        return [point.experiment for block in study.blocks for point in block]
+    return [study]
 
 
 def plan_study(study: Study, workers: int | None, max_memory: str | None, console: Console) -> None:
@@ -84,6 +93,8 @@ def run_study(
         As for `calstudy.runs.run`.
     """
     study, count = fit_study(study, workers, max_memory, scheduler)
+    for experiment in _experiments(study):
+        require_basis_fits(experiment)
     if isinstance(study, Collection):
         collected = run_collection(study, count, scheduler, console)
         show_collection_result(collected, console)

@@ -8,11 +8,13 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from calstudy.experiment.model import Experiment, Variant
+from calstudy.experiment.model import Component, Experiment, Variant
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.store import digest_file, digest_json
 
 PARITIES = ("even", "odd")
+# Inputs of the spectra besides the variants, whose names cannot hold a colon.
+EOR_REFERENCE, NOISE_REFERENCE = "reference:eor", "reference:noise"
 DEFAULT_CHUNKS = SimulationSettings().chunks
 
 
@@ -239,7 +241,15 @@ class Graph:
         """The wedge and spherical spectra of all variants, with errors."""
         variants = self._sections["variants"]
         inputs = {name: self.power(name) for name in variants}
+        inputs[EOR_REFERENCE] = self._reference("eor")
+        if any("noise" in variant.components for variant in self.experiment.variants.values()):
+            inputs[NOISE_REFERENCE] = self._reference("noise")
         return Task("spectra", "wedge and spherical", {**self._section("power"), "variants": variants}, inputs)
+
+    def _reference(self, component: Component) -> Task:
+        """Return the spectra of one component alone, which give the errors of all variants that contain it."""
+        variant = Variant(components=(component,))
+        return self.crossed(component, {parity: self.average(variant, parity) for parity in PARITIES})
 
     @cached_property
     def agreement(self) -> Task | None:

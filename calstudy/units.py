@@ -16,6 +16,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, PlainSerializer
 from pydantic_core import PydanticCustomError
 
+LARGEST_DECIBEL = 200
 NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
 
@@ -78,6 +79,8 @@ def parse_decibel(value: Any) -> float:
     match = NUMBER.match(value) if isinstance(value, str) else None
     if match is None or match[2] != "dB":
         raise _fail(value, 'is not a level in decibel: write for example "-40 dB"')
+    if not abs(float(match[1])) <= LARGEST_DECIBEL:
+        raise _fail(value, f"is beyond {LARGEST_DECIBEL} dB either way")
     return float(match[1])
 
 
@@ -114,7 +117,6 @@ Frequency = _quantity("Hz", "80 kHz")
 Time = _quantity("s", "2 s")
 Delay = _quantity("s", "100 ns")
 Length = _quantity("m", "14 m")
-Angle = _quantity("rad", "10 deg")
 FluxDensity = _quantity("Jy", "50 mJy")
 PowerDensity = _quantity("K2 Mpc3", "12482.356 K2 Mpc3")
 Memory = _quantity("byte", "6 GB")

@@ -40,8 +40,6 @@ def starting_gains(data: UVData, numbers: np.ndarray, gains: UVCal | None) -> np
     times = np.unique(data.time_array)
     if gains is None:
         return np.ones((len(numbers), data.Nfreqs, times.size, data.Npols), complex)
-    if gains.cal_type != "gain":
-        raise InputError(f"gains: holds {gains.cal_type} solutions; gains by channel are needed")
     values = gains_for(gains, data)
     rows = {int(number): row for row, number in enumerate(data.telescope.antenna_numbers)}
     values = values[[rows[int(number)] for number in numbers]]

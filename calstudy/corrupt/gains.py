@@ -68,23 +68,33 @@ def draw_reflection_gains(n_antennas: int, frequencies: np.ndarray, settings: Re
 
 
 def read_gains(path: Path, template: UVData) -> UVCal:
-    """Read a CalH5 or calfits file and check that it has the template's antennas and channels.
+    """Read a CalH5 or calfits file of gains that are constant in time; flagged gains are taken as unity.
+
+    Returns
+    -------
+    UVCal
+        In the convention "divide", with the template's antennas, channels and polarizations.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or antennas, channels or polarizations of the template are missing from it.
+        If the file cannot be read, holds several times, or lacks antennas, channels or polarizations of the template.
     """
     from pyuvdata import UVCal
 
     try:
         gains = UVCal.from_file(path)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, IndexError) as error:
         raise InputError(
             f"corruption.gains.path = {str(path)!r}: not a readable CalH5 or calfits file ({error})"
         ) from None
-    gains_for(gains, template)
-    return gains
+    if gains.Ntimes != 1:
+        raise InputError(
+            f"corruption.gains.path = {str(path)!r}: holds {gains.Ntimes} times; the corrupting gains are constant in "
+            "time, so that one is needed"
+        )
+    values = gains_for(gains, template)
+    return make_uvcal(template, np.where(np.isfinite(values), values, 1))
 
 
 def make_gains(settings: Gains, template: UVData) -> UVCal:

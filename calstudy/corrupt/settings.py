@@ -5,10 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from calstudy.schema import Section, choice
+from calstudy.schema import Section, choice, fault
 from calstudy.units import Decibel, Delay
+
+
+def _different(seeds: tuple[int, int]) -> tuple[int, int]:
+    if seeds[0] == seeds[1]:
+        raise fault("", f"of even and odd are both {seeds[0]}: their noise would be the same")
+    return seeds
+
+
+Seed = Annotated[int, Field(ge=0)]
+Seeds = Annotated[
+    tuple[Seed, Seed],
+    Field(strict=False, description="Seeds of the even and odd realization."),
+    AfterValidator(_different),
+]
 
 
 class NoiseRelativeToEor(Section):
@@ -16,10 +30,7 @@ class NoiseRelativeToEor(Section):
 
     kind: Literal["times-eor"] = "times-eor"
     factor: float = Field(10.0, gt=0)
-    seeds: Annotated[tuple[int, int], Field(strict=False, description="Seeds of the even and odd realization.")] = (
-        3,
-        4,
-    )
+    seeds: Seeds = (3, 4)
 
 
 class NoiseRelativeToForegrounds(Section):
@@ -27,7 +38,7 @@ class NoiseRelativeToForegrounds(Section):
 
     kind: Literal["times-foregrounds"]
     factor: float = Field(0.1, gt=0)
-    seeds: Annotated[tuple[int, int], Field(strict=False)] = (3, 4)
+    seeds: Seeds = (3, 4)
 
 
 class NoNoise(Section):

@@ -115,6 +115,14 @@ def _input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, Ba
             yield path, section, field
 
 
+def expand_user(path: Path, field: str) -> Path:
+    """Replace a leading ~ by the home folder; raises InputError, naming the field, if there is no such user."""
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        raise InputError(f"{field} = {str(path)!r}: there is no such home folder") from None
+
+
 def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> Experiment:
     """Make the paths of input files absolute, relative ones from `base`, and check that they can be read."""
     faults, resolved = [], data
@@ -131,13 +139,15 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
             )
     for path, section, field in _input_files(experiment):
         target = getattr(section, field)
-        file = target.expanduser() if target.expanduser().is_absolute() else (base / target)
+        file = base / expand_user(target, path)
         resolved = override(resolved, path, str(file.resolve()))
         if not file.is_file():
             faults.append(f"{path} = {str(target)!r}: no such file (looked for {file})")
     if faults:
         raise ExperimentError(faults)
     resolved_experiment = Experiment.model_validate(resolved)
+    for name in ("store", "runs"):
+        expand_user(getattr(experiment.outputs, name), f"outputs.{name}")
     _require_inspected_antennas(resolved_experiment)
     return resolved_experiment
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.constants import HYDROGEN_LINE
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.settings import PowerSettings
@@ -42,6 +44,9 @@ FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
     "signal-loss": SIGNAL_LOSS_VARIANTS,
 }
 """Names of the variants that each figure cannot do without."""
+
+
+VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 class Variant(Section):
@@ -154,8 +159,8 @@ class Experiment(Section):
                 raise fault(f"variants.{name}.components", "asks for noise, but corruption.noise is 'none'")
             if "foregrounds" in variant.components and self.sky.foregrounds.kind == "none":
                 raise fault(f"variants.{name}.components", "asks for foregrounds, but sky.foregrounds is 'none'")
-        if not any(variant.components == ("eor",) for variant in self.variants.values()):
-            raise fault("variants", "needs one with components [eor] alone: its power is the sample variance of errors")
+            if not VARIANT_NAME.fullmatch(name) or name == "transfer":
+                raise fault(f"variants.{name}", "is not a usable name: use letters, digits, '_', '-'; not 'transfer'")
         return self
 
     @model_validator(mode="after")
@@ -217,6 +222,14 @@ class Experiment(Section):
                 )
             if self.corruption.noise.kind == "times-foregrounds":
                 raise fault("corruption.noise", "is relative to foregrounds, but sky.foregrounds is 'none'")
+        return self
+
+    @model_validator(mode="after")
+    def _channels_see_the_21_cm_line(self) -> Experiment:
+        channels = self.instrument.channels
+        last = channels.first + (channels.count - 1) * channels.width
+        if last >= HYDROGEN_LINE:
+            raise fault("instrument.channels", f"end at {last / 1e6:g} MHz, above the 21 cm line at redshift zero")
         return self
 
     @model_validator(mode="after")

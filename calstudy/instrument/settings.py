@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from calstudy.schema import Section, choice
+from calstudy.schema import Section, choice, fault
 from calstudy.units import Frequency, HourAngle, Length, Time
 
 
@@ -162,4 +162,12 @@ class InstrumentSettings(Section):
     beam: Beam = MwaEmbeddedBeam()
     channels: Channels = Channels()
     times: Times = Times()
-    polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(strict=False, min_length=1, max_length=2)] = ("xx",)
+    polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(strict=False, min_length=1, max_length=2)] = Field(
+        ("xx",), description="Linear polarizations, each calibrated on its own: xx (east-west dipoles), yy, or both."
+    )
+
+    @model_validator(mode="after")
+    def _polarizations_are_unique(self) -> InstrumentSettings:
+        if len(set(self.polarizations)) != len(self.polarizations):
+            raise fault("polarizations", f"names a polarization twice: {', '.join(self.polarizations)}")
+        return self

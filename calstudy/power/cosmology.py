@@ -15,12 +15,11 @@ from astropy import units as u
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
+from calstudy.constants import HYDROGEN_LINE
+
 if TYPE_CHECKING:
     from astropy.cosmology import FLRW
     from hera_pspec.conversions import Cosmo_Conversions
-
-HYDROGEN_LINE = 1420.405751e6
-"""Rest frequency of the 21 cm line in Hz, as in hera_pspec."""
 
 
 def make_cosmology(name: str) -> FLRW:

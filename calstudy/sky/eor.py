@@ -11,9 +11,9 @@ from astropy.cosmology import FLRW, Planck15
 from pyradiosky import SkyModel
 from scipy.interpolate import CubicSpline
 
+from calstudy.constants import HYDROGEN_LINE
 from calstudy.sky.settings import Eor
 
-HYDROGEN_LINE = 1420405751.768
 # Nodes of the radial wavenumber integral: per logarithmic interval near zero, per channel beyond.
 LOWEST_PHASE = 1e-5
 LOG_INTERVALS = 24

@@ -143,7 +143,7 @@ def _nearest(available: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregrounds:
-    sky = _read(settings.path)
+    sky = _read(settings)
     if sky.component_type != "point":
         raise InputError(f"sky.foregrounds.path: {settings.path} holds a HEALPix map; a catalogue of points is needed")
     at_centre = _at_frequency(sky, float(np.mean(frequencies)))
@@ -193,7 +193,26 @@ def _require_idl(path: Path) -> None:
             raise ValueError("not an IDL save file")
 
 
-def _read(path: Path) -> SkyModel:
+def _read_votable(path: Path, columns: section.VotableColumns) -> SkyModel:
+    frequency = None if columns.frequency is None else columns.frequency * units.Hz
+    with warnings.catch_warnings():
+        # Published tables stretch the standard (units, versions).
+        warnings.simplefilter("ignore")
+        return SkyModel.from_votable_catalog(
+            str(path),
+            table_name=columns.table,
+            id_column=columns.id,
+            lon_column=columns.right_ascension,
+            lat_column=columns.declination,
+            frame="icrs",
+            flux_columns=columns.flux,
+            reference_frequency=frequency,
+            spectral_index_column=columns.spectral_index,
+        )
+
+
+def _read(settings: section.FileSources) -> SkyModel:
+    path = settings.path
     if not path.is_file():
         raise InputError(f"sky.foregrounds.path: there is no file {path}")
     try:
@@ -203,6 +222,8 @@ def _read(path: Path) -> SkyModel:
                 # Names are not used here; pyradiosky numbers those that occur twice.
                 warnings.filterwarnings("ignore", message="Source IDs are not unique")
                 return SkyModel.from_fhd_catalog(str(path), expand_extended=False)
+        if settings.votable is not None:
+            return _read_votable(path, settings.votable)
         return SkyModel.from_file(str(path))
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"sky.foregrounds.path: {path} cannot be read as a catalogue ({error})") from error

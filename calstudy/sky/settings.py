@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from calstudy.schema import Section, choice
-from calstudy.units import FluxDensity, PowerDensity
+from calstudy.schema import Section, choice, fault
+from calstudy.units import FluxDensity, Frequency, PowerDensity
+
+VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
 
 
 class PointSources(Section):
@@ -40,11 +42,30 @@ class SyntheticSources(PointSources):
     seed: int = Field(1, ge=0, description="Seed of the synthetic population's positions and fluxes.")
 
 
+class VotableColumns(Section):
+    """Where a VOTable keeps what; part of a name will do if no other has that part. Units are those in the file."""
+
+    table: str = Field(description="Name of the table.")
+    id: str = Field(description="Column of source names.")
+    right_ascension: str
+    declination: str
+    flux: str = Field(description="Column of flux densities.")
+    frequency: Frequency | None = Field(None, gt=0, description="At which the fluxes are; needed for spectral indices.")
+    spectral_index: str | None = None
+
+
 class FileSources(PointSources):
-    """Any catalogue that pyradiosky reads: SkyH5, VOTable, FHD .sav, pyradiosky text."""
+    """Any catalogue that pyradiosky reads: SkyH5, VOTable (with `votable`), FHD .sav, pyradiosky text."""
 
     kind: Literal["file"]
     path: Path = Field(strict=False)
+    votable: VotableColumns | None = Field(None, description="Needed for a VOTable (.vot, .votable, .xml), ICRS.")
+
+    @model_validator(mode="after")
+    def _votables_have_columns(self) -> FileSources:
+        if (self.path.suffix.lower() in VOTABLE_SUFFIXES) != (self.votable is not None):
+            raise fault("votable", f"goes with VOTables ({', '.join(VOTABLE_SUFFIXES)}), and they need it")
+        return self
 
 
 class NoSources(Section):

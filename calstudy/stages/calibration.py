@@ -49,7 +49,7 @@ def calibrate_chunk(job: Job) -> Mapping[str, Any]:
 
 def assemble(job: Job) -> Mapping[str, Any]:
     """Join the runs of integrations into one set of gains, model, residual and solution log."""
-    folders = [job.inputs[name] for name in sorted(job.inputs)]
+    folders = [job.inputs[name] for name in sorted(job.inputs, key=lambda name: int(name.removeprefix("chunk")))]
     gains = UVCal.from_file([str(folder / GAINS) for folder in folders], axis="time")
     gains.write_calh5(job.output / GAINS)
     for name in VISIBILITIES:

@@ -19,6 +19,7 @@ from calstudy.power.tables import save_spectrum, write_csv
 from calstudy.power.wedge import cylindrical_average
 from calstudy.stages.files import read_visibilities, write_visibilities
 from calstudy.stages.registry import Job
+from calstudy.tasks import EOR_REFERENCE, NOISE_REFERENCE
 
 EXCISION = {"all-modes": False, "outside-wedge": True}
 """Names of the spherical averages, and whether each leaves the wedge out."""
@@ -48,7 +49,7 @@ def _read_spectra(job: Job, settings: PowerSettings) -> dict[str, DelaySpectra]:
     from hera_pspec import UVPSpec
 
     found = {}
-    for name in job.settings["variants"]:
+    for name in job.inputs:
         uvp = UVPSpec()
         uvp.read_hdf5(str(job.inputs[name] / "pspec.h5"))
         found[name] = delay_spectra(uvp, settings)
@@ -58,15 +59,14 @@ def _read_spectra(job: Job, settings: PowerSettings) -> dict[str, DelaySpectra]:
 def spectra(job: Job) -> Mapping[str, Any]:
     """Write, for every variant, wedge.h5 and the two spherical spectra with their errors, as HDF5 and CSV.
 
-    The noise part of the errors comes from the noise-only variant, the sample variance from the EoR-only one (paper
-    section Reduction of Simulation Products); each enters the variants that contain its component.
+    The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
+    (paper section Reduction of Simulation Products); each enters the variants that contain its component.
     """
     settings = PowerSettings.model_validate(job.settings["power"])
     variants = {name: set(variant["components"]) for name, variant in job.settings["variants"].items()}
     delays = _read_spectra(job, settings)
-    sigma_noise = next((noise_level(delays[name]) for name, parts in variants.items() if parts == {"noise"}), 0.0)
-    eor_only = next(name for name, parts in variants.items() if parts == {"eor"})
-    signals = {name: spherical_average(delays[eor_only], settings, excise) for name, excise in EXCISION.items()}
+    sigma_noise = noise_level(delays[NOISE_REFERENCE]) if NOISE_REFERENCE in delays else 0.0
+    signals = {name: spherical_average(delays[EOR_REFERENCE], settings, excise) for name, excise in EXCISION.items()}
     for name, parts in variants.items():
         save_spectrum(job.output / f"{name}.wedge.h5", cylindrical_average(delays[name], settings))
         for modes, excise in EXCISION.items():

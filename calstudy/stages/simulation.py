@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import TypeAdapter
+from scipy.constants import speed_of_light
 
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import InstrumentSettings
@@ -30,8 +31,9 @@ if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
-SPEED_OF_LIGHT = 299792458.0
 SMOOTH_SPECTRA = ("flat", "spectral_index")
+TOLERATED = 100
+"""Interpolation errors up to this times the tolerance, which bounds a typical one, go without a warning."""
 CHECKED = 2
 """Integrations, and channels, at which interpolated visibilities are compared with directly simulated ones."""
 
@@ -48,6 +50,7 @@ class _Scene:
         self.template = make_template(self.instrument)
         self.beam = make_beam(self.instrument.beam, self.instrument.channels)
         self.engine = make_engine(self.simulation)
+        self.stand_ins = [self.beam.stand_in] if self.beam.stand_in else []
 
     @cached_property
     def _field(self) -> EorField:
@@ -57,7 +60,9 @@ class _Scene:
     @cached_property
     def _foregrounds(self) -> SkyModel:
         settings = TypeAdapter(Foregrounds).validate_python(self._sky_settings)
-        return make_foregrounds(settings, self.template.freq_array).sky
+        foregrounds = make_foregrounds(settings, self.template.freq_array)
+        self.stand_ins = [note for note in (foregrounds.stand_in, self.beam.stand_in) if note]
+        return foregrounds.sky
 
     @property
     def smooth(self) -> bool:
@@ -98,7 +103,18 @@ def assemble_product(job: Job) -> Mapping[str, Any]:
         quality["delay_floor"] = _floors(data)
     write_visibilities(data, job.output / "visibilities.uvh5")
     write_json(job.output / "quality.json", quality)
-    return quality
+    return {**quality, "stand_ins": scene.stand_ins, "warnings": _warnings(scene, quality)}
+
+
+def _warnings(scene: _Scene, quality: Mapping[str, Any]) -> list[str]:
+    """Warn of an interpolation error far above the tolerance, as a beam much wider than `beam_extent` makes."""
+    check, nodes = quality["interpolation"], scene.simulation.nodes
+    if check is None or check["max_error"] <= TOLERATED * nodes.tolerance:
+        return []
+    return [
+        f"interpolation between simulation nodes errs by {check['max_error']:.1e} of the rms, where simulation.nodes."
+        f"tolerance is {nodes.tolerance:.0e}: raise simulation.nodes.beam_extent, or set simulation.nodes.enabled=false"
+    ]
 
 
 def _check(scene: _Scene, cube: np.ndarray) -> dict[str, Any] | None:
@@ -117,7 +133,7 @@ def _check(scene: _Scene, cube: np.ndarray) -> dict[str, Any] | None:
 def _floors(data: UVData) -> dict[str, Any]:
     """Measure the delay floor with both tapers, where the band leaves delays beyond the horizon for them."""
     width = float(np.diff(data.freq_array).mean())
-    horizon = float(np.linalg.norm(baseline_vectors(data), axis=1).max()) / SPEED_OF_LIGHT
+    horizon = float(np.linalg.norm(baseline_vectors(data), axis=1).max()) / speed_of_light
     floors = {}
     for taper, lobe in MAIN_LOBES.items():
         buffer = max(100e-9, lobe / (width * data.Nfreqs))

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 from astropy.coordinates import EarthLocation
-from conftest import FREQUENCIES, HEX, make_toy, scattered
 from pyuvdata import Telescope, UVData
 from pyuvdata.utils import ECEF_from_ENU, uvcalibrate
+from toy import FREQUENCIES, HEX, make_toy, scattered
 
 from calstudy.calibrate.calamity import calibrate
 from calstudy.calibrate.problem import gain_products

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tensorflow as tf
-from conftest import HEX, complex_normal, make_toy
+from toy import HEX, complex_normal, make_toy
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import make_basis
@@ -31,7 +31,7 @@ def redundant_structure(toy):
 
 
 def basis_arguments():
-    from conftest import BASIS, FREQUENCIES
+    from toy import BASIS, FREQUENCIES
 
     return FREQUENCIES, BASIS
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import BASIS, FREQUENCIES
 from scipy.constants import speed_of_light
+from toy import BASIS, FREQUENCIES
 
 from calstudy.calibrate.basis import delay_half_widths, make_basis
 from calstudy.calibrate.settings import BasisSettings

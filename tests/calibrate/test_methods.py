@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tensorflow as tf
-from conftest import FREQUENCIES, complex_normal, make_toy, scattered
 from test_solvers import in_the_span, product_error
+from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import dpss_vectors
@@ -160,7 +160,7 @@ def test_pieces_of_any_size_give_the_same_projection(toy):
 
 
 def test_gaps_in_frequency_are_flagged_channels(toy):
-    from conftest import BASIS
+    from toy import BASIS
 
     from calstudy.calibrate.basis import make_basis
     from calstudy.calibrate.problem import FitStructure

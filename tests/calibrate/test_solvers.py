@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import make_toy, scattered
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_calibration_loss import redundant_structure
+from toy import make_toy, scattered
 
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import make_toy, scattered
 from pyuvdata import UVFlag
 from test_calamity import SETTINGS, make_uvdata
+from toy import make_toy, scattered
 
 from calstudy.calibrate.calamity import calibrate
 from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, SampleWeights

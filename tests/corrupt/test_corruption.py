@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pyuvdata.utils import uvcalibrate
 
 from calstudy.corrupt.gains import draw_reflection_gains, make_gains, per_channel_gains, reflection_gain
 from calstudy.corrupt.levels import rms, set_levels
@@ -114,3 +115,37 @@ def test_gains_of_other_channels_or_antennas_are_refused(template, tmp_path):
     (tmp_path / "noise.calh5").write_bytes(b"no gains")
     with pytest.raises(InputError, match=r"corruption\.gains\.path"):
         make_gains(FileGains(kind="file", path=tmp_path / "noise.calh5"), template)
+
+
+@pytest.mark.parametrize("convention", ["divide", "multiply"])
+def test_a_gain_file_corrupts_as_pyuvdata_understands_it(template, rng, tmp_path, convention):
+    gains = complex_normal(rng, (template.Nants_telescope, template.Nfreqs, 1, template.Npols))
+    cal = make_uvcal(template, gains)
+    cal.gain_convention = convention
+    cal.write_calh5(tmp_path / "g.calh5")
+    sky = from_cube(template, np.ones((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), complex))
+    data = corrupt_by_gains(sky, make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template))
+    raw = data.copy()
+    raw.vis_units, raw.pol_convention = "uncalib", None
+    calibrated = uvcalibrate(raw, cal, inplace=False, time_check=False)
+    assert to_cube(calibrated) == pytest.approx(1, rel=1e-12)
+
+
+def test_flagged_gains_of_a_file_count_as_unity(template, tmp_path):
+    cal = make_uvcal(template, np.full((template.Nants_telescope, template.Nfreqs, 1, template.Npols), 5 + 0j))
+    cal.flag_array[2, 3] = True
+    cal.write_calh5(tmp_path / "g.calh5")
+    gains = gains_for(make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template), template)
+    assert gains[2, 3] == 1
+    assert np.count_nonzero(gains != 5) == 1
+
+
+def test_gains_that_change_in_time_or_are_delays_are_refused(template, tmp_path):
+    shape = (template.Nants_telescope, template.Nfreqs, template.Ntimes, template.Npols)
+    make_uvcal(template, np.ones(shape, complex)).write_calh5(tmp_path / "g.calh5")
+    with pytest.raises(InputError, match="holds 3 times"):
+        make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template)
+    delays = make_uvcal(template, np.ones((*shape[:2], 1, shape[3]), complex))
+    delays.cal_type = "delay"
+    with pytest.raises(InputError, match="holds delay solutions"):
+        gains_for(delays, template)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy import units
 from astropy.coordinates import SkyCoord
+from astropy.io.votable import from_table
 from astropy.table import Table
 from pydantic import ValidationError
 from pyradiosky import SkyModel
@@ -178,12 +179,40 @@ def test_catalogue_at_other_frequencies_is_refused(tmp_path):
         make_foregrounds(section.FileSources(kind="file", path=path, spectrum="catalogue"), FREQUENCIES)
 
 
+COLUMNS = {"table": "", "id": "GLEAM", "right_ascension": "RAJ2000", "declination": "DEJ2000", "flux": "Fintwide"}
+
+
 @pytest.mark.parametrize("name", ["none.skyh5", "wrong.skyh5", "wrong.sav", "wrong.vot"])
 def test_unusable_catalogues_are_refused(tmp_path, name):
     for wrong in ("wrong.skyh5", "wrong.sav", "wrong.vot"):
         (tmp_path / wrong).write_text("not a catalogue")
+    settings = {"kind": "file", "path": tmp_path / name, "votable": COLUMNS if name.endswith("vot") else None}
     with pytest.raises(InputError, match=name):
-        make_foregrounds(section.FileSources(kind="file", path=tmp_path / name), FREQUENCIES)
+        make_foregrounds(section.FileSources.model_validate(settings), FREQUENCIES)
+
+
+def test_any_votable_is_read_by_the_columns_named(tmp_path):
+    table = Table(
+        {
+            "source": ["a", "b"],
+            "ra": [10.0, 20.0] * units.deg,
+            "dec": [-30.0, -20.0] * units.deg,
+            "s": [2.0, 1.0] * units.Jy,
+        }
+    )
+    votable = from_table(table)
+    votable.resources[0].tables[0].name = "survey"
+    votable.to_xml(str(tmp_path / "mine.vot"))
+    columns = {"table": "survey", "id": "source", "right_ascension": "ra", "declination": "dec", "flux": "s"}
+    settings = {"kind": "file", "path": tmp_path / "mine.vot", "votable": columns}
+    sky = make_foregrounds(section.FileSources.model_validate(settings), FREQUENCIES).sky
+    assert flux(sky) == pytest.approx([2.0, 1.0])
+    assert sky.skycoord.icrs.ra.deg == pytest.approx([10.0, 20.0])
+
+
+def test_a_votable_needs_its_columns_named(tmp_path):
+    with pytest.raises(ValidationError, match="goes with VOTables"):
+        section.FileSources(kind="file", path=tmp_path / "mine.vot")
 
 
 def test_fetched_gleam_is_proved_and_then_held_to_its_hash(tmp_path, monkeypatch):
