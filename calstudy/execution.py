@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,6 +95,20 @@ def _write_errors_to(path: Path) -> None:
 
 
 @contextmanager
+def _errors_written_to(path: Path) -> Iterator[None]:
+    """Append what is written to standard error within the block to a file."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        _write_errors_to(path)
+        yield
+    finally:
+        sys.stderr.flush()
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+@contextmanager
 def _local_client(workers: int, log: Path) -> Iterator[Client]:
     """Start workers on this machine: a thread of this process if there is one, else processes that share the cores."""
     import dask
@@ -124,7 +139,8 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     ):
         if workers > 1:
             client.run(_write_errors_to, log)
-        yield client
+        with _errors_written_to(log) if workers == 1 else nullcontext():
+            yield client
 
 
 @contextmanager

@@ -35,7 +35,7 @@ class Forecast:
         """Count a task as made; return the seconds that the rest will take at this pace."""
         self.fraction += self._costs[key] / self._total
         elapsed = time.perf_counter() - self._start
-        return elapsed * (1 - self.fraction) / max(self.fraction, 1e-6)
+        return elapsed * max(0.0, 1 - self.fraction) / max(self.fraction, 1e-6)
 
 
 @contextmanager

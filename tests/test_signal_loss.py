@@ -77,13 +77,18 @@ def test_inside_the_modelled_delays_nothing_is_left(swept):
 
 
 def test_a_larger_buffer_loses_more(swept):
-    narrow, wide = (table(swept, point, "transfer-bands.outside-wedge") for point in (1, 3))
-    assert wide.transfer[1] < narrow.transfer[1] - 3 * narrow.transfer_error[1]
+    narrow, wide = (
+        pool([table(swept, point, "transfer-bands.outside-wedge") for point in points]) for points in ((1, 2), (3, 4))
+    )
+    assert wide.transfer[2] < narrow.transfer[2] - 3 * narrow.transfer_error[2]
 
 
 def test_the_loss_is_linear_in_the_signal(swept):
     usual, fainter = (table(swept, point, "transfer-bands.outside-wedge") for point in (1, 5))
-    assert fainter.retained[2:] == pytest.approx(usual.retained[2:], abs=0.03)
+    # Near the wedge, weakly constrained gains make the loss of so small an array depend on where the solver stopped.
+    assert fainter.retained[-1] == pytest.approx(usual.retained[-1], abs=0.03)
+    difference = np.abs(fainter.retained - usual.retained)[2:]
+    assert (difference < 2 * usual.retained_error[2:]).all()
 
 
 def test_the_corrected_residual_is_a_table(swept):

@@ -90,7 +90,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ("{name: a, instrument: {channels: {first: 1.5 GHz}}}", "instrument.channels: end at 1530.64 MHz, above the"),
         (
             "{name: a, outputs: {store: ~nobody-here/x}}",
-            "outputs.store = '~nobody-here/x': there is no such home folder",
+            "outputs.store = '~nobody-here/x': there is no such",
         ),
         ("{name: a, corruption: {noise: none}}", "asks for noise, but corruption.noise is 'none'"),
         ("{name: a, corruption: {gains: {sigma: .nan}}}", "corruption.gains.sigma = nan: must be a finite number"),
