@@ -20,6 +20,7 @@ import numpy as np
 from pyradiosky import SkyModel
 from pyuvdata import UVData
 from scipy.constants import speed_of_light
+from threadpoolctl import threadpool_limits
 
 from calstudy.errors import InputError
 from calstudy.simulate.brightness import is_polarized, stokes_i
@@ -82,12 +83,14 @@ class DenseEngine:
         first, second = pairs.reshape(-1, 2).T
         delays = template.telescope.get_enu_antpos()[used] / speed_of_light
         cube = np.empty((len(times), template.Nbls, len(frequencies), len(feeds)), dtype=np.complex128)
-        for index, time in enumerate(times):
-            vectors = tracks.at(time, order)
-            up = vectors[2] > 0
-            sums = self._sum_sources(vectors[:, up], flux, order[up], delays, frequencies, pattern)
-            forward, backward = sums[..., first, second], sums[..., second, first]
-            cube[index] = 0.5 * ((forward + backward) + 1j * (forward - backward)).transpose(2, 0, 1)
+        # The products are many and small: threads in each cost more than they gain, and workers share the cores already.
+        with threadpool_limits(limits=1, user_api="blas"):
+            for index, time in enumerate(times):
+                vectors = tracks.at(time, order)
+                up = vectors[2] > 0
+                sums = self._sum_sources(vectors[:, up], flux, order[up], delays, frequencies, pattern)
+                forward, backward = sums[..., first, second], sums[..., second, first]
+                cube[index] = 0.5 * ((forward + backward) + 1j * (forward - backward)).transpose(2, 0, 1)
         return cube
 
     def _sum_sources(
