@@ -83,7 +83,7 @@ class DenseEngine:
         first, second = pairs.reshape(-1, 2).T
         delays = template.telescope.get_enu_antpos()[used] / speed_of_light
         cube = np.empty((len(times), template.Nbls, len(frequencies), len(feeds)), dtype=np.complex128)
-        # The products are many and small: threads in each cost more than they gain, and workers share the cores already.
+        # The products are many and small: threads in each cost more than they gain, and workers share the cores.
         with threadpool_limits(limits=1, user_api="blas"):
             for index, time in enumerate(times):
                 vectors = tracks.at(time, order)
