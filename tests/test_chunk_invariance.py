@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from pyuvdata import UVData
 from tiny import tiny
 
@@ -11,8 +10,6 @@ from calstudy.execution import Crew, execute, schedule
 from calstudy.experiment.files import override, validate
 from calstudy.store import Store
 from calstudy.tasks import Graph
-
-pytestmark = pytest.mark.filterwarnings("ignore")
 
 
 def visibilities(folder: Path, chunks: int, workers: int) -> list[np.ndarray]:

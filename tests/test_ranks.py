@@ -105,7 +105,6 @@ def test_a_mistake_is_told_once(tmp_path, arguments, told):
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.filterwarnings("ignore")
 def test_a_run_on_two_ranks_has_the_visibilities_of_a_serial_one(tmp_path):
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(study(tmp_path)))
     result = mpiexec("-m", "calstudy", "run", "tiny.yaml", cwd=tmp_path)
