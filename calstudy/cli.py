@@ -13,11 +13,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calstudy import __version__, ranks
+from calstudy import __version__
 from calstudy.commands.bench import bench_app
 from calstudy.commands.calibrate import calibrate
 from calstudy.commands.check import check_app
 from calstudy.errors import ExperimentError, InputError
+from calstudy.running import ranks
 
 app = typer.Typer(
     help="Simulation and validation studies of 21 cm interferometer calibration.",
@@ -75,7 +76,7 @@ def run(
     Products that are in the store already are not made again; an interrupted run is resumed by the same command.
     """
     from calstudy.experiment.collection import load_study
-    from calstudy.studies import run_study
+    from calstudy.running.studies import run_study
 
     study = load_study(file, scale, overrides or ())
     run_study(study, workers, max_memory, scheduler, Console(soft_wrap=True, highlight=False))
@@ -91,7 +92,7 @@ def plan(
 ) -> None:
     """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
     from calstudy.experiment.collection import load_study
-    from calstudy.studies import plan_study
+    from calstudy.running.studies import plan_study
 
     plan_study(load_study(file, scale, overrides or ()), workers, max_memory, Console(highlight=False))
 

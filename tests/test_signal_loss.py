@@ -12,12 +12,12 @@ from tiny import tiny
 from calstudy.errors import ExperimentError, InputError
 from calstudy.experiment.files import dump, load, override, validate
 from calstudy.experiment.sweep import expand
+from calstudy.graph.sweeps import SweepGraph
+from calstudy.graph.tasks import Graph
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction, TransferMap, pool
-from calstudy.runs import run
-from calstudy.sweep_runs import SweepRun, run_sweep
-from calstudy.sweep_tasks import SweepGraph
-from calstudy.tasks import Graph
+from calstudy.running.runs import run
+from calstudy.running.sweep_runs import SweepRun, run_sweep
 
 ANTENNAS = 7
 VARIANTS = {

@@ -153,7 +153,7 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
 
 
 def _require_inspected_antennas(experiment: Experiment) -> None:
-    from calstudy.estimates import antenna_count
+    from calstudy.graph.estimates import antenna_count
 
     count = antenna_count(experiment.instrument.layout.model_dump())
     highest = max(place for pair in experiment.outputs.inspect.pairs for place in pair)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.errors import InputError
-from calstudy.progress import duration
+from calstudy.running.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
 FIRST_FIGURES = ("sweep", "layout", "wedge", "spherical", "signal-loss", "gains", "model", "data", "baselines")

@@ -16,8 +16,8 @@ from pyuvsim import BeamList
 from pyuvsim.simsetup import SkyModelData
 from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
 
-from calstudy import ranks
 from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.running import ranks
 from calstudy.visibilities import require_rectangular
 
 

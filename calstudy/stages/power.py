@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from calstudy.graph.tasks import EOR_REFERENCE, NOISE_REFERENCE
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import Beam, Channels
 from calstudy.power.average import fringe_stop_and_average
@@ -19,7 +20,6 @@ from calstudy.power.tables import save_spectrum, write_csv
 from calstudy.power.wedge import cylindrical_average
 from calstudy.stages.files import read_visibilities, write_visibilities
 from calstudy.stages.registry import Job
-from calstudy.tasks import EOR_REFERENCE, NOISE_REFERENCE
 
 EXCISION = {"all-modes": False, "outside-wedge": True}
 """Names of the spherical averages, and whether each leaves the wedge out."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calstudy.tasks import Task
+from calstudy.graph.tasks import Task
 
 LIBRARIES_MEMORY = 0.8e9
 COMPLEX128, COMPLEX64 = 16, 8

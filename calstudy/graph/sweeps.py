@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 from calstudy.experiment.sweep import Sweep
-from calstudy.tasks import Graph, Task, unique
+from calstudy.graph.tasks import Graph, Task, unique
 
 
 class SweepGraph:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import cached_property
 
-from calstudy.claim_tasks import claim_facts, claim_inputs
 from calstudy.experiment.collection import COMPARED, Collection
-from calstudy.tasks import Graph, Task, unique
+from calstudy.graph.claims import claim_facts, claim_inputs
+from calstudy.graph.tasks import Graph, Task, unique
 
 
 class CollectionGraph:

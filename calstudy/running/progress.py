@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from calstudy.store import Product
-from calstudy.tasks import Task
+from calstudy.graph.tasks import Task
+from calstudy.running.store import Product
 
 
 def duration(seconds: float) -> str:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calstudy import ranks
 from calstudy.errors import InputError
-from calstudy.perform import Order, perform
+from calstudy.graph.tasks import Task, unique
 from calstudy.resources import cores
-from calstudy.store import Product, Store, digest_json
-from calstudy.tasks import Task, unique
+from calstudy.running import ranks
+from calstudy.running.perform import Order, perform
+from calstudy.running.store import Product, Store, digest_json
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from calstudy import ranks
 from calstudy.errors import InputError
-from calstudy.estimates import LIBRARIES_MEMORY, estimate
 from calstudy.experiment.model import Experiment
+from calstudy.graph.estimates import LIBRARIES_MEMORY, estimate
+from calstudy.graph.tasks import Graph, Task
 from calstudy.resources import cores, free_memory
-from calstudy.store import Store
-from calstudy.tasks import Graph, Task
+from calstudy.running import ranks
+from calstudy.running.store import Store
 
 BYTES = {"MB": 1e6, "GB": 1e9, "TB": 1e12}
 SHARED_STAGE = "simulate-chunk"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from calstudy.claims.facts import FACTS
-from calstudy.tasks import Graph, Task
+from calstudy.graph.tasks import Graph, Task
 
 
 def agreement_task(graph: Graph) -> Task | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from calstudy.tasks import Graph, Task
+from calstudy.graph.tasks import Graph, Task
 
 WITHOUT_SKY = ("layout", "reflections")
 """Figures of nothing that a stand-in for sky, beam or scale enters."""

@@ -19,11 +19,11 @@ from tiny import tiny
 from calstudy.errors import InputError
 from calstudy.experiment.files import load, override, validate
 from calstudy.experiment.model import Experiment
+from calstudy.graph.tasks import Graph
 from calstudy.power.spherical import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.power.wedge import WedgeSpectrum
-from calstudy.runs import Run, run
-from calstudy.tasks import Graph
+from calstudy.running.runs import Run, run
 
 
 def run_here(data: dict, folder: Path) -> tuple[Run, str]:

@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 from tiny import tiny
 
-from calstudy import capacity
-from calstudy.capacity import fit, parse_memory
 from calstudy.errors import InputError
-from calstudy.estimates import estimate
 from calstudy.experiment.files import load, override, validate
 from calstudy.experiment.model import Experiment
-from calstudy.tasks import Graph
+from calstudy.graph.estimates import estimate
+from calstudy.graph.tasks import Graph
+from calstudy.running import capacity
+from calstudy.running.capacity import fit, parse_memory
 
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
 @pytest.fixture

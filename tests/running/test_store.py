@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calstudy.errors import InputError
-from calstudy.store import Store, digest_json
+from calstudy.running.store import Store, digest_json
 
 KEY = "0" * 32
 

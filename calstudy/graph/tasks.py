@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.experiment.model import Component, Experiment, Variant
+from calstudy.running.store import digest_file, digest_json
 from calstudy.simulate.settings import SimulationSettings
-from calstudy.store import digest_file, digest_json
 
 PARITIES = ("even", "odd")
 # Inputs of the spectra besides the variants, whose names cannot hold a colon.
@@ -254,22 +254,22 @@ class Graph:
     @cached_property
     def agreement(self) -> Task | None:
         """How far the calibration agrees with the truth, or None if the experiment has no such comparison."""
-        from calstudy.claim_tasks import agreement_task
+        from calstudy.graph.claims import agreement_task
 
         return agreement_task(self)
 
     @cached_property
     def claims(self) -> Task:
         """The paper's claims, evaluated on this experiment alone."""
-        from calstudy.claim_tasks import claims_task
+        from calstudy.graph.claims import claims_task
 
         return claims_task(self)
 
     @cached_property
     def figures(self) -> list[Task]:
         """The figures asked for."""
-        from calstudy.figure_tasks import figure_task
-        from calstudy.transfer_tasks import transfer_figure
+        from calstudy.graph.figures import figure_task
+        from calstudy.graph.transfers import transfer_figure
 
         names = self.experiment.outputs.figures
         return [transfer_figure(self) if name == "signal-loss" else figure_task(self, name) for name in names]
@@ -277,7 +277,7 @@ class Graph:
     @cached_property
     def transfer(self) -> Task | None:
         """The signal loss, or None if the experiment does not calibrate the data with the EoR and without."""
-        from calstudy.transfer_tasks import transfer_task
+        from calstudy.graph.transfers import transfer_task
 
         return transfer_task(self) if self.experiment.measures_signal_loss else None
 

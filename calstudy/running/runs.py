@@ -16,15 +16,15 @@ from uuid import uuid4
 from rich.console import Console
 
 from calstudy.errors import InputError
-from calstudy.estimates import estimate
-from calstudy.execution import Crew, drop_temporary, execute, schedule
 from calstudy.experiment.files import dump
 from calstudy.experiment.model import Experiment
-from calstudy.progress import report
-from calstudy.provenance import git_commit, machine, package_versions, seeds
+from calstudy.graph.estimates import estimate
+from calstudy.graph.tasks import Graph, Task, unique
 from calstudy.report.page import write_report
-from calstudy.store import Product, Store, digest_json
-from calstudy.tasks import Graph, Task, unique
+from calstudy.running.execution import Crew, drop_temporary, execute, schedule
+from calstudy.running.progress import report
+from calstudy.running.provenance import git_commit, machine, package_versions, seeds
+from calstudy.running.store import Product, Store, digest_json
 
 logger = logging.getLogger(__name__)
 MANIFEST = "manifest.json"

@@ -10,14 +10,14 @@ from typing import Any
 
 from rich.console import Console
 
-from calstudy.execution import Crew
 from calstudy.experiment.files import dump
 from calstudy.experiment.sweep import Sweep
-from calstudy.provenance import git_commit, machine, package_versions
+from calstudy.graph.sweeps import SweepGraph
 from calstudy.report.page import write_report
-from calstudy.runs import MANIFEST, Run, fill_folder, log_to, make, open_folder, publish, run_folder, write
-from calstudy.store import Product, Store
-from calstudy.sweep_tasks import SweepGraph
+from calstudy.running.execution import Crew
+from calstudy.running.provenance import git_commit, machine, package_versions
+from calstudy.running.runs import MANIFEST, Run, fill_folder, log_to, make, open_folder, publish, run_folder, write
+from calstudy.running.store import Product, Store
 
 POINTS, SUMMARY = "points", "summary.csv"
 

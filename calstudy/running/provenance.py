@@ -44,7 +44,7 @@ def package_versions() -> dict[str, str | None]:
 
 def git_commit() -> str | None:
     """Return the commit of the checkout that calstudy runs from, with ``-dirty`` if it was changed, or None."""
-    checkout = Path(__file__).resolve().parents[1]
+    checkout = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(checkout), *arguments]

@@ -13,14 +13,14 @@ from pyuvdata import UVData
 from tiny import tiny
 
 from calstudy.experiment.files import validate
-from calstudy.perform import Order, perform
-from calstudy.store import Store
-from calstudy.tasks import Graph, unique
+from calstudy.graph.tasks import Graph, unique
+from calstudy.running.perform import Order, perform
+from calstudy.running.store import Store
 
 MPIEXEC = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or "mpiexec"
 PROGRAM = """
 import sys
-from calstudy import ranks
+from calstudy.running import ranks
 from calstudy.errors import InputError
 from ranks_example import {work} as work
 if ranks.is_helper():

@@ -6,18 +6,18 @@ import dataclasses
 
 from rich.console import Console
 
-from calstudy.capacity import fit
-from calstudy.collection_runs import collection_folder, run_collection
-from calstudy.collection_tasks import CollectionGraph
 from calstudy.experiment.collection import Collection
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.sweep import Sweep, expand
-from calstudy.plans import show_claims, show_collection_result, show_plan, show_result
-from calstudy.preflight import require_basis_fits
-from calstudy.runs import run, run_folder
-from calstudy.sweep_runs import run_sweep
-from calstudy.sweep_tasks import SweepGraph
-from calstudy.tasks import Graph
+from calstudy.graph.collections import CollectionGraph
+from calstudy.graph.sweeps import SweepGraph
+from calstudy.graph.tasks import Graph
+from calstudy.running.capacity import fit
+from calstudy.running.collection_runs import collection_folder, run_collection
+from calstudy.running.plans import show_claims, show_collection_result, show_plan, show_result
+from calstudy.running.preflight import require_basis_fits
+from calstudy.running.runs import run, run_folder
+from calstudy.running.sweep_runs import run_sweep
 
 Study = Experiment | Collection | Sweep
 

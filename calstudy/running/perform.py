@@ -14,10 +14,10 @@ from typing import Any
 
 from calstudy import __version__
 from calstudy.errors import InputError
+from calstudy.graph.tasks import Task
 from calstudy.resources import Usage
+from calstudy.running.store import Product, Store
 from calstudy.stages.registry import STAGES, Job
-from calstudy.store import Product, Store
-from calstudy.tasks import Task
 
 logger = logging.getLogger(__name__)
 

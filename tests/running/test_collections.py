@@ -12,17 +12,17 @@ from tiny import tiny
 
 from calstudy.claims.folders import evaluate_folder
 from calstudy.claims.tables import from_json
-from calstudy.collection_runs import CollectionRun, collection_folder, run_collection
-from calstudy.collection_tasks import CollectionGraph
 from calstudy.errors import ExperimentError, InputError
 from calstudy.experiment.collection import Collection, load_study
 from calstudy.experiment.files import override
 from calstudy.experiment.model import Experiment
+from calstudy.graph.collections import CollectionGraph
+from calstudy.graph.tasks import Graph
 from calstudy.power.spherical import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
-from calstudy.tasks import Graph
+from calstudy.running.collection_runs import CollectionRun, collection_folder, run_collection
 
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 PAIR = {
     "name": "pair",
     "experiments": [

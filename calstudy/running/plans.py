@@ -10,18 +10,18 @@ from rich.console import Console
 from rich.table import Table
 
 from calstudy.claims.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
-from calstudy.collection_runs import CollectionRun
-from calstudy.collection_tasks import CollectionGraph
-from calstudy.estimates import LIBRARIES_MEMORY, Cost, estimate
-from calstudy.execution import schedule
 from calstudy.experiment.collection import Collection
 from calstudy.experiment.model import Experiment
-from calstudy.progress import duration
+from calstudy.graph.collections import CollectionGraph
+from calstudy.graph.estimates import LIBRARIES_MEMORY, Cost, estimate
+from calstudy.graph.sweeps import SweepGraph
+from calstudy.graph.tasks import Graph, Task
 from calstudy.resources import free_memory
-from calstudy.runs import Run
-from calstudy.store import Store
-from calstudy.sweep_tasks import SweepGraph
-from calstudy.tasks import Graph, Task
+from calstudy.running.collection_runs import CollectionRun
+from calstudy.running.execution import schedule
+from calstudy.running.progress import duration
+from calstudy.running.runs import Run
+from calstudy.running.store import Store
 
 
 def _by_stage(tasks: Sequence[Task]) -> dict[str, list[Task]]:

@@ -6,10 +6,10 @@ import numpy as np
 from pyuvdata import UVData
 from tiny import tiny
 
-from calstudy.execution import Crew, execute, schedule
 from calstudy.experiment.files import override, validate
-from calstudy.store import Store
-from calstudy.tasks import Graph
+from calstudy.graph.tasks import Graph
+from calstudy.running.execution import Crew, execute, schedule
+from calstudy.running.store import Store
 
 
 def visibilities(folder: Path, chunks: int, workers: int) -> list[np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
-from calstudy.tasks import PARITIES, Graph, Task
+from calstudy.graph.tasks import PARITIES, Graph, Task
 
 
 def transfer_task(graph: Graph) -> Task:

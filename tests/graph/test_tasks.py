@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from calstudy.experiment.files import override, validate
-from calstudy.tasks import Graph, identify
+from calstudy.graph.tasks import Graph, identify
 
 BASE = {"name": "keys", "instrument": {"layout": {"kind": "hex", "side": 2}, "beam": "gaussian"}}
 

@@ -11,12 +11,12 @@ from typing import Any
 
 from rich.console import Console
 
-from calstudy.collection_tasks import CollectionGraph
-from calstudy.execution import Crew
 from calstudy.experiment.collection import Collection
+from calstudy.graph.collections import CollectionGraph
 from calstudy.report.page import write_report
-from calstudy.runs import MANIFEST, Run, fill_folder, log_to, make, open_folder, publish, run_folder, write
-from calstudy.store import Product, Store, digest_json
+from calstudy.running.execution import Crew
+from calstudy.running.runs import MANIFEST, Run, fill_folder, log_to, make, open_folder, publish, run_folder, write
+from calstudy.running.store import Product, Store, digest_json
 
 
 @dataclass(frozen=True)

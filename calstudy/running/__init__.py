@@ -1,0 +1,1 @@
+"""Make the products of a graph: store, workers, and run folders."""
