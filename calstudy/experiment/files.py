@@ -205,6 +205,7 @@ def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) ->
     ExperimentError
         If fields are unknown, missing, or hold values that are not allowed.
     """
+    path = Path(path)
     data = apply_scale(read_mapping(path), scale)
     for text in overrides:
         data = override(data, *parse_override(text))
