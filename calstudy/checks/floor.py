@@ -10,14 +10,15 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from calstudy.checks.beam import INTERPOLATIONS, interpolated, require_tabulated
+from calstudy.errors import InputError
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate.chunks import simulate_visibilities
 from calstudy.simulate.engine import make_engine
-from calstudy.simulate.floor import MAIN_LOBES, DelayFloor, delay_floor, make_window
+from calstudy.simulate.floor import MAIN_LOBES, DelayFloor, delay_floor, delay_profile, floor_buffers
 from calstudy.simulate.nodes import integration_times
 from calstudy.sky.foregrounds import make_foregrounds
-from calstudy.visibilities import baseline_vectors, from_cube, to_cube
+from calstudy.visibilities import baseline_vectors, from_cube
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -82,21 +83,22 @@ def compare_floors(
 
 
 def _measure(foregrounds: UVData) -> InterpolationFloor:
-    cube = to_cube(foregrounds)
+    buffers = floor_buffers(foregrounds)
+    if len(buffers) < len(MAIN_LOBES):
+        raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
-    width = float(np.diff(foregrounds.freq_array).mean())
     short = lengths <= np.quantile(lengths, 1 / 3)
-    window = make_window("dolph-chebyshev", foregrounds.Nfreqs)
-    transform = np.abs(np.fft.fft(cube[:, short] * window[:, None], axis=2)) ** 2
-    delays = np.fft.fftfreq(foregrounds.Nfreqs, width)
-    power = transform.mean(axis=(0, 1, 3))
-    half = foregrounds.Nfreqs // 2
-    # Both signs of a delay are one.
-    folded = np.concatenate([power[:1], (power[1:half] + power[:-half:-1]) / 2])
-    buffers = {taper: lobe / (width * foregrounds.Nfreqs) for taper, lobe in MAIN_LOBES.items()}
+    delays, power = delay_profile(foregrounds, "dolph-chebyshev")
+    delay, folded = folded_spectrum(delays, power[short].mean(axis=0))
     return InterpolationFloor(
-        delay=delays[:half],
+        delay=delay,
         spectrum=np.sqrt(folded / folded.max()),
         horizon=float(lengths[short].max() / speed_of_light),
-        floors={taper: delay_floor(foregrounds, max(100e-9, buffer), taper) for taper, buffer in buffers.items()},
+        floors={taper: delay_floor(foregrounds, buffer, taper) for taper, buffer in buffers.items()},
     )
+
+
+def folded_spectrum(delays: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return delays >= 0, (N // 2,), and the mean power of both signs of each, from the order of `numpy.fft`."""
+    half = delays.size // 2
+    return delays[:half], np.concatenate([power[:1], (power[1:half] + power[:-half:-1]) / 2])

@@ -14,6 +14,7 @@ import numpy as np
 from astropy import units
 from astropy.coordinates import EarthLocation
 from pyuvdata import utils as uvutils
+from scipy.spatial.distance import pdist, squareform
 
 from calstudy.errors import InputError
 from calstudy.instrument import settings as section
@@ -207,8 +208,14 @@ def _from_csv(path: Path) -> Layout:
     """Positions, and names and numbers where given, from a CSV file."""
     if not path.is_file():
         raise InputError(f"instrument.layout.path: there is no file {path}")
-    with path.open(newline="", encoding="utf-8-sig") as table:
-        rows = list(csv.DictReader(table))
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as table:
+            rows = list(csv.DictReader(table))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"instrument.layout.path: {path} is not a CSV file in UTF-8 ({error})") from None
+    uneven = next((line for line, row in enumerate(rows, 2) if None in row or None in row.values()), None)
+    if uneven is not None:
+        raise InputError(f"instrument.layout.path: row {uneven} of {path} has more or fewer cells than the first")
     columns = set(rows[0]) if rows else set()
     missing = {"east_m", "north_m", "up_m"} - columns
     if missing or len(rows) < 2:
@@ -226,4 +233,11 @@ def _from_csv(path: Path) -> Layout:
         raise InputError(f"instrument.layout.path: antenna numbers (>= 0) and names in {path} must be unique")
     if not np.isfinite(enu).all():
         raise InputError(f"instrument.layout.path: positions in {path} must be finite")
+    distances = squareform(pdist(enu)) + np.diag(np.full(len(enu), np.inf))
+    first, second = np.unravel_index(distances.argmin(), distances.shape)
+    if distances[first, second] == 0:
+        raise InputError(
+            f"instrument.layout.path: antennas {names[first]!r} and {names[second]!r} in {path} are in one place: a "
+            "baseline of length zero"
+        )
     return Layout(path.stem, numbers, names, enu, MWA_LOCATION)

@@ -139,6 +139,15 @@ Beam = Annotated[
 ]
 
 
+class AntennaBeam(Section):
+    """Antennas whose beam is not the array's own."""
+
+    antennas: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, min_length=1)] = Field(
+        description="Which antennas of the layout, counted from 0."
+    )
+    beam: Beam = Field(description="Their beam, any of the kinds of `instrument.beam`.")
+
+
 class Channels(Section):
     """Equally spaced channel centres; the default is the paper's (384 x 80 kHz from 167.075 MHz)."""
 
@@ -160,6 +169,12 @@ class InstrumentSettings(Section):
 
     layout: Layout = MwaLayout()
     beam: Beam = MwaEmbeddedBeam()
+    # Left out where it is not used, so that it is no part of what identifies an array of like antennas.
+    antenna_beams: dict[str, AntennaBeam] = Field(
+        default_factory=dict,
+        exclude_if=lambda value: not value,
+        description="Sets of antennas with another beam, by any name. Power spectra are normalized by `beam`.",
+    )
     channels: Channels = Channels()
     times: Times = Times()
     polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(strict=False, min_length=1, max_length=2)] = Field(
@@ -170,4 +185,14 @@ class InstrumentSettings(Section):
     def _polarizations_are_unique(self) -> InstrumentSettings:
         if len(set(self.polarizations)) != len(self.polarizations):
             raise fault("polarizations", f"names a polarization twice: {', '.join(self.polarizations)}")
+        return self
+
+    @model_validator(mode="after")
+    def _antennas_have_one_beam(self) -> InstrumentSettings:
+        seen: set[int] = set()
+        for name, group in self.antenna_beams.items():
+            twice = seen.intersection(group.antennas)
+            if twice or len(set(group.antennas)) != len(group.antennas):
+                raise fault(f"antenna_beams.{name}.antennas", "names an antenna that is named already")
+            seen.update(group.antennas)
         return self

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,8 @@ from pyuvdata import UVBeam
 from scipy.interpolate import interp1d
 
 from calstudy.errors import InputError
+from calstudy.instrument.beam_file import find_beam
 
-MWA_FILE = "mwa_full_embedded_element_pattern.h5"
 PIXELS_PER_DEGREE = 1
 
 # The tabulated MWA beam scatters from frequency to frequency by 2.4e-5 rms of the zenith value. A polynomial of order 8
@@ -32,7 +31,7 @@ def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> U
     Parameters
     ----------
     path
-        Beam file (HDF5), by default the one in the mwa_pb package.
+        Beam file (HDF5), by default the one that `calstudy.instrument.beam_file.find_beam` finds.
     band
         Lowest and highest frequency of interest in Hz; the margin that a fit needs is read, too.
 
@@ -41,7 +40,7 @@ def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> U
     InputError
         If the file is missing or is not an MWA beam file of this band.
     """
-    path = Path(str(files("mwa_pb") / "data" / MWA_FILE)) if path is None else path
+    path = find_beam() if path is None else path
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
     return _read_mwa(path, *_fit_range(band))

@@ -7,6 +7,7 @@ likes, and the chunks of a simulation assemble to its visibilities. The result d
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
+    from calstudy.instrument.antenna_beams import AntennaBeams
     from calstudy.simulate.engine import BeamSource, Engine
     from calstudy.simulate.settings import SimulationSettings
 
@@ -98,7 +100,9 @@ def plan_chunks(template: UVData, settings: SimulationSettings, smooth_in_freque
     return [Chunk(grid, slice(start, stop)) for start, stop in pairwise(edges)]
 
 
-def simulate_chunk(engine: Engine, sky: SkyModel, beam: BeamSource, template: UVData, chunk: Chunk) -> np.ndarray:
+def simulate_chunk(
+    engine: Engine, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, chunk: Chunk
+) -> np.ndarray:
     """Simulate a chunk at all integrations.
 
     Sources above the horizon throughout are simulated at the time nodes and interpolated; those that rise or set are
@@ -111,7 +115,7 @@ def simulate_chunk(engine: Engine, sky: SkyModel, beam: BeamSource, template: UV
     sky
         For a sky given channel by channel, at least the chunk's channels.
     beam
-        Of all antennas.
+        Of all antennas, or of each.
     template
         The whole observation.
     chunk
@@ -148,7 +152,7 @@ def assemble(chunks: list[Chunk], cubes: list[np.ndarray]) -> np.ndarray:
 def simulate_visibilities(
     engine: Engine,
     sky: SkyModel,
-    beam: BeamSource,
+    beam: BeamSource | AntennaBeams,
     template: UVData,
     settings: SimulationSettings,
     smooth_in_frequency: bool,
@@ -165,9 +169,7 @@ def simulate_visibilities(
 
 
 def check_interpolation(
-    engine: Engine,
-    sky: SkyModel,
-    beam: BeamSource,
+    simulate: Callable[[UVData], np.ndarray],
     template: UVData,
     cube: np.ndarray,
     grid: NodeGrid,
@@ -178,8 +180,11 @@ def check_interpolation(
 
     Parameters
     ----------
-    engine, sky, beam, template
-        As for the simulation.
+    simulate
+        Returns the visibilities at a template's integrations and channels, (Ntimes, Nbls, Nfreqs, Npols): an engine's
+        `simulate` with the sky and beam of the simulation.
+    template
+        Of the simulation.
     cube : (Ntimes, Nbls, Nfreqs, Npols)
         Its result at all channels.
     grid
@@ -192,7 +197,7 @@ def check_interpolation(
     times, frequencies = integration_times(template), template.freq_array
     at_times = _farthest(times, grid.times_jd, np.arange(len(times)), count)
     at_channels = _farthest(frequencies, grid.frequencies, np.arange(len(frequencies))[channels], count)
-    direct = engine.simulate(sky, beam, subset_template(template, times[at_times], frequencies[at_channels]))
+    direct = simulate(subset_template(template, times[at_times], frequencies[at_channels]))
     errors = np.abs(cube[at_times][:, :, at_channels] - direct)
     rms = np.sqrt(np.mean(np.abs(direct) ** 2))
     return InterpolationCheck(

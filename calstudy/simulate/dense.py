@@ -7,7 +7,9 @@ With C = Re E and S = Im E,
     Z_ab = sum_s w (C_a - S_a) C_b + w (C_a + S_a) S_b = Re V_ab + Im V_ab,
     Re V = (Z + Z^T) / 2,    Im V = (Z - Z^T) / 2,
 
-half the arithmetic of the complex product. Sine and cosine are evaluated by polynomials in a loop the compiler
+half the arithmetic of the complex product. Where antennas have different beams the weights of a pair of antennas are
+complex, w = J_a J_b* I / 2; then the same is done with their real and with their imaginary parts, for every pair of
+beams (`calstudy.simulate.patterns.CrossPattern`). Sine and cosine are evaluated by polynomials in a loop the compiler
 vectorizes, which costs less than the complex multiplications of a recurrence over channels and allows any frequencies.
 """
 
@@ -23,10 +25,11 @@ from scipy.constants import speed_of_light
 from threadpoolctl import threadpool_limits
 
 from calstudy.errors import InputError
+from calstudy.instrument.antenna_beams import split_beams
 from calstudy.simulate.brightness import is_polarized, stokes_i
 from calstudy.simulate.directions import SourceTracks
 from calstudy.simulate.nodes import integration_times
-from calstudy.simulate.patterns import PowerPattern, power_pattern, refusal
+from calstudy.simulate.patterns import CrossPattern, Pattern, power_pattern, refusal
 from calstudy.visibilities import antenna_indices, require_rectangular
 
 # Sources per block: the two factors of the matrix product then stay in a 2 MB cache for tens of antennas.
@@ -38,7 +41,9 @@ SINE = tuple((-1) ** k * math.pi ** (2 * k + 1) / math.factorial(2 * k + 1) for 
 
 
 class DenseEngine:
-    """Matrix products over blocks of sources; unpolarized sky, one beam for all antennas, xx and yy.
+    """Matrix products over blocks of sources; unpolarized sky, xx and yy.
+
+    The cost of the products grows with the square of the number of different beams.
 
     Parameters
     ----------
@@ -59,7 +64,9 @@ class DenseEngine:
             feeds = polarization_feeds(template)
         except InputError as error:
             return f"the dense engine does not handle it: {error}"
-        return refusal(beam.at(template.freq_array[:1]), feeds)
+        beams, _ = split_beams(beam, template)
+        reasons = (refusal(item.at(template.freq_array[:1]), feeds) for item in beams)
+        return next((reason for reason in reasons if reason), None)
 
     def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`.
@@ -74,23 +81,28 @@ class DenseEngine:
         if is_polarized(sky):
             raise InputError("the dense engine does not handle a polarized sky")
         frequencies, feeds = template.freq_array, polarization_feeds(template)
-        pattern = power_pattern(beam.at(frequencies), frequencies, feeds)
+        beams, index = split_beams(beam, template)
+        patterns = [power_pattern(item.at(frequencies), frequencies, feeds) for item in beams]
+        pattern = patterns[0] if len(patterns) == 1 else CrossPattern(patterns)
         flux = stokes_i(sky, frequencies)
         times = integration_times(template)
         tracks = SourceTracks(sky, template.telescope.location, times)
         order = _order_on_sky(tracks.at(times[0]))
         used, pairs = np.unique(antenna_indices(template), return_inverse=True)
         first, second = pairs.reshape(-1, 2).T
+        owners = index[used[np.array([first, second])]]
         delays = template.telescope.get_enu_antpos()[used] / speed_of_light
         cube = np.empty((len(times), template.Nbls, len(frequencies), len(feeds)), dtype=np.complex128)
         # The products are many and small: threads in each cost more than they gain, and workers share the cores.
         with threadpool_limits(limits=1, user_api="blas"):
-            for index, time in enumerate(times):
+            for step, time in enumerate(times):
                 vectors = tracks.at(time, order)
                 up = vectors[2] > 0
                 sums = self._sum_sources(vectors[:, up], flux, order[up], delays, frequencies, pattern)
                 forward, backward = sums[..., first, second], sums[..., second, first]
-                cube[index] = 0.5 * ((forward + backward) + 1j * (forward - backward)).transpose(2, 0, 1)
+                # (Nbls, Nfreqs, Nweights)
+                products = 0.5 * ((forward + backward) + 1j * (forward - backward)).transpose(2, 0, 1)
+                cube[step] = products if len(patterns) == 1 else _of_beams(products, len(beams), *owners)
         return cube
 
     def _sum_sources(
@@ -100,13 +112,13 @@ class DenseEngine:
         components: np.ndarray,
         delays: np.ndarray,
         frequencies: np.ndarray,
-        pattern: PowerPattern,
+        pattern: Pattern,
     ) -> np.ndarray:
-        """Return Z of every frequency and feed, (Nfreqs, Nfeeds, Nants, Nants), for sources at `vectors` (3, Nup)."""
-        n_ants, n_feeds = len(delays), pattern.n_feeds
+        """Return Z of every frequency and weight, (Nfreqs, Nweights, Nants, Nants); sources at `vectors` (3, Nup)."""
+        n_ants, n_weights = len(delays), pattern.n_weights
         azimuth, zenith_angle = np.arctan2(vectors[1], vectors[0]) % (2 * np.pi), _zenith_angles(vectors)
         size = max(64, BLOCK_BYTES // (4 * 8 * n_ants) // 64 * 64)
-        sums = np.zeros((len(frequencies), n_feeds, n_ants, n_ants))
+        sums = np.zeros((len(frequencies), n_weights, n_ants, n_ants))
         for start in range(0, len(components), size):
             block = slice(start, start + size)
             weights = pattern.at(azimuth[block], zenith_angle[block])
@@ -115,13 +127,33 @@ class DenseEngine:
         return sums
 
     def _add_products(self, delays: np.ndarray, weights: np.ndarray, frequencies: np.ndarray, sums: np.ndarray) -> None:
-        """Add to Z a block of sources with delays (Nants, N) and weights (Nfeeds, Nfreqs, N)."""
-        n_feeds, (n_ants, n_sources) = len(weights), delays.shape
-        left = np.empty((n_feeds * n_ants, 2 * n_sources), dtype=self._dtype)
+        """Add to Z a block of sources with delays (Nants, N) and weights (Nweights, Nfreqs, N)."""
+        n_weights, (n_ants, n_sources) = len(weights), delays.shape
+        left = np.empty((n_weights * n_ants, 2 * n_sources), dtype=self._dtype)
         right = np.empty((n_ants, 2 * n_sources), dtype=self._dtype)
         for index, frequency in enumerate(frequencies):
             _factors(delays, weights[:, index], frequency, left, right)
-            sums[index] += (left @ right.T).reshape(n_feeds, n_ants, n_ants)
+            sums[index] += (left @ right.T).reshape(n_weights, n_ants, n_ants)
+
+
+def _of_beams(products: np.ndarray, count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the visibilities of baselines between antennas of given beams, (Nbls, Nfreqs, Nfeeds).
+
+    Parameters
+    ----------
+    products : (Nbls, Nfreqs, Nbeams * Nbeams * Nfeeds)
+        Visibilities for each of the weights of a `CrossPattern`.
+    count
+        Number of beams.
+    first, second : (Nbls,) int
+        Beams of the antennas of each baseline.
+    """
+    baselines = np.arange(len(first))
+    matrices = products.reshape(*products.shape[:2], count, count, -1)
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    sign = np.sign(second - first)[:, None, None]
+    # The baseline first: numpy puts the axes of separated index arrays in front.
+    return matrices[baselines, :, low, high] + 1j * sign * matrices[baselines, :, high, low]
 
 
 def polarization_feeds(template: UVData) -> list[str]:
@@ -173,12 +205,12 @@ def _weigh(cosine: np.ndarray, sine: np.ndarray, weights: np.ndarray, low: np.nd
 
 @numba.njit(cache=True, nogil=True)
 def _factors(delays: np.ndarray, weights: np.ndarray, frequency: float, left: np.ndarray, right: np.ndarray) -> None:
-    """Fill left (Nfeeds * Nants, 2 N) with w (C - S) and w (C + S), right (Nants, 2 N) with C and S."""
+    """Fill left (Nweights * Nants, 2 N) with w (C - S) and w (C + S), right (Nants, 2 N) with C and S."""
     n_ants, n_sources = delays.shape
     # One row at a time: on rows the compiler can rule out that input and output overlap, and vectorizes.
     for antenna in range(n_ants):
         cosine, sine = right[antenna, :n_sources], right[antenna, n_sources:]
         _fringes(delays[antenna], frequency, cosine, sine)
-        for feed in range(len(weights)):
-            row = left[feed * n_ants + antenna]
-            _weigh(cosine, sine, weights[feed], row[:n_sources], row[n_sources:])
+        for index in range(len(weights)):
+            row = left[index * n_ants + antenna]
+            _weigh(cosine, sine, weights[index], row[:n_sources], row[n_sources:])

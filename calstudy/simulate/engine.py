@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pyuvdata import UVBeam, UVData
     from pyuvdata.analytic_beam import AnalyticBeam
 
+    from calstudy.instrument.antenna_beams import AntennaBeams
     from calstudy.simulate.settings import SimulationSettings
 
 logger = logging.getLogger(__name__)
@@ -31,10 +32,10 @@ class Engine(Protocol):
 
     name: str
 
-    def refusal(self, sky: SkyModel, beam: BeamSource, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
         """Return in one sentence why this engine cannot do what is asked, or None if it can."""
 
-    def simulate(self, sky: SkyModel, beam: BeamSource, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
         """Simulate every time, baseline, frequency and polarization of the template; change none of the arguments.
 
         Parameters
@@ -42,7 +43,7 @@ class Engine(Protocol):
         sky
             Points or HEALPix, in Jy or K, of any spectral type.
         beam
-            One beam for all antennas.
+            One for all antennas, or `AntennaBeams`.
         template
             Rectangular observation without data (see `calstudy.visibilities`).
 
@@ -61,7 +62,7 @@ class FastestEngine:
     def __init__(self, engines: list[Engine]):
         self._engines = engines
 
-    def choose(self, sky: SkyModel, beam: BeamSource, template: UVData) -> Engine:
+    def choose(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> Engine:
         """Return the engine that will be used; raises InputError with every engine's reason if none can."""
         reasons = []
         for engine in self._engines:
@@ -73,7 +74,7 @@ class FastestEngine:
             reasons.append(f"{engine.name}: {reason}")
         raise InputError("no engine handles this simulation; " + "; ".join(reasons))
 
-    def refusal(self, sky: SkyModel, beam: BeamSource, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
         """Return why none of the engines can do what is asked, or None if one can."""
         try:
             self.choose(sky, beam, template)
@@ -81,7 +82,7 @@ class FastestEngine:
             return str(error)
         return None
 
-    def simulate(self, sky: SkyModel, beam: BeamSource, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities of the fastest engine that handles them; see `Engine.simulate`."""
         return self.choose(sky, beam, template).simulate(sky, beam, template)
 

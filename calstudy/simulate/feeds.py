@@ -6,6 +6,7 @@ import numpy as np
 from pyradiosky import SkyModel
 from pyuvdata import UVData
 
+from calstudy.instrument.antenna_beams import split_beams
 from calstudy.simulate.brightness import is_polarized
 
 # Row and column of a matrix of feeds x and y that hold each polarization number.
@@ -19,8 +20,9 @@ def refusal(engine: str, sky: SkyModel, beam, template: UVData) -> str | None:
     unknown = [int(number) for number in template.polarization_array if int(number) not in FEED_PAIRS]
     if unknown:
         return f"polarization number {unknown[0]} is not linear"
-    if list(beam.at(template.freq_array[:1]).feed_array) != ["x", "y"]:
-        return f"{engine} needs a beam with feeds x and y"
+    beams, _ = split_beams(beam, template)
+    if any(list(item.at(template.freq_array[:1]).feed_array) != ["x", "y"] for item in beams):
+        return f"{engine} needs beams with feeds x and y"
     return None
 
 

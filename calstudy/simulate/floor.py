@@ -64,8 +64,41 @@ class DelayFloor:
         return float(np.nanmax(self.max_db))
 
 
+def delay_profile(foregrounds: UVData, taper: Taper) -> tuple[np.ndarray, np.ndarray]:
+    """Return delays in the order of `numpy.fft`, (Nfreqs,), s, and each baseline's mean |V~|^2 there, (Nbls, Nfreqs).
+
+    The mean is over integrations and polarizations; the transform is a plain sum over equally spaced channels, Jy.
+    """
+    cube = to_cube(foregrounds)
+    width = float(np.diff(foregrounds.freq_array).mean())
+    spectrum = np.fft.fft(cube * make_window(taper, cube.shape[2])[:, None], axis=2)
+    return np.fft.fftfreq(cube.shape[2], width), np.mean(np.abs(spectrum) ** 2, axis=(0, 3))
+
+
+def floor_buffers(foregrounds: UVData) -> dict[Taper, float]:
+    """Return for each taper the delay beyond the horizon at which its main lobe has ended, 100 ns at least, in s.
+
+    Tapers for which the band leaves no delay beyond that of the longest baseline are left out.
+    """
+    width = float(np.diff(foregrounds.freq_array).mean())
+    resolution = 1 / (width * foregrounds.Nfreqs)
+    horizon = float(np.linalg.norm(baseline_vectors(foregrounds), axis=1).max()) / speed_of_light
+    found = {taper: max(100e-9, lobe * resolution) for taper, lobe in MAIN_LOBES.items()}
+    return {taper: buffer for taper, buffer in found.items() if horizon + buffer + resolution < 0.5 / width}
+
+
+def length_bins(lengths: np.ndarray, n_bins: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges (n_bins + 1,) of equal bins from zero to the longest baseline, and each one's bin (Nbls,)."""
+    edges = np.linspace(0, lengths.max() * (1 + 1e-9), n_bins + 1)
+    return edges, np.digitize(lengths, edges) - 1
+
+
 def delay_floor(
-    foregrounds: UVData, buffer: float = 100e-9, taper: Taper = "blackman-harris", n_bins: int = 6
+    foregrounds: UVData,
+    buffer: float = 100e-9,
+    taper: Taper = "blackman-harris",
+    n_bins: int = 6,
+    peaks: UVData | None = None,
 ) -> DelayFloor:
     """Measure the delay floor of simulated foregrounds.
 
@@ -81,28 +114,26 @@ def delay_floor(
         shows the simulation's own floor under them.
     n_bins
         Number of equal bins in baseline length.
+    peaks
+        Visibilities whose peaks the levels are relative to, of the same shape; by default `foregrounds` themselves.
 
     Raises
     ------
     ValueError
         If no delay is beyond horizon + buffer for the longest baseline.
     """
-    cube = to_cube(foregrounds)
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
-    width = float(np.diff(foregrounds.freq_array).mean())
-    spectrum = np.fft.fft(cube * make_window(taper, cube.shape[2])[:, None], axis=2)
-    power = np.mean(np.abs(spectrum) ** 2, axis=(0, 3))
-    delays = np.abs(np.fft.fftfreq(cube.shape[2], width))
-    beyond = delays > (lengths / speed_of_light + buffer)[:, None]
+    delays, power = delay_profile(foregrounds, taper)
+    peak_power = power if peaks is None else delay_profile(peaks, taper)[1]
+    beyond = np.abs(delays) > (lengths / speed_of_light + buffer)[:, None]
     if not beyond.any(axis=1).all():
         raise ValueError(f"no delay is beyond the horizon plus {buffer} s: the channels are too wide")
-    edges = np.linspace(0, lengths.max() * (1 + 1e-9), n_bins + 1)
-    bins = np.digitize(lengths, edges) - 1
+    edges, bins = length_bins(lengths, n_bins)
     levels = np.full((2, n_bins), np.nan)
     for index in np.unique(bins):
         members = bins == index
         mean = power[members].mean(axis=0)
         outside = beyond[members].all(axis=0)
-        ratios = np.array([mean[outside].mean(), mean[outside].max()]) / mean.max()
+        ratios = np.array([mean[outside].mean(), mean[outside].max()]) / peak_power[members].mean(axis=0).max()
         levels[:, index] = 5 * np.log10(np.maximum(ratios, np.finfo(float).tiny))
     return DelayFloor(edges, *levels, buffer, taper)

@@ -5,19 +5,15 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from astropy.coordinates import ICRS
-from astropy.time import Time
 from matvis.wrapper import simulate_vis
 from pyradiosky import SkyModel
 from pyuvdata import BeamInterface, UVBeam, UVData
 
 from calstudy.errors import InputError
-from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.simulate.arguments import baseline_pairs, beam_arguments, common_arguments
 from calstudy.simulate.brightness import stokes_i
-from calstudy.simulate.directions import sky_coordinates
 from calstudy.simulate.feeds import refusal, select_polarizations
-from calstudy.simulate.nodes import integration_times
-from calstudy.visibilities import antenna_indices, require_rectangular
+from calstudy.visibilities import require_rectangular
 
 # matvis splits its sources so that a block takes about this much memory (bytes).
 BLOCK_MEMORY = 500_000_000
@@ -53,23 +49,14 @@ class MatvisEngine:
         reason = self.refusal(sky, beam, template)
         if reason:
             raise InputError(reason)
-        coordinates = sky_coordinates(sky).transform_to(ICRS())
-        telescope = template.telescope
-        used, pairs = np.unique(antenna_indices(template), return_inverse=True)
-        positions = telescope.get_enu_antpos()[used]
-        use_bundled_earth_orientation()
+        beams, index = beam_arguments(beam, template)
         simulate_positive = partial(
             simulate_vis,
-            ants=dict(enumerate(positions)),
-            ra=coordinates.ra.rad,
-            dec=coordinates.dec.rad,
-            freqs=template.freq_array,
-            times=Time(integration_times(template), format="jd", scale="utc", location=telescope.location),
-            beams=[_as_splines(beam.at(template.freq_array))],
-            telescope_loc=telescope.location,
-            polarized=True,
+            **common_arguments(sky, template),
+            beams=[_as_splines(item) for item in beams],
+            beam_idx=index,
             precision=self._precision,
-            antpairs=pairs.reshape(-1, 2),
+            antpairs=baseline_pairs(template),
             max_memory=BLOCK_MEMORY,
         )
         flux = np.ascontiguousarray(stokes_i(sky, template.freq_array).T)
@@ -78,7 +65,7 @@ class MatvisEngine:
         if flux.min() < 0:
             # matvis takes the square root of fluxes, and those of a 21 cm sky have both signs.
             visibilities -= simulate_positive(fluxes=np.maximum(-flux, 0))
-        return select_polarizations(visibilities.transpose(1, 2, 0, 3, 4), template).astype(np.complex128)
+        return select_polarizations(visibilities.transpose(1, 2, 0, 4, 3), template).astype(np.complex128)
 
 
 class _SplineBeam(UVBeam):
@@ -91,9 +78,9 @@ class _SplineBeam(UVBeam):
         return super().interp(**{**options, "interpolation_function": "az_za_simple", "spline_opts": None})
 
 
-def _as_splines(beam) -> UVBeam | BeamInterface:
+def _as_splines(beam: UVBeam | BeamInterface) -> UVBeam | BeamInterface:
     if not isinstance(beam, UVBeam):
-        return BeamInterface(beam, beam_type="efield")
+        return beam
     splines = _SplineBeam()
     for parameter in beam:
         setattr(splines, parameter, getattr(beam, parameter))

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from astropy.coordinates import ICRS
-from astropy.time import Time
 from fftvis.wrapper import simulate_vis
 from pyradiosky import SkyModel
-from pyuvdata import BeamInterface, UVBeam, UVData
+from pyuvdata import UVData
 
 from calstudy.errors import InputError
-from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.instrument.antenna_beams import AntennaBeams
+from calstudy.simulate.arguments import baseline_pairs, beam_arguments, common_arguments
 from calstudy.simulate.brightness import stokes_i
-from calstudy.simulate.directions import sky_coordinates
 from calstudy.simulate.feeds import refusal, select_polarizations
-from calstudy.simulate.nodes import integration_times
-from calstudy.visibilities import antenna_pairs, require_rectangular
+from calstudy.visibilities import require_rectangular
 
 # fftvis treats an array flatter than this (m) as flat: at 200 MHz, a phase of 4e-12.
 FLATNESS = 1e-12
+# Numbers of xy and yx are below that of yy.
+CROSS_HANDS = -6
 
 
 class FftvisEngine:
@@ -38,6 +37,8 @@ class FftvisEngine:
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
         """Return why this engine cannot do what is asked, or None if it can."""
+        if isinstance(beam, AntennaBeams) and (template.polarization_array < CROSS_HANDS).any():
+            return "fftvis mixes up the feeds of cross-hand polarizations where antennas have different beams"
         return refusal(self.name, sky, beam, template)
 
     def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:
@@ -52,26 +53,15 @@ class FftvisEngine:
         reason = self.refusal(sky, beam, template)
         if reason:
             raise InputError(reason)
-        coordinates = sky_coordinates(sky).transform_to(ICRS())
-        telescope = template.telescope
-        positions = dict(zip(telescope.antenna_numbers.tolist(), telescope.get_enu_antpos(), strict=True))
-        pairs = antenna_pairs(template).tolist()
-        used = sorted({number for pair in pairs for number in pair})
-        tabulated = beam.at(template.freq_array)
-        use_bundled_earth_orientation()
+        beams, index = beam_arguments(beam, template)
         # One process and thread, for the caller shares out the work.
         visibilities = simulate_vis(
-            ants={number: positions[number] for number in used},
+            **common_arguments(sky, template),
             fluxes=np.ascontiguousarray(stokes_i(sky, template.freq_array).T),
-            ra=coordinates.ra.rad,
-            dec=coordinates.dec.rad,
-            freqs=template.freq_array,
-            times=Time(integration_times(template), format="jd", scale="utc", location=telescope.location),
-            beam=tabulated if isinstance(tabulated, UVBeam) else BeamInterface(tabulated, beam_type="efield"),
-            telescope_loc=telescope.location,
-            baselines=[tuple(pair) for pair in pairs],
+            beam=beams,
+            beam_idx=index,
+            baselines=[tuple(pair) for pair in baseline_pairs(template).tolist()],
             precision=2,
-            polarized=True,
             eps=self._accuracy,
             flat_array_tol=FLATNESS,
             interpolation_function="az_za_simple",
@@ -80,4 +70,4 @@ class FftvisEngine:
             coord_method="CoordinateRotationAstropy",
         )
         # (Nfreqs, Ntimes, feed, feed, Nbls)
-        return select_polarizations(visibilities.transpose(1, 4, 0, 2, 3), template).astype(np.complex128)
+        return select_polarizations(visibilities.transpose(1, 4, 0, 3, 2), template).astype(np.complex128)

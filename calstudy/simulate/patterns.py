@@ -1,7 +1,8 @@
-"""Power pattern of a feed towards many directions at many frequencies: the part of a simulation that is not fringes."""
+"""Patterns of feeds towards many directions at many frequencies: the part of a simulation that is not fringes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numba
@@ -15,13 +16,20 @@ from calstudy.errors import InputError
 AZIMUTH_EXTENSION = 3
 
 
-class PowerPattern(Protocol):
-    """What a source of unit flux density gives in each feed, |J_theta|^2 + |J_phi|^2."""
+class Pattern(Protocol):
+    """What sources of unit flux density weigh, as so many real numbers for each frequency and direction."""
 
-    n_feeds: int
+    n_weights: int
 
     def at(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
-        """Return the pattern, (Nfeeds, Nfreqs, Ndirections), azimuth from east through north; both in rad."""
+        """Return the weights, (Nweights, Nfreqs, Ndirections), azimuth from east through north; both in rad."""
+
+
+class PowerPattern(Pattern, Protocol):
+    """|J_theta|^2 + |J_phi|^2 of each feed of one beam: one weight per feed."""
+
+    def fields(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return real and imaginary parts of both components of J, (Ndirections, Nfeeds, Nfreqs, 4)."""
 
 
 def power_pattern(beam: UVBeam | AnalyticBeam, frequencies: np.ndarray, feeds: list[str]) -> PowerPattern:
@@ -68,12 +76,21 @@ class AnalyticPattern:
         self._beam = BeamInterface(beam, beam_type="efield")
         self._frequencies = frequencies
         self._feeds = [list(beam.feed_array).index(feed) for feed in feeds]
-        self.n_feeds = len(feeds)
+        self.n_weights = len(feeds)
+
+    def _jones(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return J, (2, Nfeeds, Nfreqs, Ndirections)."""
+        jones = self._beam.compute_response(az_array=azimuth, za_array=zenith_angle, freq_array=self._frequencies)
+        return jones[:, self._feeds]
 
     def at(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
         """Return the pattern, (Nfeeds, Nfreqs, Ndirections)."""
-        jones = self._beam.compute_response(az_array=azimuth, za_array=zenith_angle, freq_array=self._frequencies)
-        return (np.abs(jones[:, self._feeds]) ** 2).sum(axis=0)
+        return (np.abs(self._jones(azimuth, zenith_angle)) ** 2).sum(axis=0)
+
+    def fields(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return real and imaginary parts of both components of J, (Ndirections, Nfeeds, Nfreqs, 4)."""
+        jones = self._jones(azimuth, zenith_angle).astype(np.complex128)
+        return np.ascontiguousarray(jones.transpose(3, 1, 2, 0)).view(np.float64)
 
 
 class SplinePattern:
@@ -92,7 +109,7 @@ class SplinePattern:
         data = beam.data_array[:, [list(beam.feed_array).index(feed) for feed in feeds]]
         data = np.pad(data, [(0, 0)] * 4 + [(pad, pad)], mode="wrap") if pad else data
         n_axes, n_feeds, n_freqs = data.shape[:3]
-        self.n_feeds = n_feeds
+        self.n_weights = n_feeds
         along_za, along_az = (bspline_coefficients(len(axis)) for axis in (self._zenith_angle, self._azimuth))
         # Innermost parts of components, then frequencies: what one source needs lies together.
         self._table = np.empty((len(along_za), len(along_az), n_feeds, n_freqs, 2 * n_axes))
@@ -103,12 +120,47 @@ class SplinePattern:
 
     def at(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
         """Return the pattern, (Nfeeds, Nfreqs, Ndirections)."""
-        _, _, n_feeds, n_freqs, n_parts = self._table.shape
-        power = np.empty((n_feeds * n_freqs, len(azimuth)))
-        rows = _cells(zenith_angle, self._zenith_angle)
-        columns = _cells(azimuth, self._azimuth)
-        _spline_power(self._table.reshape(*self._table.shape[:2], -1), n_parts, *rows, *columns, power)
-        return power.reshape(n_feeds, n_freqs, -1)
+        fields = self.fields(azimuth, zenith_angle)
+        power = np.empty((fields.shape[1] * fields.shape[2], len(azimuth)))
+        _sum_squares(fields.reshape(len(azimuth), len(power), -1), power)
+        return power.reshape(*fields.shape[1:3], -1)
+
+    def fields(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return real and imaginary parts of both components of J, (Ndirections, Nfeeds, Nfreqs, 4)."""
+        table = self._table.reshape(*self._table.shape[:2], -1)
+        fields = np.empty((len(azimuth), table.shape[2]))
+        rows, columns = _cells(zenith_angle, self._zenith_angle), _cells(azimuth, self._azimuth)
+        _spline_fields(table, *rows, *columns, fields)
+        return fields.reshape(len(azimuth), *self._table.shape[2:])
+
+
+class CrossPattern:
+    """Products of the fields of several beams, of whose antennas every pair is a baseline.
+
+    For beams k and l, W_kl = sum of J_k conj(J_l) over the components of J, a complex number unless k = l. It is held
+    in a matrix of real numbers per feed: Re W_kl at (k, l) for k <= l, Im W_kl at (l, k) for k < l.
+
+    Parameters
+    ----------
+    patterns
+        Of the beams, with the same feeds and frequencies.
+    """
+
+    def __init__(self, patterns: Sequence[PowerPattern]):
+        self._patterns = patterns
+        self.n_weights = len(patterns) ** 2 * patterns[0].n_weights
+
+    def at(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return the matrix, flattened: (Nbeams * Nbeams * Nfeeds, Nfreqs, Ndirections)."""
+        fields = [pattern.fields(azimuth, zenith_angle).view(np.complex128) for pattern in self._patterns]
+        count, (n_directions, n_feeds, n_freqs) = len(fields), fields[0].shape[:3]
+        weights = np.empty((count, count, n_feeds, n_freqs, n_directions))
+        for k in range(count):
+            for other in range(k, count):
+                product = (fields[k] * fields[other].conj()).sum(axis=3).transpose(1, 2, 0)
+                weights[other, k] = product.imag
+                weights[k, other] = product.real
+        return weights.reshape(-1, n_freqs, n_directions)
 
 
 def bspline_coefficients(count: int) -> np.ndarray:
@@ -147,24 +199,29 @@ def _add_row(total: np.ndarray, taps: np.ndarray, weights: np.ndarray, factor: f
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _spline_power(
+def _spline_fields(
     table: np.ndarray,
-    n_parts: int,
     rows: np.ndarray,
     row_weights: np.ndarray,
     columns: np.ndarray,
     column_weights: np.ndarray,
-    power: np.ndarray,
+    fields: np.ndarray,
 ) -> None:
-    """Fill `power` (Npatterns, Ndirections) from a table (Nza + 2, Naz + 2, Npatterns * Nparts)."""
-    field = np.empty(table.shape[2])
-    for source in range(power.shape[1]):
+    """Fill `fields` (Ndirections, Nvalues) from a table (Nza + 2, Naz + 2, Nvalues)."""
+    for source in range(len(fields)):
+        field = fields[source]
         field[:] = 0.0
         for tap in range(4):
             taps = table[rows[source] + tap, columns[source] : columns[source] + 4]
             _add_row(field, taps, column_weights[source], row_weights[source, tap])
-        for pattern in range(power.shape[0]):
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _sum_squares(fields: np.ndarray, power: np.ndarray) -> None:
+    """Fill `power` (Npatterns, Ndirections) from fields (Ndirections, Npatterns, Nparts)."""
+    for source in range(fields.shape[0]):
+        for pattern in range(fields.shape[1]):
             square = 0.0
-            for part in range(pattern * n_parts, (pattern + 1) * n_parts):
-                square += field[part] * field[part]
+            for part in range(fields.shape[2]):
+                square += fields[source, pattern, part] * fields[source, pattern, part]
             power[pattern, source] = square

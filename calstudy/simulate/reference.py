@@ -16,6 +16,7 @@ from pyuvsim import BeamList
 from pyuvsim.simsetup import SkyModelData
 from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
 
+from calstudy.instrument.antenna_beams import split_beams
 from calstudy.instrument.telescope import use_bundled_earth_orientation
 from calstudy.running import ranks
 from calstudy.visibilities import require_rectangular
@@ -28,9 +29,13 @@ class PyuvsimEngine:
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
         """Return why this engine cannot do what is asked, or None if it can."""
-        available = _products(beam.at(template.freq_array[:1]))
-        missing = [int(number) for number in template.polarization_array if number not in available]
-        return f"the beam's feeds do not give polarization number {missing[0]}" if missing else None
+        beams, _ = split_beams(beam, template)
+        for item in beams:
+            available = _products(item.at(template.freq_array[:1]))
+            missing = [int(number) for number in template.polarization_array if number not in available]
+            if missing:
+                return f"the beam's feeds do not give polarization number {missing[0]}"
+        return None
 
     def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`.
@@ -41,33 +46,39 @@ class PyuvsimEngine:
             If the beam's feeds do not give a polarization of the template.
         """
         require_rectangular(template)
-        tabulated = beam.at(template.freq_array)
-        products = _products(tabulated)
+        beams, index = split_beams(beam, template)
+        tabulated = [item.at(template.freq_array) for item in beams]
+        products = _products(tabulated[0])
         columns = [products.index(number) for number in template.polarization_array]
         cube = np.empty((template.Nblts, template.Nfreqs, len(products)), dtype=np.complex128)
-        for indices, values in ranks.share(_visibilities, sky, tabulated, template):
+        for indices, values in ranks.share(_visibilities, sky, tabulated, index, template):
             cube[tuple(indices.T)] = values
         return cube.reshape(template.Ntimes, template.Nbls, template.Nfreqs, -1)[..., columns]
 
 
-def _visibilities(rank: int, count: int, sky: SkyModel, tabulated, template: UVData) -> tuple[np.ndarray, np.ndarray]:
+def _visibilities(
+    rank: int, count: int, sky: SkyModel, beams: list, index: np.ndarray, template: UVData
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a rank's share: indices of sample and channel, (N, 2), and visibilities, (N, Nproducts) complex128.
+
+    Antenna i of the telescope has the beam ``beams[index[i]]``.
 
     `pyuvsim.run_uvdata_uvsim` prints, and installs an excepthook; this is its loop, and gives the same bits.
     """
     use_bundled_earth_orientation()
-    beams = BeamList([BeamInterface(tabulated, beam_type="efield")])
+    listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])
+    by_antenna = dict(zip(template.telescope.antenna_names, index.tolist(), strict=True))
     tasks = _share(range(template.Nblts * template.Nfreqs), rank, count)
     indices, values = [], []
     engine = UVEngine()
     with warnings.catch_warnings():
         # A 21 cm sky is a brightness difference.
         warnings.filterwarnings("ignore", "Some Stokes I values are negative", UserWarning)
-        for task in uvdata_to_task_iter(tasks, template, _catalog(sky, template.freq_array), beams, None):
+        for task in uvdata_to_task_iter(tasks, template, _catalog(sky, template.freq_array), listed, by_antenna):
             engine.set_task(task)
             indices.append(task.uvdata_index[:2])
             values.append(engine.make_visibility())
-    shape = (len(tasks), len(_products(tabulated)))
+    shape = (len(tasks), len(_products(beams[0])))
     return np.array(indices, dtype=int).reshape(-1, 2), np.array(values, dtype=np.complex128).reshape(shape)
 
 

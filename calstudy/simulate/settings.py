@@ -15,7 +15,10 @@ class Nodes(Section):
 
     enabled: bool = Field(True, description="false: every integration and channel is simulated.")
     tolerance: float = Field(
-        1e-9, gt=0, lt=1e-2, description="Largest interpolation error, relative to the rms of the visibilities."
+        1e-9,
+        gt=0,
+        lt=1e-2,
+        description="Largest interpolation error of any source's fringe, relative to its amplitude.",
     )
     beam_extent: Length = Field(
         20.0,

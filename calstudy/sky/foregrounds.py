@@ -14,10 +14,12 @@ from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 
 from calstudy.errors import InputError
+from calstudy.plugins import load_function
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
 from calstudy.sky.catalogue import Catalogue, brightest, concatenate, read_gleam_table, to_sky_model
 from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL_INDEX, draw_population
+from calstudy.sky.csv_catalogue import read_csv_catalogue
 
 LOG = logging.getLogger(__name__)
 
@@ -67,6 +69,8 @@ def make_foregrounds(settings: section.Foregrounds, frequencies: np.ndarray) -> 
         return _gleam(settings)
     if isinstance(settings, section.FileSources):
         return _from_file(settings, np.asarray(frequencies, dtype=float))
+    if isinstance(settings, section.CodeSources):
+        return _from_code(settings, np.asarray(frequencies, dtype=float))
     return _synthetic(settings)
 
 
@@ -169,6 +173,20 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
     return Foregrounds(sky.select(component_inds=chosen, inplace=False), stand_in)
 
 
+def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregrounds:
+    sky = load_function(settings)(frequencies.copy(), **settings.options)
+    where = f"{settings.function} of {settings.path.name}"
+    if not isinstance(sky, SkyModel) or sky.component_type != "point":
+        raise InputError(f"sky.foregrounds: {where} must return a pyradiosky SkyModel of points")
+    if sky.spectral_type == "full" and not _has_frequencies(sky, frequencies):
+        raise InputError(f"sky.foregrounds: {where} tabulates fluxes at frequencies other than the channels")
+    sky.check()
+    flux = _at_frequency(sky, float(np.mean(frequencies))).stokes[0, 0].to_value("Jy")
+    order = np.argsort(-flux, kind="stable")
+    stand_in = f"foregrounds: {sky.Ncomponents} sources by {where}"
+    return Foregrounds(sky.select(component_inds=order, inplace=False), stand_in)
+
+
 def _at_frequency(sky: SkyModel, frequency: float) -> SkyModel:
     """Return the catalogue at one frequency in Hz, or at the tabulated one next to it if it has no others."""
     if sky.spectral_type == "flat":
@@ -224,6 +242,8 @@ def _read(settings: section.FileSources) -> SkyModel:
                 return SkyModel.from_fhd_catalog(str(path), expand_extended=False)
         if settings.votable is not None:
             return _read_votable(path, settings.votable)
+        if settings.csv is not None:
+            return read_csv_catalogue(path, settings.csv)
         return SkyModel.from_file(str(path))
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"sky.foregrounds.path: {path} cannot be read as a catalogue ({error})") from error

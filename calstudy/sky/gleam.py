@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from pathlib import Path
 
-import pooch
-
+from calstudy.downloads import default_directory, download, sha256
 from calstudy.errors import InputError
 from calstudy.sky.catalogue import read_gleam_table
 
@@ -20,11 +18,6 @@ URL = (
 )
 FILE = "gleam_egc.vot"
 SOURCES = 307_455
-
-
-def default_directory() -> Path:
-    """Return where catalogues are kept on this machine."""
-    return Path(pooch.os_cache("calstudy"))
 
 
 def default_path() -> Path:
@@ -56,13 +49,8 @@ def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
     if path.is_file() and hash_file(path).is_file():
         verify(path)
         return path
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        # `known_hash=None` makes pooch accept an existing file as it is: one that was never proved goes first.
-        path.unlink(missing_ok=True)
-        pooch.retrieve(URL, known_hash=None, fname=FILE, path=directory, progressbar=progress)
-    except (OSError, ValueError) as error:
-        raise InputError(f"GLEAM cannot be downloaded from VizieR to {directory} ({error})") from error
+    instead = "give a copy of yours under sky.foregrounds.path, or use 'g4jy-and-counts', which needs no download"
+    download(URL, path, instead, progress=progress)
     try:
         found = len(read_gleam_table(path))
     except InputError:
@@ -71,13 +59,13 @@ def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
     if found != SOURCES:
         path.unlink()
         raise InputError(f"the download from VizieR holds {found} sources, GLEAM has {SOURCES}: try again")
-    hash_file(path).write_text(f"{_sha256(path)}  {FILE}\n")
+    hash_file(path).write_text(f"{sha256(path)}  {FILE}\n")
     return path
 
 
 def verify(path: Path) -> None:
     """Raise InputError if a fetched catalogue has changed since; a user's own file, without a hash, is not checked."""
-    if hash_file(path).is_file() and hash_file(path).read_text().split()[:1] != [_sha256(path)]:
+    if hash_file(path).is_file() and hash_file(path).read_text().split()[:1] != [sha256(path)]:
         raise InputError(
             f"{path} has changed since it was downloaded: remove it and {hash_file(path).name}, "
             "and run `calstudy data fetch gleam`"
@@ -87,8 +75,3 @@ def verify(path: Path) -> None:
 def hash_file(path: Path) -> Path:
     """Return the file beside a fetched catalogue that holds its SHA-256."""
     return path.with_name(path.name + ".sha256")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

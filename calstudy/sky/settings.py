@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from calstudy.plugins import Plugin
 from calstudy.schema import Section, choice, fault
 from calstudy.units import FluxDensity, Frequency, PowerDensity
 
@@ -54,18 +55,46 @@ class VotableColumns(Section):
     spectral_index: str | None = None
 
 
+class CsvColumns(Section):
+    """Where a CSV file with a line of column names keeps what."""
+
+    right_ascension: str = Field(description="Column of right ascensions, ICRS, degrees.")
+    declination: str = Field(description="Column of declinations, ICRS, degrees.")
+    flux: str = Field(description="Column of flux densities, Jy.")
+    frequency: Frequency = Field(gt=0, description="At which the fluxes are.")
+    spectral_index: str | None = Field(None, description="Column of spectral indices; flat spectra without.")
+
+
 class FileSources(PointSources):
-    """Any catalogue that pyradiosky reads: SkyH5, VOTable (with `votable`), FHD .sav, pyradiosky text."""
+    """Any catalogue that pyradiosky reads: SkyH5, VOTable (with `votable`), FHD .sav, text; or a CSV (with `csv`)."""
 
     kind: Literal["file"]
     path: Path = Field(strict=False)
     votable: VotableColumns | None = Field(None, description="Needed for a VOTable (.vot, .votable, .xml), ICRS.")
+
+    # Left out where it is not used, so that catalogues of other kinds are identified as before.
+    csv: CsvColumns | None = Field(None, exclude_if=lambda value: value is None, description="Needed for a CSV (.csv).")
+
+    @model_validator(mode="after")
+    def _csv_has_columns(self) -> FileSources:
+        if (self.path.suffix.lower() == ".csv") != (self.csv is not None):
+            raise fault("csv", "goes with CSV files (.csv), and they need it")
+        return self
 
     @model_validator(mode="after")
     def _votables_have_columns(self) -> FileSources:
         if (self.path.suffix.lower() in VOTABLE_SUFFIXES) != (self.votable is not None):
             raise fault("votable", f"goes with VOTables ({', '.join(VOTABLE_SUFFIXES)}), and they need it")
         return self
+
+
+class CodeSources(Plugin):
+    """Sources from a function of your own, called with the channels' frequencies in Hz, (Nfreqs,), and the options.
+
+    It returns a pyradiosky SkyModel of points.
+    """
+
+    kind: Literal["code"]
 
 
 class NoSources(Section):
@@ -75,7 +104,7 @@ class NoSources(Section):
 
 
 Foregrounds = Annotated[
-    GleamSources | SyntheticSources | FileSources | NoSources,
+    GleamSources | SyntheticSources | FileSources | CodeSources | NoSources,
     Field(discriminator="kind"),
     choice("kind", "g4jy-and-counts"),
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from simulation_cases import healpix_sky, observe, random_sky, relative_error
@@ -9,6 +11,7 @@ from simulation_cases import healpix_sky, observe, random_sky, relative_error
 from calstudy.instrument.telescope import subset_template
 from calstudy.simulate.chunks import assemble, check_interpolation, plan_chunks, simulate_chunk, simulate_visibilities
 from calstudy.simulate.dense import DenseEngine
+from calstudy.simulate.directions import split_by_horizon
 from calstudy.simulate.nodes import integration_times, node_grid
 from calstudy.simulate.reference import PyuvsimEngine
 from calstudy.simulate.settings import Nodes, SimulationSettings
@@ -79,11 +82,27 @@ def test_a_sky_given_channel_by_channel_needs_only_the_chunks_channels(dipole_be
     assert len(chunks[0].grid.times_jd) < template.Ntimes
     cube = assemble(chunks, cubes)
     assert relative_error(cube, direct) < 1e-9
-    check = check_interpolation(
-        DenseEngine(), part, dipole_beam, template, cube, chunks[0].grid, channels=chunks[-1].channels
-    )
+    simulate = partial(DenseEngine().simulate, part, dipole_beam)
+    check = check_interpolation(simulate, template, cube, chunks[0].grid, channels=chunks[-1].channels)
     assert set(check.frequencies) <= set(chunks[-1].frequencies)
     assert check.max_error < 1e-9
+
+
+def test_what_more_nodes_do_not_lower_are_the_knots_of_a_tabulated_beam(embedded_beam, tile_beam):
+    template = observe(count=12, channels=1, times=28, integration="4 s", polarizations=("xx",))
+    sky = healpix_sky(template.freq_array, nside=16)
+    always_up, _ = split_by_horizon(sky, template.telescope.location, integration_times(template))
+    sky.select(component_inds=always_up, run_check=False)
+    errors = {}
+    for name, beam in (("table", embedded_beam), ("formula", tile_beam)):
+        direct = DenseEngine().simulate(sky, beam, template)
+        for tolerance in (1e-9, 1e-13):
+            grid = node_grid(template, Nodes(tolerance=tolerance), smooth_in_frequency=False)
+            nodes = DenseEngine().simulate(sky, beam, subset_template(template, grid.times_jd, grid.frequencies))
+            errors[name, tolerance] = relative_error(grid.interpolate(nodes), direct)
+    assert errors["formula", 1e-9] < 1e-10
+    assert errors["table", 1e-13] > 0.2 * errors["table", 1e-9] > 2 * errors["formula", 1e-9]
+    assert errors["table", 1e-9] < 1e-8
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
@@ -91,7 +110,7 @@ def test_the_check_finds_the_error_that_is_there(tolerance, template, sky, dipol
     loose = settings(tolerance)
     cube = simulate_visibilities(DenseEngine(), sky, dipole_beam, template, loose, True)
     grid = plan_chunks(template, loose, True)[0].grid
-    check = check_interpolation(DenseEngine(), sky, dipole_beam, template, cube, grid)
+    check = check_interpolation(partial(DenseEngine().simulate, sky, dipole_beam), template, cube, grid)
     worst = relative_error(cube, direct)
     assert 0.1 * worst < check.max_error <= 1.5 * worst
     assert check.rms_error <= check.max_error

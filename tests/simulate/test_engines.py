@@ -95,6 +95,20 @@ def test_a_source_at_zenith_gives_half_its_flux_with_the_phase_of_the_heights(ga
     np.testing.assert_allclose(cube, expected, rtol=1e-7)
 
 
+@pytest.mark.parametrize("engine", [DenseEngine(), PyuvsimEngine()], ids=lambda engine: engine.name)
+def test_a_source_anywhere_gives_the_power_of_a_short_dipole_and_the_phase_of_its_direction(engine, dipole_beam):
+    template = observe(times=1)
+    altitude, azimuth = np.deg2rad(35.0), np.deg2rad(110.0)
+    sky = point_sky(local_coordinates(template, np.array([altitude]), np.array([azimuth])), [3.0])
+    # Azimuth of coordinates from north through east.
+    direction = np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
+    turns = (baseline_vectors(template) @ direction)[:, None] * template.freq_array / speed_of_light
+    # A dipole does not see what comes along its axis: east for xx, north for yy.
+    power = 1 - direction[:2] ** 2
+    expected = 1.5 * np.exp(2j * np.pi * turns)[None, :, :, None] * power
+    np.testing.assert_allclose(engine.simulate(sky, dipole_beam, template), expected, rtol=1e-7)
+
+
 def test_a_uniform_hemisphere_gives_a_sinc():
     """The integral of exp(2 pi i u.s) over a hemisphere has the real part 2 pi sin(x) / x, x = 2 pi |u|."""
     template = observe(count=2, times=1, channels=2, polarizations=("xx",))
@@ -157,14 +171,15 @@ def test_engines_are_chosen_by_name():
         assert make_engine(SimulationSettings(engine=name)).name == name
 
 
-def test_cross_hands_go_to_an_engine_that_has_them(sky, template, tile_beam):
+@pytest.mark.parametrize("name", ["tile_beam", "embedded_beam"])
+def test_cross_hands_go_to_an_engine_that_has_them(name, request, sky):
     crossed = observe(channels=1, times=1, polarizations=("xx",))
     crossed.polarization_array = np.array([-7])
     auto = make_engine(SimulationSettings())
-    assert auto.choose(sky, tile_beam, crossed).name == "matvis"
-    expected = PyuvsimEngine().simulate(sky, tile_beam, crossed)
+    beam, expected = pyuvsim_visibilities(name, request, sky, crossed)
+    assert auto.choose(sky, beam, crossed).name == "matvis"
     for engine in (auto, FftvisEngine()):
-        assert relative_error(engine.simulate(sky, tile_beam, crossed), expected) < 1e-10
+        assert relative_error(engine.simulate(sky, beam, crossed), expected) < 1e-10
 
 
 def test_a_galactic_sky_is_where_it_should_be(template, tile_beam):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import requests
 from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.io.votable import from_table
@@ -14,6 +15,7 @@ from pydantic import ValidationError
 from pyradiosky import SkyModel
 from scipy.integrate import quad
 
+from calstudy import downloads
 from calstudy.errors import InputError
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
@@ -210,6 +212,26 @@ def test_any_votable_is_read_by_the_columns_named(tmp_path):
     assert sky.skycoord.icrs.ra.deg == pytest.approx([10.0, 20.0])
 
 
+CSV = {"right_ascension": "ra", "declination": "dec", "flux": "s", "frequency": "150 MHz"}
+
+
+def test_a_csv_is_read_by_the_columns_named(tmp_path):
+    path = tmp_path / "mine.csv"
+    path.write_text("dec,s,ra,alpha\n-30.0,1.5,10.0,-1.0\n-20.0,3.0,20.0,0.5\n-10.0,,30.0,0.0\n")
+    flat = make_foregrounds(section.FileSources(kind="file", path=path, csv=CSV), FREQUENCIES)
+    assert flux(flat.sky) == pytest.approx([1.5, 3.0])
+    assert flat.sky.skycoord.icrs.dec.deg == pytest.approx([-30.0, -20.0])
+    assert flat.stand_in == "foregrounds: 2 sources of mine.csv"
+    steep = {"kind": "file", "path": path, "csv": {**CSV, "spectral_index": "alpha"}, "spectrum": "catalogue"}
+    sky = make_foregrounds(section.FileSources.model_validate(steep), FREQUENCIES).sky
+    at_300 = sky.at_frequencies(np.array([300e6]) * units.Hz, inplace=False)
+    assert flux(at_300) == pytest.approx([0.75, 3 * np.sqrt(2)])
+    with pytest.raises(InputError, match="no column flux, only dec, s, ra, alpha"):
+        make_foregrounds(section.FileSources(kind="file", path=path, csv={**CSV, "flux": "flux"}), FREQUENCIES)
+    with pytest.raises(ValidationError, match="goes with CSV files"):
+        section.FileSources(kind="file", path=path)
+
+
 def test_a_votable_needs_its_columns_named(tmp_path):
     with pytest.raises(ValidationError, match="goes with VOTables"):
         section.FileSources(kind="file", path=tmp_path / "mine.vot")
@@ -220,7 +242,7 @@ def test_fetched_gleam_is_proved_and_then_held_to_its_hash(tmp_path, monkeypatch
         assert "VIII/100" in url
         return str(write_gleam(Path(path) / fname))
 
-    monkeypatch.setattr(gleam.pooch, "retrieve", download)
+    monkeypatch.setattr(downloads.pooch, "retrieve", download)
     with pytest.raises(InputError, match="6 sources, GLEAM has 307455"):
         gleam.fetch_gleam(tmp_path, progress=False)
     assert not (tmp_path / gleam.FILE).exists()
@@ -236,8 +258,8 @@ def test_fetched_gleam_is_proved_and_then_held_to_its_hash(tmp_path, monkeypatch
 
 def test_failed_download_is_one_sentence(tmp_path, monkeypatch):
     def download(*args, **kwargs):
-        raise OSError("no route to host")
+        raise requests.ConnectionError("no route to host")
 
-    monkeypatch.setattr(gleam.pooch, "retrieve", download)
-    with pytest.raises(InputError, match="cannot be downloaded"):
+    monkeypatch.setattr(downloads.pooch, "retrieve", download)
+    with pytest.raises(InputError, match=r"no connection to vizier.*sky\.foregrounds\.path"):
         gleam.fetch_gleam(tmp_path)

@@ -1,0 +1,71 @@
+"""Arrays whose antennas do not all have the same beam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from calstudy.instrument.beams import Beam, make_beam
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+    from calstudy.instrument.settings import InstrumentSettings
+
+Source = TypeVar("Source")
+
+
+@dataclass(frozen=True)
+class AntennaBeams:
+    """The beams of an array, and which antenna has which.
+
+    Attributes
+    ----------
+    beams
+        Distinct ones, the array's own first.
+    index
+        Which of `beams` each antenna of the layout has, in its order, (Nants,) int.
+    """
+
+    beams: tuple[Beam, ...]
+    index: np.ndarray
+
+    @property
+    def stand_in(self) -> str | None:
+        """What stands in for the beam of the paper: the array's own beam's sentence, and that there are others."""
+        others = f"antennas with another: {int((self.index > 0).sum())}"
+        return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
+
+
+def make_beams(settings: InstrumentSettings, n_antennas: int) -> Beam | AntennaBeams:
+    """Return the beam of all antennas, or the beams of an array that has several.
+
+    Parameters
+    ----------
+    settings
+        The `instrument` section. Sets of antennas with the array's own beam, or with one another's, share it.
+    n_antennas
+        Antennas of the layout.
+
+    Raises
+    ------
+    InputError
+        If a beam file is missing, cannot be read, or does not cover the channels.
+    """
+    distinct = [settings.beam]
+    index = np.zeros(n_antennas, dtype=int)
+    for group in settings.antenna_beams.values():
+        if group.beam not in distinct:
+            distinct.append(group.beam)
+        index[list(group.antennas)] = distinct.index(group.beam)
+    beams = tuple(make_beam(beam, settings.channels) for beam in distinct)
+    return AntennaBeams(beams, index) if len(beams) > 1 else beams[0]
+
+
+def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source, ...], np.ndarray]:
+    """Return the distinct beams of an array, and which of them each antenna of the telescope has, (Nants,) int."""
+    if isinstance(beam, AntennaBeams):
+        return beam.beams, beam.index
+    return (beam,), np.zeros(template.telescope.Nants, dtype=int)

@@ -1,0 +1,31 @@
+"""The power spectrum that an EoR sky is drawn from, in the units of the estimates."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calstudy.power.cosmology import make_cosmology
+
+if TYPE_CHECKING:
+    from calstudy.sky.settings import Eor
+
+MILLIKELVIN2 = 1e6
+
+
+def input_power(settings: Eor, k: np.ndarray, cosmology: str) -> np.ndarray:
+    """Return P(k), mK^2 h^-3 Mpc^3, at wavenumbers `k` (h/Mpc, any shape).
+
+    Parameters
+    ----------
+    settings
+        Of the EoR sky: amplitude and shape are in units without h.
+    k
+        Wavenumbers.
+    cosmology
+        Name, as in the `power` section.
+    """
+    h = float(make_cosmology(cosmology).h)
+    index = settings.index if settings.spectrum == "power-law" else 0.0
+    return MILLIKELVIN2 * h**3 * settings.amplitude * (np.asarray(k) * h / settings.pivot_k) ** index

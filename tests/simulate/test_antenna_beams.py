@@ -1,0 +1,165 @@
+"""Different beams on different antennas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulation_cases import observe, random_sky, relative_error
+
+from calstudy.errors import ExperimentError
+from calstudy.experiment.files import validate
+from calstudy.graph.tasks import Graph
+from calstudy.instrument.antenna_beams import AntennaBeams, make_beams
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.telescope import make_template
+from calstudy.simulate.dense import DenseEngine
+from calstudy.simulate.engine import make_engine
+from calstudy.simulate.matvis_engine import MatvisEngine
+from calstudy.simulate.nufft import FftvisEngine
+from calstudy.simulate.reference import PyuvsimEngine
+from calstudy.simulate.settings import SimulationSettings
+from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.stages.files import read_visibilities
+from calstudy.stages.registry import Job
+from calstudy.stages.simulation import assemble_product, simulate_chunk_product
+from calstudy.standins import footnotes
+from calstudy.visibilities import antenna_indices, to_cube
+
+SMALL = {
+    "name": "several",
+    "instrument": {
+        "layout": {"kind": "hex", "side": 2},
+        "beam": "gaussian",
+        "channels": {"width": "400 kHz", "count": 32},
+        "times": {"count": 2},
+    },
+    "sky": {"foregrounds": {"kind": "g4jy-and-counts", "count": 50}, "eor": {"nside": 16}},
+    "simulation": {"chunks": 1},
+}
+WIDE = {"kind": "gaussian", "fwhm_deg": 30.0}
+
+
+@pytest.fixture(scope="module")
+def template():
+    return observe(count=6, channels=2, times=1)
+
+
+@pytest.fixture(scope="module")
+def sky(template):
+    return random_sky(template, count=60)
+
+
+@pytest.fixture(scope="module")
+def beams(embedded_beam, gaussian_beam, dipole_beam):
+    return AntennaBeams((embedded_beam, gaussian_beam, dipole_beam), np.array([0, 2, 0, 1, 2, 0]))
+
+
+@pytest.fixture(scope="module")
+def expected(sky, beams, template):
+    return PyuvsimEngine().simulate(sky, beams, template)
+
+
+@pytest.mark.parametrize("engine", [DenseEngine(), MatvisEngine(), FftvisEngine()], ids=lambda engine: engine.name)
+def test_engines_agree_with_pyuvsim(engine, sky, beams, template, expected):
+    assert engine.refusal(sky, beams, template) is None
+    assert relative_error(engine.simulate(sky, beams, template), expected) < 1e-10
+
+
+def test_cross_hands_of_different_beams_go_to_an_engine_that_has_them(sky, beams):
+    crossed = observe(count=6, channels=1, times=1)
+    crossed.polarization_array = np.array([-7, -8])
+    expected = PyuvsimEngine().simulate(sky, beams, crossed)
+    assert relative_error(expected[..., 0], expected[..., 1]) > 0.1
+    assert relative_error(MatvisEngine().simulate(sky, beams, crossed), expected) < 1e-10
+    assert "mixes up" in FftvisEngine().refusal(sky, beams, crossed)
+    assert make_engine(SimulationSettings()).choose(sky, beams, crossed).name == "matvis"
+
+
+def test_only_the_baselines_of_other_antennas_change(sky, beams, template, expected, embedded_beam):
+    alike = DenseEngine().simulate(sky, embedded_beam, template)
+    first, second = beams.index[antenna_indices(template)].T
+    own = (first == 0) & (second == 0)
+    np.testing.assert_allclose(expected[:, own], alike[:, own], rtol=1e-10)
+    changes = np.abs(expected - alike).max(axis=(0, 2, 3))
+    assert (changes[~own] > 1e-3 * np.sqrt(np.mean(np.abs(alike) ** 2))).all()
+
+
+@pytest.mark.parametrize(
+    "engine", [DenseEngine(), MatvisEngine(), FftvisEngine(), PyuvsimEngine()], ids=lambda engine: engine.name
+)
+def test_the_same_beam_given_to_each_antenna_changes_nothing(engine, sky, gaussian_beam):
+    template = observe(count=4, channels=1, times=1)
+    twice = AntennaBeams((gaussian_beam, gaussian_beam), np.array([0, 1, 1, 0]))
+    whole = engine.simulate(sky, gaussian_beam, template)
+    assert relative_error(engine.simulate(sky, twice, template), whole) < 1e-11
+
+
+def test_beams_that_are_the_same_are_one():
+    alike = {"some": {"antennas": [0, 3], "beam": "gaussian"}}
+    instrument = InstrumentSettings.model_validate({**SMALL["instrument"], "antenna_beams": alike})
+    assert not isinstance(make_beams(instrument, 7), AntennaBeams)
+    groups = {"a": {"antennas": [4], "beam": WIDE}, "b": {"antennas": [1], "beam": WIDE}, **alike}
+    instrument = InstrumentSettings.model_validate({**SMALL["instrument"], "antenna_beams": groups})
+    made = make_beams(instrument, 7)
+    assert made.index.tolist() == [0, 1, 0, 0, 1, 0, 0]
+    assert "antennas with another: 2" in made.stand_in
+
+
+def test_auto_takes_the_fastest(sky, beams, template):
+    assert make_engine(SimulationSettings()).choose(sky, beams, template).name == "dense"
+
+
+def test_an_experiment_simulates_them(tmp_path: Path):
+    groups = {"damaged": {"antennas": [2, 5], "beam": WIDE}}
+    experiment = validate({**SMALL, "instrument": {**SMALL["instrument"], "antenna_beams": groups}}, tmp_path)
+    task = Graph(experiment).foregrounds
+    (piece,) = task.inputs.values()
+    chunk, whole = tmp_path / "chunk", tmp_path / "whole"
+    chunk.mkdir()
+    whole.mkdir()
+    simulate_chunk_product(Job(settings=piece.settings, inputs={}, output=chunk))
+    assemble_product(Job(settings=task.settings, inputs={"chunk000": chunk}, output=whole))
+    template = make_template(experiment.instrument)
+    made = make_beams(experiment.instrument, 7)
+    assert made.index.tolist() == [0, 0, 1, 0, 0, 1, 0]
+    foregrounds = make_foregrounds(experiment.sky.foregrounds, template.freq_array).sky
+    direct = MatvisEngine().simulate(foregrounds, made, template)
+    assert relative_error(to_cube(read_visibilities(whole / "visibilities.uvh5")), direct) < 1e-8
+
+
+def test_an_array_of_like_antennas_is_identified_as_before(tmp_path: Path):
+    plain, with_field = (
+        validate({**SMALL, "instrument": {**SMALL["instrument"], **extra}}, tmp_path)
+        for extra in ({}, {"antenna_beams": {}})
+    )
+    assert "antenna_beams" not in plain.model_dump(mode="json")["instrument"]
+    assert Graph(plain).foregrounds.key == Graph(with_field).foregrounds.key
+    groups = {"antenna_beams": {"odd": {"antennas": [1], "beam": WIDE}}}
+    other = validate({**SMALL, "instrument": {**SMALL["instrument"], **groups}}, tmp_path)
+    assert Graph(other).foregrounds.key != Graph(plain).foregrounds.key
+    assert "antennas with another: 1" in " ".join(footnotes(other))
+    # What does not look through the beams stays the same.
+    assert Graph(other).gains.key == Graph(plain).gains.key
+
+
+@pytest.mark.parametrize(
+    ("groups", "told"),
+    [
+        ({"a": {"antennas": [7], "beam": "airy"}}, "names antenna 7, but the layout has 7 antennas"),
+        ({"a": {"antennas": [1, 1], "beam": "airy"}}, r"antenna_beams\.a\.antennas.*named already"),
+        (
+            {"a": {"antennas": [1], "beam": "airy"}, "b": {"antennas": [1], "beam": "airy"}},
+            r"antenna_beams\.b\.antennas.*named already",
+        ),
+        ({"a": {"antennas": [], "beam": "airy"}}, r"antenna_beams\.a\.antennas"),
+        (
+            {"a": {"antennas": [1], "beam": {"kind": "beamfits", "path": "none.fits"}}},
+            r"antenna_beams\.a\.beam\.path = 'none\.fits': no such file",
+        ),
+    ],
+)
+def test_mistakes_are_told(groups, told, tmp_path: Path):
+    with pytest.raises(ExperimentError, match=told):
+        validate({**SMALL, "instrument": {**SMALL["instrument"], "antenna_beams": groups}}, tmp_path)
