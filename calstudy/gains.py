@@ -14,7 +14,25 @@ from calstudy.errors import InputError
 from calstudy.visibilities import antenna_pairs
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pyuvdata import UVCal, UVData
+
+
+def read_gains(path: Path, where: str) -> UVCal:
+    """Read a CalH5 or calfits file.
+
+    Raises
+    ------
+    InputError
+        If it is neither; `where` says who asked for it.
+    """
+    from pyuvdata import UVCal
+
+    try:
+        return UVCal.from_file(path)
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise InputError(f"{where} = {str(path)!r}: not a readable CalH5 or calfits file ({error})") from None
 
 
 def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = None) -> UVCal:

@@ -126,7 +126,8 @@ def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
     """
     spacings = np.abs(np.diff(frequencies))
     refusal = ValueError("frequencies: the DPSS foreground basis needs at least two channels on an even grid")
-    if spacings.size == 0 or spacings.min() == 0:
+    # Written so that frequencies that are not numbers are refused as well.
+    if spacings.size == 0 or not spacings.min() > 0:
         raise refusal
     span = np.abs(frequencies - frequencies[0])
     # The narrowest spacing has the rounding of stored frequencies; the whole band gives a better one.

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from pyuvdata import UVCal, UVData
 
+from calstudy.calibrate.measured import Measured, make_problem, measure
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
-from calstudy.calibrate.products import make_gains, make_visibilities, require_parallel_hands
+from calstudy.calibrate.products import make_gains, make_visibilities
 from calstudy.calibrate.records import CalibrationResult, SolveRecord
 from calstudy.calibrate.settings import CalibrationSettings, GaussNewtonSettings, LbfgsSettings
 from calstudy.calibrate.solution import Solution
@@ -17,12 +18,9 @@ from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solver, WarmStart, solve_warm
 from calstudy.calibrate.solvers.lbfgs import Lbfgs
-from calstudy.calibrate.starts import read_gains, starting_gains
-from calstudy.calibrate.structure import make_structure, repeat_structure
-from calstudy.calibrate.weights import make_weights
+from calstudy.calibrate.structure import repeat_structure
 from calstudy.errors import InputError
 from calstudy.resources import Usage
-from calstudy.visibilities import antenna_pairs, flag_cube, to_cube
 
 Progress = Callable[[int, int], None]
 
@@ -36,25 +34,6 @@ def make_solver(settings: CalibrationSettings) -> Solver:
         return Lbfgs(solver.tolerance, solver.max_steps, solver.memory)
     optimizer = Optimizer(solver.name, solver.learning_rate, solver.schedule, solver.final_rate, solver.max_steps)
     return FirstOrder(optimizer, solver.tolerance, solver.precision)
-
-
-class Measured(NamedTuple):
-    """The arrays of a calibration.
-
-    Attributes
-    ----------
-    visibilities, weights
-        Shape (Ntimes, Nbls, Nfreqs, Npols).
-    start
-        Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
-    sky
-        The sky model like the visibilities, or None.
-    """
-
-    visibilities: np.ndarray
-    weights: np.ndarray
-    start: np.ndarray
-    sky: np.ndarray | None
 
 
 class Solve(NamedTuple):
@@ -100,26 +79,15 @@ def calibrate(
         If the data are not rectangular, not finite where unflagged, of cross-hand polarizations, without any baseline
         to fit, or differ from the sky model in shape; or if the basis does not fit into the channels.
     """
-    fitted = _fitted_baselines(data, settings.autos)
-    weights = make_weights(data, fitted, settings.weights)
-    data = _keep(data, fitted)
-    sky = None
-    if sky_model is not None:
-        sky = _matching_cube(fitted_part(sky_model, settings.autos), data)
-    elif settings.calibrator == "sky-based":
-        raise InputError("calibration.calibrator: 'sky-based' needs a sky model, and there is none")
-    _require_finite(data)
-    structure, numbers = make_structure(data, settings)
-    if gains is None and settings.initial_gains.kind == "file":
-        gains = read_gains(settings.initial_gains.path)
-    measured = Measured(to_cube(data), weights, starting_gains(data, numbers, gains), sky)
-    return _collect(data, numbers, structure, measured, _solve_all(structure, settings, measured, progress))
+    if settings.code is not None:
+        raise InputError("calibration.calibrator: 'code' stands for another calibrator; it is run in studies only")
+    measured = measure(data, settings, sky_model, gains)
+    return _collect(measured, _solve_all(settings, measured, progress))
 
 
-def _collect(
-    data: UVData, numbers: np.ndarray, structure: FitStructure, measured: Measured, solves: Iterator[Solve]
-) -> CalibrationResult:
+def _collect(measured: Measured, solves: Iterator[Solve]) -> CalibrationResult:
     """Put the solutions together."""
+    data, structure = measured.data, measured.structure
     visibilities, used = measured.visibilities, measured.weights > 0
     gains, gain_flags = np.ones(measured.start.shape, complex), np.ones(measured.start.shape, bool)
     model, residual, flags = np.zeros_like(visibilities), np.zeros_like(visibilities), ~used
@@ -139,16 +107,14 @@ def _collect(
             calibrated = np.where(present, visibilities[t, :, :, p], 0) / products
             residual[t, :, :, p] = np.where(present, calibrated - fitted[t - first], 0)
     return CalibrationResult(
-        make_gains(data, numbers, gains, gain_flags),
+        make_gains(data, measured.numbers, gains, gain_flags),
         make_visibilities(data, model, flags),
         make_visibilities(data, residual, flags),
         tuple(records),
     )
 
 
-def _solve_all(
-    structure: FitStructure, settings: CalibrationSettings, measured: Measured, progress: Progress | None
-) -> Iterator[Solve]:
+def _solve_all(settings: CalibrationSettings, measured: Measured, progress: Progress | None) -> Iterator[Solve]:
     """Yield every solve, polarization by polarization, each in the order of time."""
     solver = make_solver(settings)
     n_times, _, _, n_polarizations = measured.visibilities.shape
@@ -157,43 +123,26 @@ def _solve_all(
     for p in range(n_polarizations):
         warm: WarmStart | None = None
         for index, (first, last) in enumerate(groups):
-            shared = repeat_structure(structure, last - first)
             with Usage() as usage:
-                problem = _problem(shared, settings, measured, slice(first, last), p)
+                problem = make_problem(measured, settings, slice(first, last), p)
                 if isinstance(problem, str):
-                    solution = _skipped(shared, problem)
+                    solution = _skipped(repeat_structure(measured.structure, last - first), problem)
                 else:
-                    solution, warm = solve_warm(problem, solver, warm if settings.solver.warm_start else None)
+                    solution, warm = _solve(problem, solver, warm if settings.solver.warm_start else None)
             yield Solve(first, last, p, solution, usage.peak_memory)
             if progress is not None:
                 progress(p * len(groups) + index + 1, len(groups) * n_polarizations)
 
 
-def _problem(
-    structure: FitStructure, settings: CalibrationSettings, measured: Measured, times: slice, p: int
-) -> CalibrationProblem | str:
-    """Return the problem of some integrations, or the reason why there is none."""
-
-    def rows(cube: np.ndarray) -> np.ndarray:
-        return cube[times, :, :, p].reshape(structure.n_baselines, structure.n_frequencies)
-
-    weights, visibilities = rows(measured.weights), rows(measured.visibilities)
-    flagged = float(np.mean(weights == 0))
-    if flagged == 1:
-        return "every sample is flagged or has no weight"
-    if flagged >= settings.skip_flagged:
-        return f"{100 * flagged:.0f} % of the samples are flagged, which skip_flagged excludes"
-    if not np.any(visibilities, where=weights > 0):
-        return "the data are zero"
-    return CalibrationProblem(
-        structure,
-        visibilities,
-        weights,
-        measured.start[:, :, times.start, p],
-        None if measured.sky is None else rows(measured.sky),
-        settings.prior,
-        settings.calibrator == "sky-based",
-    )
+def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) -> tuple[Solution, WarmStart | None]:
+    """Solve from the warm start, and anew from the problem's own gains if that got stuck; the lower loss counts."""
+    solution, next_warm = solve_warm(problem, solver, warm)
+    if warm is None or solution.status not in ("stalled", "failed"):
+        return solution, next_warm
+    again, again_warm = solve_warm(problem, solver)
+    if not again.usable or (solution.usable and again.loss_history[-1] > solution.loss_history[-1]):
+        return solution, next_warm
+    return again, again_warm
 
 
 def _skipped(structure: FitStructure, message: str) -> Solution:
@@ -214,6 +163,8 @@ def _record(data: UVData, solve: Solve) -> SolveRecord:
         n_steps=solution.n_steps,
         loss_history=solution.loss_history,
         seconds=solution.seconds,
+        remaining=solution.remaining,
+        remaining_rms=solution.remaining_rms,
         peak_memory=solve.peak_memory,
     )
 
@@ -224,53 +175,3 @@ def _has_data(structure: FitStructure, used: np.ndarray) -> np.ndarray:
     for column in structure.antennas.T:
         np.logical_or.at(found, column, used)
     return found
-
-
-def _fitted_baselines(data: UVData, autos: bool) -> np.ndarray:
-    """Return which baselines are calibrated, shape (Nbls,), after checking that there are some."""
-    require_parallel_hands(data)
-    to_cube(data)
-    is_auto = antenna_pairs(data)[:, 0] == antenna_pairs(data)[:, 1]
-    if autos and not is_auto.any():
-        raise ValueError("calibration.autos is true, but the data hold no autocorrelations")
-    if not autos and is_auto.all():
-        raise ValueError("the data hold no cross-correlations, so that there is nothing to calibrate")
-    return np.ones(is_auto.shape, bool) if autos else ~is_auto
-
-
-def fitted_part(data: UVData, autos: bool) -> UVData:
-    """Return the baselines that are calibrated; raises as `calibrate` does if there are none."""
-    return _keep(data, _fitted_baselines(data, autos))
-
-
-def _keep(data: UVData, fitted: np.ndarray) -> UVData:
-    if fitted.all():
-        return data
-    return data.select(blt_inds=np.flatnonzero(np.tile(fitted, data.Ntimes)), inplace=False)
-
-
-def _require_finite(data: UVData) -> None:
-    bad = ~(np.isfinite(to_cube(data)) | flag_cube(data))
-    if bad.any():
-        t, baseline, channel, _ = np.argwhere(bad)[0]
-        a, b = antenna_pairs(data)[baseline]
-        raise ValueError(
-            f"{bad.sum()} unflagged visibilities are not finite, the first on baseline ({a}, {b}), integration {t}, "
-            f"channel {channel}; flag them"
-        )
-
-
-def _matching_cube(sky_model: UVData, data: UVData) -> np.ndarray:
-    """Return the sky model's cube; ValueError unless it has the baselines, times, channels and hands of the data."""
-    sky = to_cube(sky_model)
-    if (
-        sky.shape != to_cube(data).shape
-        or not np.array_equal(antenna_pairs(sky_model), antenna_pairs(data))
-        or not np.allclose(sky_model.freq_array, data.freq_array, rtol=1e-9, atol=0)
-        or not np.allclose(sky_model.time_array, data.time_array, rtol=0, atol=1e-6)
-        or not np.array_equal(sky_model.polarization_array, data.polarization_array)
-    ):
-        raise ValueError(
-            "the sky model must have the baselines, times, channels and polarizations of the data, in the same order"
-        )
-    return sky

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,28 @@ from calstudy.calibrate.records import CalibrationResult
 from calstudy.errors import InputError
 
 GAINS, CALFITS, MODEL, RESIDUAL = "gains.calh5", "gains.calfits", "model.uvh5", "residual.uvh5"
-SOLUTION, FIGURE = "solution.json", "diagnostics"
+SOLUTION, FIGURE, EXPECTED = "solution.json", "diagnostics", "expected-transfer"
 FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
 
 
-def require_free(folder: Path, calfits: bool, overwrite: bool) -> None:
-    """Raise InputError if a file that will be written exists and may not be replaced."""
+def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
+    """Raise InputError if a file that will be written exists and may not be replaced.
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    extras
+        What is written besides the usual: `CALFITS`, `EXPECTED`.
+    overwrite
+        Whether files may be replaced.
+    """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output {folder}: is a file, not a folder")
-    names = (GAINS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES, *((CALFITS,) if calfits else ()))
+    names = [GAINS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES, *([CALFITS] if CALFITS in extras else [])]
     present = [name for name in names if (folder / name).exists()]
+    if EXPECTED in extras:
+        present += [path.name for path in sorted(folder.glob(f"{EXPECTED}.*.h5"))]
     if present and not overwrite:
         raise InputError(f"--output {folder}: holds {', '.join(present)} already; use --overwrite or another folder")
 
@@ -51,7 +64,12 @@ def describe(result: CalibrationResult, context: dict[str, Any]) -> dict[str, An
 
 
 def write_result(
-    result: CalibrationResult, description: dict[str, Any], folder: Path, figure: Any, calfits: bool = False
+    result: CalibrationResult,
+    description: dict[str, Any],
+    folder: Path,
+    figure: Any,
+    extras: Sequence[str] = (),
+    expected: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """Write gains, model, residual, solution.json and the diagnostic figure; all of them or none.
 
@@ -65,24 +83,29 @@ def write_result(
         Made if it does not exist; files of the same names are replaced.
     figure
         A matplotlib figure and its arrays.
-    calfits
-        Also write the gains as calfits.
+    extras
+        `CALFITS` if the gains are to be written as calfits as well.
+    expected
+        Expected transfer functions, by polarization.
 
     Returns
     -------
     The paths.
     """
     from calstudy.figures.save import save_figure
+    from calstudy.power.tables import save_spectrum
 
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as temporary:
         work = Path(temporary)
         result.gains.write_calh5(str(work / GAINS))
-        if calfits:
+        if CALFITS in extras:
             result.gains.write_calfits(str(work / CALFITS))
         for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
             uvd.write_uvh5(str(work / name), data_write_dtype=np.dtype(np.complex64))
         (work / SOLUTION).write_text(json.dumps(description, indent=1, allow_nan=False), encoding="utf-8")
+        for polarization, transfer in (expected or {}).items():
+            save_spectrum(work / f"{EXPECTED}.{polarization}.h5", transfer)
         save_figure(*figure, work, FIGURE)
         written = sorted(work.iterdir())
         for path in written:

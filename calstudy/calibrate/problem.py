@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from calstudy.calibrate.basis import ForegroundBasis
+from calstudy.calibrate.settings import MODELS_AT_ONCE
 
 Prior = Literal["sum", "post-hoc", "gains", "none"]
 
@@ -36,6 +37,8 @@ class FitStructure:
     gain_vectors
         Orthonormal real functions of frequency whose span holds the gains, shape (Nfreqs, Ngain), float64; None for
         gains without restriction.
+    models_at_once
+        Foreground models that are worked on at a time; fewer need less memory, and change results by rounding only.
     """
 
     antennas: np.ndarray
@@ -44,6 +47,7 @@ class FitStructure:
     groups: np.ndarray
     conjugated: np.ndarray
     gain_vectors: np.ndarray | None = None
+    models_at_once: int = MODELS_AT_ONCE
 
     def __post_init__(self) -> None:
         n_baselines = len(self.antennas)
@@ -58,7 +62,7 @@ class FitStructure:
 
     @cached_property
     def _content(self) -> str:
-        digest = hashlib.sha256()
+        digest = hashlib.sha256(str(self.models_at_once).encode())
         arrays = [self.antennas, self.groups, self.conjugated.astype(np.int64)]
         if self.gain_vectors is not None:
             arrays.append(self.gain_vectors)

@@ -41,8 +41,8 @@ class Projection(NamedTuple):
     baseline_model
         F on the baselines, shape (2, Nbls, Nfreqs), float32.
     absorber
-        W of each model, shape (Nmodels, Q, Q), float32: foregrounds answer a weighted change y of the visibilities of
-        their group with ``Q W Q^T y``, where Q is the common basis.
+        W of the models of each stretch, shape (Nmembers, Q, Q), float32: foregrounds answer a weighted change y of the
+        visibilities of their group with ``Q W Q^T y``, where Q is the common basis.
     roots
         For each piece roots R of the inverse of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel without the
         common basis is ``Q W Q^T = (R A^T)^T (R A^T)``.
@@ -53,7 +53,7 @@ class Projection(NamedTuple):
     descent: tf.Tensor
     curvature: tf.Tensor
     baseline_model: tf.Tensor
-    absorber: tf.Tensor
+    absorber: tuple[tf.Tensor, ...]
     roots: tuple[tf.Tensor, ...]
 
 
@@ -72,20 +72,27 @@ class _Piece(NamedTuple):
 class Projector:
     """Eliminates the foregrounds of one fit structure.
 
+    Attributes
+    ----------
+    common
+        Orthonormal basis Q that spans all bases, (Nfreqs, rank), float32.
+    overlaps
+        A^T Q of each piece, (Nvec, rank), float32.
+
     The loss, its gradient and N are evaluated in float64: in float32 the scale of the gains drifts unseen. The inner
     products of the iteration need only float32.
     """
 
     def __init__(self, tensors: FitTensors) -> None:
         self.tensors = tensors
-        self._one_by_one = tensors.n_baselines > tensors.piece
+        self._stretches = tensors.stretches
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
         left, singular, _ = np.linalg.svd(np.concatenate(distinct, axis=1), full_matrices=False)
         common = left[:, singular > SPAN_CUTOFF * singular[0]]
         self.common = tf.constant(common, tf.float32)
         self.rank = common.shape[1]
         self._bases = [tf.constant(basis, tf.float64) for basis in tensors.bases]
-        self._overlaps = [tf.constant(basis.T @ common, tf.float32) for basis in tensors.bases]
+        self.overlaps = [tf.constant(basis.T @ common, tf.float32) for basis in tensors.bases]
         self.project = tf.function(self._project)
 
     def _factor(self, curvature: tf.Tensor, basis: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
@@ -107,24 +114,30 @@ class Projector:
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
         pieces: list[_Piece] = []
-        for index in range(len(self.tensors.slices)):
-            # Without this, all pieces would be worked on at once, and their temporaries add up.
-            with tf.control_dependencies([pieces[-1].absorber] if self._one_by_one and pieces else []):
-                pieces.append(self._project_piece(index, gains, visibilities, weights))
-        loss, model, pull, curvature, baseline_model, absorber, roots = zip(*pieces, strict=True)
+        descent: list[tf.Tensor] = []
+        absorbers: list[tf.Tensor] = []
+        for stretch in self._stretches:
+            # Without this, all stretches would be worked on at once, and their temporaries add up.
+            with tf.control_dependencies([descent[-1], absorbers[-1]] if descent else []):
+                members = [self._project_piece(index, gains, visibilities, weights) for index in stretch]
+                pull = tf.concat([member.pull for member in members], axis=1)
+                before = descent[-1] if descent else 0.0
+                descent.append(before + self.tensors.sum_over_antenna(pull, self.tensors.baselines_of(stretch)))
+                absorbers.append(tf.concat([member.absorber for member in members], axis=0))
+            pieces += members
         return Projection(
-            tf.add_n(loss),
-            tf.concat(model, axis=1),
-            self.tensors.sum_over_antenna(tf.concat(pull, axis=1)),
-            tf.concat(curvature, axis=0),
-            tf.concat(baseline_model, axis=1),
-            tf.concat(absorber, axis=0),
-            roots,
+            tf.add_n([piece.loss for piece in pieces]),
+            tf.concat([piece.model for piece in pieces], axis=1),
+            descent[-1],
+            tf.concat([piece.curvature for piece in pieces], axis=0),
+            tf.concat([piece.baseline_model for piece in pieces], axis=1),
+            tuple(absorbers),
+            tuple(piece.root for piece in pieces),
         )
 
     def _project_piece(self, index: int, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> _Piece:
         """Eliminate the foregrounds of one piece of models."""
-        tensors, basis, overlap = self.tensors, self._bases[index], self._overlaps[index]
+        tensors, basis, overlap = self.tensors, self._bases[index], self.overlaps[index]
         start, (first, last) = tensors.slices[index][0], tensors.baseline_slices[index]
         visibilities, weights = visibilities[:, first:last], weights[first:last]
         products = tensors.gain_products(gains, first, last)
@@ -156,8 +169,14 @@ class Projector:
             root,
         )
 
-    def absorb(self, values: tf.Tensor, absorber: tf.Tensor) -> tf.Tensor:
+    def absorb(self, values: tf.Tensor, absorber: tuple[tf.Tensor, ...]) -> tf.Tensor:
         """Return ``Q W Q^T values`` for each model; values and result (2, Nmodels, Nfreqs)."""
+        edges = [self.tensors.models_of(stretch) for stretch in self._stretches]
+        parts = zip(edges, absorber, strict=True)
+        answers = [self._absorb_stretch(values[:, first:last], matrices) for (first, last), matrices in parts]
+        return answers[0] if len(answers) == 1 else tf.concat(answers, axis=1)
+
+    def _absorb_stretch(self, values: tf.Tensor, absorber: tf.Tensor) -> tf.Tensor:
         n_frequencies, rank = self.common.shape
         inner = tf.reshape(tf.reshape(values, [-1, n_frequencies]) @ self.common, [2, -1, rank])
         # W is symmetric, so that models can share one batched product for real and imaginary parts.

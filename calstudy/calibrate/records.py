@@ -38,6 +38,8 @@ class SolveRecord:
     n_steps: int
     loss_history: np.ndarray
     seconds: float
+    remaining: float
+    remaining_rms: float
     peak_memory: int
 
     def summary(self) -> dict[str, Any]:
@@ -54,6 +56,8 @@ class SolveRecord:
             "first_loss": _number(losses[0]) if losses.size else None,
             "last_loss": _number(losses[-1]) if losses.size else None,
             "seconds": self.seconds,
+            "remaining": _number(self.remaining),
+            "remaining_rms": _number(self.remaining_rms),
             "peak_memory": self.peak_memory,
         }
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from calstudy.schema import Section, choice
+from calstudy.plugins import Plugin
+from calstudy.schema import Section, choice, fault
 from calstudy.units import Delay, Length
+
+MODELS_AT_ONCE = 512
 
 
 class BasisSettings(Section):
@@ -60,7 +63,7 @@ class LbfgsSettings(Section):
 
     name: Literal["lbfgs"]
     tolerance: float = Field(
-        1e-3, gt=0, lt=1, description="Stop when ten steps together lower the loss by less than this of itself."
+        1e-3, gt=0, lt=1, description="Stop when the predicted relative decrease of the loss is smaller."
     )
     max_steps: int = Field(2000, ge=1)
     memory: int = Field(20, ge=1, description="Pairs of steps and gradients that stand for the curvature.")
@@ -117,16 +120,30 @@ class FileStart(Section):
     path: Path = Field(strict=False)
 
 
-InitialGains = Annotated[UnityStart | FileStart, Field(discriminator="kind"), choice("kind", "unity")]
+class RedundantStart(Section):
+    """Start from redundant calibration of each integration: hera_cal's firstcal and logcal (Liu et al. 2010)."""
+
+    kind: Literal["redundant"]
+    delays: bool = Field(
+        True, description="First fit a delay and a phase per antenna; false for gains that are noise in frequency."
+    )
+
+
+InitialGains = Annotated[UnityStart | FileStart | RedundantStart, Field(discriminator="kind"), choice("kind", "unity")]
 
 
 class CalibrationSettings(Section):
     """The calibrator, its foreground basis and its solver."""
 
-    calibrator: Literal["calamity", "calamity-redundant", "sky-based"] = Field(
+    calibrator: Literal["calamity", "calamity-redundant", "sky-based", "code"] = Field(
         "calamity",
         description="One foreground model per baseline (LOGLIKELIHOOD) or group (LOGLIKELIHOODREDUNDANT), or none: "
-        "gains alone, with the sky model frozen.",
+        "gains alone, with the sky model frozen; or a function of your own, see `code`.",
+    )
+    code: Plugin | None = Field(
+        None,
+        description="With calibrator `code`: the function, called with data, sky model and options; it returns gains "
+        "and model (`calstudy.calibrate.own.calibrate_with`). Basis, solver, prior and weights are not read.",
     )
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are one group.")
     basis: BasisSettings = BasisSettings()
@@ -151,3 +168,16 @@ class CalibrationSettings(Section):
     chunks: int = Field(
         4, ge=1, description="Pieces of consecutive integrations; the unit of resuming and of work sharing."
     )
+
+    models_at_once: int = Field(
+        MODELS_AT_ONCE,
+        ge=16,
+        description="Foreground models that a solver works on at a time: fewer need less memory, and change results by "
+        "rounding only. A run chooses fewer by itself where memory is short.",
+    )
+
+    @model_validator(mode="after")
+    def _code_goes_with_its_calibrator(self) -> CalibrationSettings:
+        if (self.calibrator == "code") != (self.code is not None):
+            raise fault("code", "goes with calibrator: code, and that needs it")
+        return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,6 +32,13 @@ class Solution:
         Steps taken.
     seconds
         Wall time.
+    remaining
+        How far from the minimum it stopped: the decrease of the loss that a further Gauss-Newton step is predicted to
+        bring, over the loss; NaN if there is no estimate. To first order the residual still holds this fraction of its
+        own power because the iteration stopped, orthogonal to the residual at the minimum.
+    remaining_rms
+        Root mean square of that part of the calibrated residual R, in the unit of the data; NaN likewise. Two solves
+        that stop alike have it in common, and their cross power rises by up to its square.
     """
 
     gains: np.ndarray
@@ -40,6 +48,8 @@ class Solution:
     message: str
     n_steps: int
     seconds: float
+    remaining: float = math.nan
+    remaining_rms: float = math.nan
 
     @property
     def usable(self) -> bool:

@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from pyuvdata import UVCal, UVData
 
-from calstudy.errors import InputError
 from calstudy.gains import gains_for
-
-
-def read_gains(path: Path) -> UVCal:
-    """Read a CalH5 or calfits file; InputError if it is neither."""
-    try:
-        return UVCal.from_file(path)
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise InputError(f"gains {str(path)!r}: not a readable CalH5 or calfits file ({error})") from None
 
 
 def starting_gains(data: UVData, numbers: np.ndarray, gains: UVCal | None) -> np.ndarray:

@@ -35,7 +35,7 @@ def make_structure(data: UVData, settings: CalibrationSettings) -> tuple[FitStru
     if settings.gain_delay is not None:
         vectors = gain_vectors(frequencies, settings.gain_delay, settings.basis.eigenvalue_cutoff)
         structure = replace(structure, gain_vectors=vectors)
-    return structure, numbers
+    return replace(structure, models_at_once=settings.models_at_once), numbers
 
 
 def _modelled(

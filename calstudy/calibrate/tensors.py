@@ -7,6 +7,7 @@ nothing after that needs to know.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,9 +15,6 @@ import tensorflow as tf
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
-
-# Models of one bucket that are worked on at a time: bounds the temporaries, which have the size of their bases.
-PIECE = 512
 
 
 class Measurements(NamedTuple):
@@ -52,8 +50,9 @@ class FitTensors:
         Range of models of each piece: a bucket, or a part of a large one.
     baseline_slices
         Range of baselines that have the models of each piece.
-    piece
-        Models that are worked on at a time, at most.
+    stretches
+        Consecutive pieces that are worked on together, as ranges of their indices: as many as have `models_at_once`
+        baselines, or one that has more.
     bases
         Basis of each piece, shape (Nfreqs, Nvec), float64 arrays.
     gain_vectors
@@ -62,7 +61,9 @@ class FitTensors:
         1, or -1 for baselines that were turned around, shape (Nbls, 1); None if there are none.
     """
 
-    def __init__(self, structure: FitStructure, piece: int = PIECE) -> None:
+    def __init__(self, structure: FitStructure) -> None:
+        # Bounds the temporaries, which have the size of their bases.
+        piece = structure.models_at_once
         buckets = structure.basis.buckets
         model_order = np.concatenate([bucket.members for bucket in buckets])
         model_position = np.empty(structure.basis.n_models, int)
@@ -80,7 +81,6 @@ class FitTensors:
         self.second = tf.constant(pairs_sorted[:, 1], tf.int32)
         self.shared = self.n_models < self.n_baselines
         self.model_index = tf.constant(position[self._order], tf.int32) if self.shared else None
-        self.piece = piece
         self.slices, self.bases, first = [], [], 0
         for bucket in buckets:
             last = first + bucket.members.size
@@ -90,6 +90,7 @@ class FitTensors:
             first = last
         edges = np.searchsorted(position[self._order], self.slices)
         self.baseline_slices = [(int(start), int(end)) for start, end in edges]
+        self.stretches = _stretches(self.baseline_slices, piece)
         self.gain_vectors = structure.gain_vectors
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
 
@@ -137,12 +138,38 @@ class FitTensors:
         first, second = tf.gather(eta, self.first, axis=1), tf.gather(eta, self.second, axis=1)
         return tf.stack([first[0] + second[0], first[1] - second[1]])
 
-    def sum_over_antenna(self, values: tf.Tensor) -> tf.Tensor:
-        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`; (2, Nants, Nfreqs)."""
+    def sum_over_antenna(self, values: tf.Tensor, baselines: tuple[int, int] | None = None) -> tf.Tensor:
+        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`; (2, Nants, Nfreqs).
+
+        Parameters
+        ----------
+        values
+            Of all baselines, or of the range `baselines`, (2, Nbls, Nfreqs).
+        """
+        start, end = baselines or (0, self.n_baselines)
+        first, second = self.first[start:end], self.second[start:end]
 
         def scatter(part: tf.Tensor, index: tf.Tensor) -> tf.Tensor:
             return tf.math.unsorted_segment_sum(part, index, self.n_antennas)
 
-        real = scatter(values[0], self.first) + scatter(values[0], self.second)
-        imaginary = scatter(values[1], self.first) - scatter(values[1], self.second)
+        real = scatter(values[0], first) + scatter(values[0], second)
+        imaginary = scatter(values[1], first) - scatter(values[1], second)
         return tf.stack([real, imaginary])
+
+    def models_of(self, stretch: range) -> tuple[int, int]:
+        """Return the range of models in a stretch of pieces."""
+        return self.slices[stretch[0]][0], self.slices[stretch[-1]][1]
+
+    def baselines_of(self, stretch: range) -> tuple[int, int]:
+        """Return the range of baselines that have the models of a stretch of pieces."""
+        return self.baseline_slices[stretch[0]][0], self.baseline_slices[stretch[-1]][1]
+
+
+def _stretches(slices: Sequence[tuple[int, int]], most: int) -> list[range]:
+    """Return ranges of consecutive slices that hold `most` elements together, or one slice that holds more."""
+    first, found = 0, []
+    for index in range(1, len(slices) + 1):
+        if index == len(slices) or slices[index][1] - slices[first][0] > most:
+            found.append(range(first, index))
+            first = index
+    return found

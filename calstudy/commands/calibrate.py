@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
 EXIT_UNCONVERGED = 3
 # More solves than this that did not converge are counted instead of named.
 NAMED = 5
+# A fit is said to be able to absorb anything from this many unknowns per sample on.
+CROWDED = 0.9
+# Real data of few baselines have directions that converge slowly, at next to no cost.
+PATIENT = {"name": "gauss-newton", "max_steps": 500}
 
 Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format that pyuvdata reads.", show_default=False)]
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
@@ -47,6 +52,12 @@ Set = Annotated[
 ]
 Output = Annotated[Path, typer.Option(help="Folder for the results.")]
 Calfits = Annotated[bool, typer.Option("--calfits", help="Also write the gains as calfits.")]
+ExpectedLoss = Annotated[
+    bool, typer.Option("--expected-loss", help="Also write the signal loss that the fit is expected to cause.")
+]
+MaxMemory = Annotated[
+    str | None, typer.Option(metavar="SIZE", help="Memory to use at most, such as '6 GB'; by default what is free.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of an earlier calibration.")]
 
 
@@ -64,7 +75,9 @@ def calibrate(
     overrides: Set = None,
     output: Output = Path("calibrated"),
     calfits: Calfits = False,
+    expected_loss: ExpectedLoss = False,
     overwrite: Overwrite = False,
+    max_memory: MaxMemory = None,
 ) -> None:
     """Calibrate visibilities: solve for gains and foregrounds, write both and the residual.
 
@@ -72,9 +85,11 @@ def calibrate(
     converged, 3 if some did not, 2 if something given cannot be used.
     """
     from calstudy.calibrate.options import read_settings
+    from calstudy.calibrate.output import CALFITS, EXPECTED
+    from calstudy.running.capacity import parse_memory
 
     changes = {
-        "solver": solver,
+        "solver": PATIENT if solver is None and settings_file is None else solver,
         "basis.buffer": buffer,
         "calibrator": _calibrator(redundant, gains_only),
         "weights": _weights(weights),
@@ -83,7 +98,10 @@ def calibrate(
         "initial_gains": None if gains is None else {"kind": "file", "path": str(gains)},
     }
     settings = read_settings(settings_file, changes, overrides or [])
-    sys.exit(_run(data, sky_model, settings, select or [], output, calfits=calfits, overwrite=overwrite))
+    budget = None if max_memory is None else parse_memory(max_memory)
+    extras = [name for name, wanted in ((CALFITS, calfits), (EXPECTED, expected_loss)) if wanted]
+    files = {"extras": extras, "overwrite": overwrite}
+    sys.exit(_run(data, sky_model, settings, select or [], output, budget=budget, **files))
 
 
 def _calibrator(redundant: bool, gains_only: bool) -> str | None:
@@ -107,23 +125,24 @@ def _run(
     selections: list[str],
     output: Path,
     *,
-    calfits: bool,
+    budget: float | None,
+    extras: list[str],
     overwrite: bool,
 ) -> int:
     from calstudy.quiet import load_tensorflow
 
     load_tensorflow()
-    from calstudy.calibrate.output import describe, require_free, write_result
+    from calstudy.calibrate.output import EXPECTED, describe, require_free, write_result
     from calstudy.calibrate.selection import parse_selection
     from calstudy.stages.files import quiet_libraries
 
     selection = parse_selection(selections)
-    require_free(output, calfits, overwrite)
+    require_free(output, extras, overwrite)
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     started = time.perf_counter()
     with quiet_libraries():
         data, sky, notes = _load(paths, sky_path, selection)
-        plan = _plan(data, settings, notes)
+        settings, plan = _plan(data, settings, notes, budget)
         for note in notes:
             console.print(note, markup=False)
         console.print(plan, markup=False)
@@ -136,8 +155,11 @@ def _run(
             "notes": notes,
             "plan": plan,
         }
-        written = write_result(result, describe(result, context), output, _figure(data, result, notes), calfits)
+        expected = _expected(data, sky, settings, result) if EXPECTED in extras else {}
+        figure = _figure(data, result, notes)
+        written = write_result(result, describe(result, context), output, figure, extras, expected)
     console.print(f"{len(written)} files in {output}, {time.perf_counter() - started:.1f} s", markup=False)
+    _tell_distance(result, console)
     return _verdict(result)
 
 
@@ -152,32 +174,37 @@ def _load(paths: list[Path], sky_path: Path | None, selection: Any) -> tuple[UVD
     return data, match_sky_model(sky, data), notes + [f"Sky model: {note}" for note in sky_notes]
 
 
-def _plan(data: UVData, settings: CalibrationSettings, notes: list[str]) -> str:
-    """Say what will be done, note what will not work well, and refuse it if the memory does not suffice."""
-    from calstudy.calibrate.calamity import fitted_part
-    from calstudy.calibrate.memory import solve_memory
+def _plan(
+    data: UVData, settings: CalibrationSettings, notes: list[str], budget: float | None
+) -> tuple[CalibrationSettings, str]:
+    """Fit the solver to the memory, say what will be done, note what will not work well, and refuse what cannot fit."""
+    from calstudy.calibrate.measured import fitted_part
+    from calstudy.calibrate.memory import Dimensions, fit_models_at_once, solve_memory
     from calstudy.calibrate.structure import make_structure, repeat_structure
     from calstudy.resources import free_memory
 
     with _sentences():
         structure, _ = make_structure(fitted_part(data, settings.autos), settings)
     together = min(settings.integrations_per_solve, data.Ntimes)
-    needed = solve_memory(repeat_structure(structure, together), settings) + 6 * data.data_array.nbytes
+    dimensions = Dimensions.of(repeat_structure(structure, together))
+    results, available = 6 * data.data_array.nbytes, free_memory() if budget is None else budget
+    settings = fit_models_at_once(dimensions, settings, available - results)
+    needed = solve_memory(dimensions, settings) + results
     unknowns = structure.basis.n_coefficients + structure.n_antennas * structure.n_frequencies
     samples = structure.n_baselines * structure.n_frequencies
-    if settings.calibrator != "sky-based" and unknowns >= samples:
+    if settings.calibrator != "sky-based" and unknowns >= CROWDED * samples:
         notes.append(
             f"The fit has {unknowns} unknowns for {samples} samples, so that it can absorb anything: expect slow "
             "convergence, and no residual; use a smaller basis.min_delay or --buffer, or --redundant."
         )
-    if needed > free_memory():
+    if needed > available:
         raise InputError(
             f"{structure.n_antennas} antennas, {structure.n_baselines} baselines and {structure.n_frequencies} "
-            f"channels need about {needed / 1e9:.1f} GB, and {free_memory() / 1e9:.1f} GB are free; "
-            "--select fewer of them"
+            f"channels need about {needed / 1e9:.1f} GB, and {available / 1e9:.1f} GB are "
+            f"{'free' if budget is None else 'allowed by --max-memory'}; --select fewer of them"
         )
     solves = -(-data.Ntimes // together) * data.Npols
-    return (
+    return settings, (
         f"{structure.n_antennas} antennas, {structure.n_baselines} baselines, {structure.n_frequencies} channels, "
         f"{data.Ntimes} integrations, {data.Npols} polarizations: {solves} solves, {structure.basis.n_coefficients} "
         f"foreground coefficients each, about {needed / 1e9:.1f} GB"
@@ -218,6 +245,28 @@ def _figure(data: UVData, result: CalibrationResult, notes: list[str]) -> tuple[
 
     found = diagnose(data, result)
     return draw_diagnostics(found, notes), figure_arrays(found)
+
+
+def _expected(
+    data: UVData, sky: UVData | None, settings: CalibrationSettings, result: CalibrationResult
+) -> dict[str, Any]:
+    """Return the expected transfer function of every polarization that has solutions."""
+    from calstudy.calibrate.expectation import expect
+
+    found = {pol: expect(data, settings, result, sky, index) for index, pol in enumerate(result.model.get_pols())}
+    return {pol: expected for pol, expected in found.items() if expected is not None}
+
+
+def _tell_distance(result: CalibrationResult, console: Console) -> None:
+    """Say how much the residual still holds because the iterations stopped."""
+    left = [record for record in result.solutions if math.isfinite(record.remaining)]
+    if left:
+        worst = max(left, key=lambda record: record.remaining)
+        console.print(
+            f"left by stopping: at most {100 * worst.remaining:.2g} % of the residual's power "
+            f"({worst.remaining_rms:.2g} {result.model.vis_units} rms)",
+            markup=False,
+        )
 
 
 def _verdict(result: CalibrationResult) -> int:

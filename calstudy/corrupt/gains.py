@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.errors import InputError
-from calstudy.gains import gains_for, make_uvcal
+from calstudy.gains import gains_for, make_uvcal, read_gains
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +67,7 @@ def draw_reflection_gains(n_antennas: int, frequencies: np.ndarray, settings: Re
     return reflection_gain(frequencies, amplitudes[:, None], delays[:, None], phases[:, None])
 
 
-def read_gains(path: Path, template: UVData) -> UVCal:
+def gains_from_file(path: Path, template: UVData) -> UVCal:
     """Read a CalH5 or calfits file of gains that are constant in time; flagged gains are taken as unity.
 
     Returns
@@ -80,14 +80,7 @@ def read_gains(path: Path, template: UVData) -> UVCal:
     InputError
         If the file cannot be read, holds several times, or lacks antennas, channels or polarizations of the template.
     """
-    from pyuvdata import UVCal
-
-    try:
-        gains = UVCal.from_file(path)
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise InputError(
-            f"corruption.gains.path = {str(path)!r}: not a readable CalH5 or calfits file ({error})"
-        ) from None
+    gains = read_gains(path, "corruption.gains.path")
     if gains.Ntimes != 1:
         raise InputError(
             f"corruption.gains.path = {str(path)!r}: holds {gains.Ntimes} times; the corrupting gains are constant in "
@@ -108,7 +101,7 @@ def make_gains(settings: Gains, template: UVData) -> UVCal:
         If a gain file does not fit the template, or a drawn reflection does not decay.
     """
     if settings.kind == "file":
-        return read_gains(settings.path, template)
+        return gains_from_file(settings.path, template)
     n_antennas, n_feeds = template.Nants_telescope, template.Npols
     frequencies = template.freq_array
     if settings.kind == "unity":

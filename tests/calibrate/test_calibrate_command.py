@@ -11,7 +11,9 @@ from pyuvdata import UVCal, UVData
 from test_calamity import make_uvdata
 
 from calstudy import cli
+from calstudy.calibrate.absorption import ExpectedTransfer
 from calstudy.calibrate.output import FIGURE_FILES
+from calstudy.power.tables import load_spectrum
 
 OPTIONS = ["--buffer", "50 ns", "--set", "basis.min_delay=50 ns"]
 
@@ -37,6 +39,20 @@ def command(monkeypatch, capsys, tmp_path):
         return end.value.code, capsys.readouterr().err
 
     return run
+
+
+def test_the_expected_loss_is_written_and_how_far_the_fit_is_told(command, data, tmp_path):
+    code, error = command(data, *OPTIONS, "--output", "out", "--expected-loss")
+    assert code == 0
+    expected = load_spectrum(tmp_path / "out" / "expected-transfer.ee.h5", ExpectedTransfer)
+    assert expected.transfer.shape == (28, 64)
+    assert -1e-9 < expected.transfer.min() < 0.1 < 0.5 < expected.transfer.max() < 1
+    assert not expected.error.any()
+    assert "left by stopping: at most" in error
+    records = json.loads((tmp_path / "out" / "solution.json").read_text())["records"]
+    assert all(0 < record["remaining"] < 1e-3 and record["remaining_rms"] > 0 for record in records)
+    again, told = command(data, *OPTIONS, "--output", "out", "--expected-loss")
+    assert again == 2 and "expected-transfer.ee.h5" in told
 
 
 def test_everything_is_written_and_readable(command, data, tmp_path):
@@ -112,3 +128,11 @@ def test_mistakes_are_one_sentence(command, data, arguments, sentence):
     complaints = [line for line in error.splitlines() if line.startswith("calstudy:")]
     assert len(complaints) == 1 and sentence in complaints[0]
     assert "Traceback" not in error
+
+
+def test_what_the_memory_does_not_hold_is_refused(command, data, tmp_path):
+    code, error = command(data, *OPTIONS, "--output", "out", "--max-memory", "500 MB")
+    assert code == 2
+    assert "8 antennas, 28 baselines and 64 channels need about 1.2 GB, and 0.5 GB are allowed by --max-memory" in error
+    assert not (tmp_path / "out").exists()
+    assert "--max-memory '5': write a positive number" in command(data, "--max-memory", "5")[1]

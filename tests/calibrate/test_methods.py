@@ -30,12 +30,37 @@ def converged(toy):
 
 
 def test_lbfgs_reaches_the_minimum_of_gauss_newton(converged):
+    """Both stop where 1e-3 of the loss is predicted to go, but at ends of slow valleys that hold more than that.
+
+    The toy has few channels for its bases: directions of next to no curvature take 5 % of its noise.
+    """
     problem, best = converged
-    found = solve(problem, Lbfgs(tolerance=3e-4))
+    found, same = solve(problem, Lbfgs(tolerance=1e-3)), solve(problem, GaussNewton(tolerance=1e-3))
     assert found.status == "converged", found.message
-    assert 0.99 * best.loss_history[-1] < found.loss_history[-1] < 1.05 * best.loss_history[-1]
+    assert found.loss_history[-1] == pytest.approx(same.loss_history[-1], rel=5e-3)
     onwards = solve_warm(problem, GaussNewton(tolerance=3e-4), WarmStart(found.gains, None))[0]
     assert onwards.loss_history[-1] == pytest.approx(best.loss_history[-1], rel=1e-2)
+
+
+def test_solvers_meet_where_no_direction_is_flat():
+    """Foregrounds with as much of every sequence keep gains and foregrounds apart: there is but one minimum."""
+    toy = make_toy(scattered(8))
+    foregrounds = np.empty_like(toy.foregrounds)
+    rng = np.random.default_rng(3)
+    for bucket in toy.basis.buckets:
+        shape = (bucket.members.size, bucket.vectors.shape[1])
+        foregrounds[bucket.members] = complex_normal(rng, shape) @ bucket.vectors.T
+    noise = 1e-3 * np.sqrt(np.mean(np.abs(foregrounds) ** 2)) * complex_normal(rng, foregrounds.shape)
+    flat = replace(toy, foregrounds=foregrounds, noise=noise)
+    losses = [
+        solve(flat.problem(prior="none"), solver).loss_history.min()
+        for solver in (
+            GaussNewton(tolerance=1e-5),
+            Lbfgs(tolerance=1e-5),
+            FirstOrder(Optimizer("adamax", 0.02, "cosine", 1e-3, 6000), tolerance=0.0, precision="double"),
+        )
+    ]
+    assert losses == pytest.approx([losses[0]] * 3, rel=2e-4)
 
 
 def test_lbfgs_says_when_it_ran_out_of_steps(toy):
@@ -148,11 +173,17 @@ def test_joint_solves_share_gains_and_lose_less_of_the_noise():
 def test_pieces_of_any_size_give_the_same_projection(toy):
     structure = toy.structure
     gains = pairs.to_pair(toy.gains, tf.float64)
-    results = []
+    eta = pairs.to_pair(toy.gains - 1, tf.float32)
+    results, images = [], []
     for piece in (1, 3, 512):
-        tensors = FitTensors(structure, piece)
+        tensors = FitTensors(replace(structure, models_at_once=piece))
         data = tensors.load(toy.problem(), tf.float64)
-        results.append(Projector(tensors).project(gains, data.visibilities, data.weights))
+        projector = Projector(tensors)
+        results.append(projector.project(gains, data.visibilities, data.weights))
+        images.append(projector.hessian_product(eta, results[-1]))
+    assert len(results[0].absorber) > len(results[2].absorber) == 1
+    for image in images[:2]:
+        assert np.abs(image - images[2]).max() < 1e-5 * np.abs(images[2]).max()
     for other in results[:2]:
         assert float(other.loss) == pytest.approx(float(results[2].loss), rel=1e-12)
         assert np.abs(other.model - results[2].model).max() < 1e-11 * np.abs(results[2].model).max()

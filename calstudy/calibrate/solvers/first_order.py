@@ -20,6 +20,7 @@ from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.loss import foreground_model, likelihood, sum_prior
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, Prior
 from calstudy.calibrate.projection import Projector
+from calstudy.calibrate.solvers.gauss_newton import remaining_at
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.tensors import FitTensors
 
@@ -295,6 +296,10 @@ class FirstOrder:
     def estimate(self, state: FirstOrderState) -> Estimate:
         """Return the best gains and foregrounds seen."""
         return state.kernels.estimate(state.descent.best, state.data, state.scale)
+
+    def remaining(self, state: FirstOrderState, problem: CalibrationProblem) -> float:
+        """Return what a Gauss-Newton step would still bring."""
+        return remaining_at(problem, self.estimate(state).gains)
 
     def memory(self, state: FirstOrderState) -> None:
         """Return nothing: only the gains carry over."""

@@ -150,7 +150,7 @@ class Kernels:
         degrees = antenna_degrees(self.tensors, projection)
         if self.frozen:
             return tf.cast(tf.linalg.diag(degrees), tf.complex64), degrees
-        return antenna_blocks(self.tensors, projection), degrees
+        return antenna_blocks(self.projector, projection), degrees
 
     def _factors(self, blocks: tf.Tensor, degrees: tf.Tensor, damping: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
         damped = blocks + tf.cast(tf.linalg.diag(damping * degrees), blocks.dtype)
@@ -190,6 +190,8 @@ class GaussNewtonState:
         Factor on the damping; grows tenfold whenever a step did not lower the loss.
     preconditioner
         The antenna blocks, once they are in use.
+    stale
+        Whether the antenna blocks are out of date, and were kept only because they say that this is the minimum.
     predicted
         Decrease of the loss that is predicted for the next step; infinite while unknown.
     """
@@ -204,6 +206,7 @@ class GaussNewtonState:
     n_accepted: int = 0
     boost: float = 1.0
     preconditioner: AntennaPreconditioner | None = None
+    stale: bool = False
     predicted: float = math.inf
 
     @property
@@ -249,13 +252,12 @@ class GaussNewton:
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
         """Try one damped step, and keep it if it lowers the loss."""
         kernels, preconditioner = state.kernels, state.preconditioner
-        damping = tf.constant(state.damping, tf.float32)
+        damping, stale = tf.constant(state.damping, tf.float32), False
         if preconditioner is None:
             eta, promised = kernels.channel_step(state.projection, state.gains, damping)
         else:
             eta, iterations = kernels.antenna_step(state.projection, state.gains, preconditioner.factors, damping)
-            if int(iterations) > CG_REFRESH:
-                preconditioner = None
+            stale = int(iterations) > CG_REFRESH
         gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))
         trial = kernels.project(gains, *state.measured)
         loss = float(trial.loss)
@@ -269,10 +271,10 @@ class GaussNewton:
             history=(*state.history, loss),
             n_accepted=state.n_accepted + 1,
             boost=1.0,
-            preconditioner=preconditioner,
+            stale=stale,
         )
         # Without slow directions, the next step will bring less than this one did.
-        return replace(state, predicted=float(promised)) if kernels.by_channel else self._prepared(state)
+        return replace(state, predicted=float(promised)) if kernels.by_channel else self._renewed(state)
 
     def terminate(self, state: GaussNewtonState) -> Verdict | None:
         """Judge convergence by the decrease of the loss that the next step is predicted to bring."""
@@ -300,9 +302,31 @@ class GaussNewton:
         model = state.kernels.tensors.unload(state.projection.model, state.scale)
         return Estimate(pairs.to_complex(state.gains), model)
 
+    def remaining(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
+        """Return the predicted decrease that convergence is judged by; looked up anew if the iteration has none yet."""
+        if state.history[-1] < ROUNDING_LOSS:
+            return 0.0
+        if math.isfinite(state.predicted):
+            return state.predicted / state.history[-1]
+        return remaining_at(problem, pairs.to_complex(state.gains))
+
     def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
         """Return the antenna blocks, which hardly change from one integration to the next."""
-        return state.preconditioner
+        return (
+            self._prepared(replace(state, preconditioner=None)).preconditioner if state.stale else state.preconditioner
+        )
+
+    def _renewed(self, state: GaussNewtonState) -> GaussNewtonState:
+        """Prepare the next step with new antenna blocks if they are stale, unless there need not be a next step."""
+        late = state.n_accepted >= CHANNEL_STEPS or state.kernels.space.vectors is not None
+        if not state.stale:
+            return self._prepared(state)
+        if late:
+            # Old blocks promise more than new ones do.
+            fall = float(state.kernels.predicted_decrease(state.projection, state.gains, state.preconditioner.factors))
+            if fall < self.tolerance * state.history[-1]:
+                return replace(state, predicted=fall)
+        return self._prepared(replace(state, preconditioner=None, stale=False))
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
         """Bring the antenna blocks up to date with the state, and let them predict the decrease of the next step."""
@@ -324,3 +348,24 @@ class GaussNewton:
             return state
         fall = kernels.predicted_decrease(state.projection, state.gains, preconditioner.factors)
         return replace(state, predicted=float(fall))
+
+
+def remaining_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
+    """Return by how much of itself a Gauss-Newton step from these gains would lower the loss at the best foregrounds.
+
+    Parameters
+    ----------
+    problem
+        Data and weights.
+    gains
+        Where any solver stopped, (Nants, Nfreqs).
+    """
+    solver = GaussNewton()
+    state = solver.init(problem, WarmStart(gains, None))
+    loss = state.history[-1]
+    if loss < ROUNDING_LOSS:
+        return 0.0
+    if state.kernels.by_channel:
+        _, promised = state.kernels.channel_step(state.projection, state.gains, tf.constant(state.damping, tf.float32))
+        return float(promised) / loss
+    return solver._prepared(replace(state, n_accepted=CHANNEL_STEPS)).predicted / loss

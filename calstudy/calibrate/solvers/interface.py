@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
@@ -10,10 +11,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from calstudy.calibrate.degeneracy import fix_degeneracies
-from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.problem import CalibrationProblem, gain_products
 from calstudy.calibrate.solution import Solution, Status
 
 logger = logging.getLogger(__name__)
+
+# A loss that stands still while more of it than this could go has not converged: fixed learning rates jitter in place.
+STILL = 0.01
 
 
 class Estimate(NamedTuple):
@@ -48,6 +52,10 @@ class Verdict(NamedTuple):
 class Solver(Protocol):
     """An iteration over states of its own kind. Solvers hold settings only; all that changes is in the state."""
 
+    @property
+    def tolerance(self) -> float:
+        """Return what the solver takes for converged, by a measure of its own."""
+
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> Any:
         """Return the first state, at the warm start's gains if there is one and at the problem's otherwise."""
 
@@ -63,6 +71,9 @@ class Solver(Protocol):
     def estimate(self, state: Any) -> Estimate:
         """Return the best gains and model so far."""
 
+    def remaining(self, state: Any, problem: CalibrationProblem) -> float:
+        """Return the predicted decrease of the loss that is left at the estimate, over the loss; NaN if unknown."""
+
     def memory(self, state: Any) -> Any:
         """Return what the next solve can reuse, or None."""
 
@@ -75,23 +86,52 @@ def solve_warm(
     The solution has its degeneracies fixed (see `calstudy.calibrate.degeneracy`). Not converging is a status, not an
     error; after a failed solve there is no warm start.
     """
+    solution, state = _solve(problem, solver, warm)
+    return solution, WarmStart(solution.gains, solver.memory(state)) if solution.usable else None
+
+
+def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) -> tuple[Solution, Any]:
+    """Return the solution and the solver's last state."""
     started = time.perf_counter()
     state = solver.init(problem, warm)
     while (verdict := solver.terminate(state)) is None:
         state = solver.step(state)
     losses = np.array(solver.losses(state), float)
     gains, model = solver.estimate(state)
+    remaining = rms = math.nan
     if verdict.status != "failed":
+        remaining = float(np.clip(solver.remaining(state, problem), 0, 1))
+        if verdict.status == "converged" and remaining > max(STILL, solver.tolerance):
+            told = f"{verdict.message}, but a Gauss-Newton step would lower it by {remaining:.1e} of itself"
+            verdict = Verdict("stalled", told)
         try:
             gains, model = fix_degeneracies(gains, model, problem)
+            rms = remaining_rms(gains, model, problem, remaining)
         except ValueError as error:
             verdict = Verdict("failed", str(error))
     seconds = time.perf_counter() - started
-    solution = Solution(gains, model, losses, verdict.status, verdict.message, losses.size - 1, seconds)
+    solution = Solution(
+        gains,
+        model,
+        losses,
+        verdict.status,
+        verdict.message,
+        losses.size - 1,
+        seconds,
+        remaining,
+        rms,
+    )
     logger.debug("%s after %d steps, %.2f s: %s", solution.status, solution.n_steps, seconds, solution.message)
-    return solution, WarmStart(gains, solver.memory(state)) if solution.usable else None
+    return solution, state
+
+
+def remaining_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem, remaining: float) -> float:
+    """Return the rms of the part of V / (g g*) - F whose share of the weighted residual's power is `remaining`."""
+    products = gain_products(gains, problem.structure.antennas)
+    loss = np.sum(problem.weights * np.abs(problem.visibilities - products * model) ** 2)
+    return float(np.sqrt(remaining * loss / np.sum(problem.weights * np.abs(products) ** 2)))
 
 
 def solve(problem: CalibrationProblem, solver: Solver) -> Solution:
     """Solve one problem from its initial gains (see `solve_warm`)."""
-    return solve_warm(problem, solver)[0]
+    return _solve(problem, solver, None)[0]

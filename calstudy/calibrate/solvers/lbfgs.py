@@ -17,12 +17,14 @@ from scipy.optimize import OptimizeResult, minimize
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
-from calstudy.calibrate.solvers.gauss_newton import Kernels, Reduced, compiled
+from calstudy.calibrate.solvers.gauss_newton import Kernels, Reduced, compiled, remaining_at
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.solvers.preconditioners import antenna_degrees
 
-# Steps over which the decrease of the loss is judged: single steps are at times short.
+# Steps between looks at what a Gauss-Newton step would still bring, which costs as much as several steps here.
 WINDOW = 10
+# Decrease over as many steps, relative to the loss, above which there is no need to look.
+FAST = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,20 +37,32 @@ class LbfgsState:
         Of the gains in their space, times `unit`, float64.
     unit
         Scale of each antenna's coordinates, (1, Nants, 1), float64.
+    remaining
+        What a Gauss-Newton step would still bring, relative to the loss; infinite while unknown.
     message
         What scipy said at the end; None before.
     """
 
+    problem: CalibrationProblem
     kernels: Kernels
     reduced: Reduced
     coordinates: np.ndarray
     unit: np.ndarray
     history: tuple[float, ...]
+    remaining: float = math.inf
     message: str | None = None
+
+    def gains(self, coordinates: np.ndarray) -> tf.Tensor:
+        """Return the gains with these coordinates, (2, Nants, Nfreqs)."""
+        return self.kernels.exact_space.expand(tf.constant(coordinates / self.unit))
+
+    def remaining_at(self, coordinates: np.ndarray) -> float:
+        """Return what a Gauss-Newton step would bring from there."""
+        return remaining_at(self.problem, pairs.to_complex(self.gains(coordinates)))
 
     def project(self, coordinates: np.ndarray) -> tuple[tf.Tensor, Projection]:
         """Return the gains with these coordinates, and the foregrounds eliminated there."""
-        gains = self.kernels.exact_space.expand(tf.constant(coordinates / self.unit))
+        gains = self.gains(coordinates)
         return gains, self.kernels.project(gains, *self.reduced.measured)
 
 
@@ -59,7 +73,7 @@ class Lbfgs:
     Parameters
     ----------
     tolerance
-        Converged when `WINDOW` steps together lower the loss by less than this of itself.
+        Converged when a Gauss-Newton step would lower the loss by less than this of itself.
     max_steps
         Steps at most.
     memory_size
@@ -78,11 +92,12 @@ class Lbfgs:
         degrees = antenna_degrees(kernels.tensors, projection).numpy().mean(axis=1)
         unit = np.sqrt(degrees / degrees.mean())[None, :, None].astype(np.float64)
         coordinates = kernels.exact_space.reduce(reduced.gains).numpy() * unit
-        return LbfgsState(kernels, reduced, coordinates, unit, (float(projection.loss),))
+        return LbfgsState(problem, kernels, reduced, coordinates, unit, (float(projection.loss),))
 
     def step(self, state: LbfgsState) -> LbfgsState:
         """Take all steps: the memory of the method lives within one call."""
         history, shape = list(state.history), state.coordinates.shape
+        looked, remaining = len(history), math.inf
         # The loss is small, and scipy's line search has absolute tolerances.
         first = max(history[0], np.finfo(float).tiny)
 
@@ -93,9 +108,13 @@ class Lbfgs:
             return float(projection.loss) / first, np.ravel(slope) / first
 
         def judge(intermediate_result: OptimizeResult) -> None:
+            nonlocal looked, remaining
             history.append(intermediate_result.fun * first)
-            if self._settled(history):
-                raise StopIteration
+            if len(history) >= looked + WINDOW and history[-1 - WINDOW] - history[-1] < FAST * history[-1]:
+                looked = len(history)
+                remaining = state.remaining_at(intermediate_result.x.reshape(shape))
+                if remaining < self.tolerance:
+                    raise StopIteration
 
         options = {"maxiter": self.max_steps, "maxfun": 10 * self.max_steps, "maxcor": self.memory_size}
         found = minimize(
@@ -106,25 +125,29 @@ class Lbfgs:
             callback=judge,
             options=options | {"ftol": 0.0, "gtol": 0.0},
         )
+        if len(history) > looked:
+            remaining = state.remaining_at(found.x.reshape(shape))
         return replace(
-            state, coordinates=found.x.reshape(shape), history=tuple(history), message=str(found.message).strip()
+            state,
+            coordinates=found.x.reshape(shape),
+            history=tuple(history),
+            remaining=remaining,
+            message=str(found.message).strip(),
         )
 
-    def _settled(self, history: Sequence[float]) -> bool:
-        return len(history) > WINDOW and history[-1 - WINDOW] - history[-1] < self.tolerance * history[-1]
-
     def terminate(self, state: LbfgsState) -> Verdict | None:
-        """Judge by the decrease over the last steps."""
+        """Judge by what a Gauss-Newton step would still bring."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
             return Verdict("failed", f"the loss is not finite after {n_steps} steps")
         if state.message is None:
             return None
-        if self._settled(state.history):
-            return Verdict("converged", f"the last {WINDOW} steps lowered the loss by less than {self.tolerance:g}")
+        if state.remaining < self.tolerance:
+            return Verdict("converged", f"a Gauss-Newton step would lower the loss by {state.remaining:.1e} of itself")
+        hint = f"{state.remaining:.1e} of the loss is predicted to go"
         if n_steps >= self.max_steps:
-            return Verdict("max-steps", f"not converged after {n_steps} steps")
-        return Verdict("stalled", f"no step lowers the loss any more after {n_steps} steps ({state.message})")
+            return Verdict("max-steps", f"not converged after {n_steps} steps: {hint}")
+        return Verdict("stalled", f"no step lowers the loss any more after {n_steps} steps ({state.message}): {hint}")
 
     def losses(self, state: LbfgsState) -> Sequence[float]:
         """Return the loss history in the unit of the data squared."""
@@ -134,6 +157,11 @@ class Lbfgs:
         """Return the current gains, and the foregrounds that fit best with them."""
         gains, projection = state.project(state.coordinates)
         return Estimate(pairs.to_complex(gains), state.kernels.tensors.unload(projection.model, state.reduced.scale))
+
+    def remaining(self, state: LbfgsState, problem: CalibrationProblem) -> float:
+        """Return what a Gauss-Newton step would still bring."""
+        del problem
+        return state.remaining
 
     def memory(self, state: LbfgsState) -> None:
         """Return nothing: only the gains carry over."""

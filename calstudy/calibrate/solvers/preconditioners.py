@@ -12,7 +12,7 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.projection import Projection
+from calstudy.calibrate.projection import Projection, Projector
 from calstudy.calibrate.tensors import FitTensors
 
 # Antennas and channels with hardly any data count as having this fraction of the mean.
@@ -97,17 +97,19 @@ def antenna_rows(tensors: FitTensors) -> AntennaRows:
     return AntennaRows(*padded)
 
 
-def antenna_blocks(tensors: FitTensors, projection: Projection) -> tf.Tensor:
+def antenna_blocks(projector: Projector, projection: Projection) -> tf.Tensor:
     """Return the channel blocks of each antenna, Hermitian, shape (Nants, Nfreqs, Nfreqs), complex64, undamped.
 
     Each baseline adds diag(K) - (D F) Q W Q^T (D F)^* to both its antennas, conjugated for the first. With the kernel
     as a sum of squares, the second terms of an antenna are one product of a long thin matrix with itself. Couplings
     between baselines that share a foreground model are left out; the blocks stay positive.
     """
-    sequences = tf.concat(
+    tensors, common = projector.tensors, projector.common
+    # In the common basis, for all the sequences at once would be the largest array of a solve.
+    rows = tf.concat(
         [
-            tf.reshape(tf.reshape(root, [-1, basis.shape[1]]) @ tf.constant(basis.T, tf.float32), [-1, basis.shape[0]])
-            for root, basis in zip(projection.roots, tensors.bases, strict=True)
+            tf.reshape(root, [-1, overlap.shape[0]]) @ overlap
+            for root, overlap in zip(projection.roots, projector.overlaps, strict=True)
         ],
         axis=0,
     )
@@ -116,7 +118,7 @@ def antenna_blocks(tensors: FitTensors, projection: Projection) -> tf.Tensor:
 
     def block(inputs: tuple[tf.Tensor, ...]) -> tf.Tensor:
         row, baseline, sign, degree = inputs
-        row_sequences = tf.gather(sequences, row)
+        row_sequences = tf.matmul(tf.gather(rows, row), common, transpose_b=True)
         real = tf.abs(sign)[:, None] * row_sequences * tf.gather(weighted[0], baseline)
         imaginary = sign[:, None] * row_sequences * tf.gather(weighted[1], baseline)
         both = tf.concat([real, imaginary], axis=0)

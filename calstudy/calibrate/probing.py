@@ -1,0 +1,112 @@
+"""The stochastic diagonal of what gains absorb: one linear solve of the fit's own kind for each random vector."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import tensorflow as tf
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.projection import Projection
+from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
+from calstudy.calibrate.solvers.gauss_newton import DAMPING_BOUNDS, PRECONDITIONER_DAMPING, Kernels, compiled
+from calstudy.calibrate.solvers.preconditioners import (
+    antenna_degrees,
+    channel_factors,
+    solve_antennas,
+    solve_channels,
+)
+
+if TYPE_CHECKING:
+    from calstudy.calibrate.absorption import DelayModes, Tangent
+
+CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
+
+
+class Follower:
+    """What gains do about a change of the data, at a solution.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    gains
+        The solution, (Nants, Nfreqs).
+    """
+
+    def __init__(self, problem: CalibrationProblem, gains: np.ndarray) -> None:
+        self.kernels: Kernels = compiled(problem.structure, problem.frozen)
+        reduced = self.kernels.reduce(problem, gains)
+        self._unit = reduced.loss_unit
+        self._projection: Projection = self.kernels.project(reduced.gains, *reduced.measured)
+        self._gains = tf.cast(reduced.gains, tf.float32)
+        self._damping = tf.constant(DAMPING_BOUNDS[0], tf.float32)
+        stronger = tf.constant(PRECONDITIONER_DAMPING, tf.float32)
+        if self.kernels.by_channel:
+            self._factors = channel_factors(self.kernels.tensors, self._projection, stronger)
+        else:
+            blocks, degrees = self.kernels.blocks(self._projection)
+            self._factors = self.kernels.factors(blocks, degrees, stronger, reduced.gains)
+        self._solve = tf.function(self._follow)
+
+    def follow(self, change: np.ndarray) -> np.ndarray:
+        """Return the relative change eta of the gains, (Nants, Nfreqs), for a weighted change of the data.
+
+        Parameters
+        ----------
+        change
+            J* applied to the whitened change, in the unit of its square root of the loss: complex, (Nants, Nfreqs).
+        """
+        # Inside the kernels the loss has the weighted square of the data for a unit.
+        return pairs.to_complex(self._solve(pairs.to_pair(change / self._unit, tf.float32)))
+
+    def _follow(self, descent: tf.Tensor) -> tf.Tensor:
+        kernels, projection, gains = self.kernels, self._projection, self._gains
+        diagonal = self._damping * antenna_degrees(kernels.tensors, projection)
+
+        def operator(coordinates: tf.Tensor) -> tf.Tensor:
+            eta = kernels.space.expand_relative(coordinates, gains)
+            image = kernels.projector.hessian_product(eta, projection) + diagonal * eta
+            return kernels.space.reduce_relative(image, gains)
+
+        solve = solve_channels if kernels.by_channel else solve_antennas
+        coordinates, _ = conjugate_gradients(
+            operator,
+            lambda values: solve(self._factors, values),
+            kernels.space.reduce_relative(descent, gains),
+            tf.constant(CG_TOLERANCE),
+            tf.constant(CG_ITERATIONS),
+        )
+        return kernels.space.expand_relative(coordinates, gains)
+
+
+def probe(
+    problem: CalibrationProblem, gains: np.ndarray, tangent: Tangent, modes: DelayModes, probes: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return <f|P|f> of the gains and its standard deviation, (Nbls, Ndelays) each; parameters as `expected_transfer`.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two probes, which give no error.
+    """
+    if probes < 2:
+        raise ValueError(f"probes: {probes}, at least 2 are needed")
+    follower, rng = Follower(problem, gains), np.random.default_rng(seed)
+    first, second = problem.structure.antennas.T
+    shape, used = tangent.slope.shape, tangent.roots > 0
+    sums = np.zeros((2, shape[0], modes.delay.size))
+    for _ in range(probes):
+        noise = used * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
+        pull = tangent.slope.conj() * tangent.free_of_foregrounds(noise)
+        descent = np.zeros(gains.shape, complex)
+        np.add.at(descent, first, pull)
+        np.add.at(descent, second, pull.conj())
+        eta = follower.follow(descent)
+        response = tangent.free_of_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
+        power = np.abs(modes.amplitudes(response)) ** 2
+        sums += power, power**2
+    mean, square = sums / probes
+    return mean, np.sqrt(np.maximum(square - mean**2, 0) / (probes - 1))

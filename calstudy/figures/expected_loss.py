@@ -1,0 +1,96 @@
+"""What a fit is expected to leave of the EoR, from its own tangent space, against what injection measures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calstudy.figures import style
+from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER, draw_transfer
+
+if TYPE_CHECKING:
+    from calstudy.power.expected import ExpectedBins
+    from calstudy.power.transfer import TransferFunction, TransferMap
+
+MAX_DELAY = 1.5e-6
+
+
+@dataclass(frozen=True)
+class ExpectedLoss:
+    """Expected and measured transfer functions of one calibration.
+
+    Attributes
+    ----------
+    expected
+        From the tangent space of one integration's fit.
+    measured, map
+        From data with the EoR and without, outside the wedge per |k|, and per baseline length and delay.
+    """
+
+    expected: ExpectedBins
+    measured: TransferFunction
+    map: TransferMap
+
+
+@style.journal_style()
+def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9, stand_ins: Sequence[str] = ()) -> Figure:
+    """Draw T outside the wedge per |k| on the left, and against the delay for some baseline lengths on the right.
+
+    Lines are expected, points measured, with 95 % bars.
+
+    Parameters
+    ----------
+    loss
+        Both transfer functions.
+    buffer
+        What was added to the horizon to tell inside from outside, s.
+    stand_ins
+        See `calstudy.figures.style.note_stand_ins`.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 2.9)
+    left, right = figure.subplots(1, 2, sharey=True)
+    expected, measured = loss.expected, loss.measured
+    left.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
+    draw_transfer(left, measured, "injected EoR", "o", style.BLUE)
+    left.plot(expected.k, expected.outside, color=style.ORANGE, label="expected at the solution")
+    left.plot(measured.k, measured.retained, color=style.BLUE, linestyle=":", label="injected, free of the flux scale")
+    filled = np.isfinite(measured.transfer)
+    left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, min(measured.bin_edges[1:][filled].max(), 1.5)))
+    left.set_title(f"outside wedge + {1e9 * buffer:.0f} ns")
+    left.legend(loc="lower right")
+    _draw_lengths(right, loss)
+    left.set_ylim(-0.03, 1.15)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_lengths(axes: Axes, loss: ExpectedLoss) -> None:
+    """Draw the mean over some neighbouring bins of baseline length: short, middle and long."""
+    axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
+    count = len(loss.map.bin_edges)
+    width = max(count // 8, 1)
+    for place, colour in zip((0.15, 0.45, 0.75), (style.BLUE, style.GREEN, style.RED), strict=True):
+        first = min(round(place * count), count - width)
+        rows = slice(first, first + width)
+        low, high = loss.map.bin_edges[first, 0], loss.map.bin_edges[first + width - 1, 1]
+        inside = (loss.expected.length_edges[:, 0] >= low) & (loss.expected.length_edges[:, 1] <= high)
+        axes.errorbar(
+            1e9 * loss.map.delay,
+            np.mean(loss.map.transfer[rows], axis=0),
+            SIGMAS_95 * np.sqrt(np.sum(loss.map.transfer_error[rows] ** 2, axis=0)) / width,
+            fmt="o",
+            color=colour,
+            markersize=2.2,
+            ecolor=(colour, 0.5),
+            elinewidth=0.6,
+        )
+        label = rf"$|\mathbf{{b}}| = {low:g}$–${high:g}$ m"
+        axes.plot(1e9 * loss.expected.delay, loss.expected.by_length[inside].mean(axis=0), color=colour, label=label)
+    axes.set(xlabel=style.DELAY, xlim=(0, 1e9 * min(MAX_DELAY, loss.map.delay[-1])))
+    axes.set_title("points injected, lines expected")
+    axes.legend(loc="lower right")

@@ -1,0 +1,98 @@
+"""The transfer function that a fit is expected to have, in the bins in which injected signals are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from astropy import constants
+
+
+@dataclass(frozen=True)
+class ExpectedBins:
+    """Expected T, each baseline counting the same.
+
+    Attributes
+    ----------
+    k, bin_edges
+        Centres (Nk,) and edges (Nk + 1,), h/Mpc.
+    outside, outside_error
+        T outside the wedge and its standard deviation from random probes, (Nk,); NaN in bins without modes.
+    length_edges
+        Lower and upper edge of each bin of baseline length, m, (Nb, 2).
+    delay
+        From zero up, s, (Nd,).
+    by_length
+        T per length and delay, both signs of the delay together, (Nb, Nd).
+    """
+
+    k: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    outside: np.ndarray = field(metadata={"unit": ""})
+    outside_error: np.ndarray = field(metadata={"unit": ""})
+    length_edges: np.ndarray = field(metadata={"unit": "m"})
+    delay: np.ndarray = field(metadata={"unit": "s"})
+    by_length: np.ndarray = field(metadata={"unit": ""})
+
+
+@dataclass(frozen=True)
+class BaselineModes:
+    """Expected T of every baseline and delay, and where these modes are.
+
+    Attributes
+    ----------
+    transfer, error
+        (Nbls, Ndelays); NaN without data.
+    length, k_perp
+        m and h/Mpc, (Nbls,).
+    delay, k_parallel
+        s and h/Mpc, ascending, (Ndelays,).
+    """
+
+    transfer: np.ndarray
+    error: np.ndarray
+    length: np.ndarray
+    k_perp: np.ndarray
+    delay: np.ndarray
+    k_parallel: np.ndarray
+
+
+def bin_expected(modes: BaselineModes, edges: Sequence[float], buffer: float, length_bin: float) -> ExpectedBins:
+    """Average over bins.
+
+    Parameters
+    ----------
+    modes
+        What is expected of each.
+    edges
+        Bin edges of |k|, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
+    buffer
+        Modes with |tau| <= |b|/c + buffer (s) are inside the wedge.
+    length_bin
+        Width of the bins of baseline length, m.
+    """
+    limits = np.asarray(edges, float)
+    known = np.isfinite(modes.transfer)
+    outside = known & (np.abs(modes.delay) > modes.length[:, None] / constants.c.value + buffer)
+    bins = np.searchsorted(limits, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
+    used = outside & (bins >= 0) & (bins < limits.size - 1)
+    count = np.bincount(bins[used], minlength=limits.size - 1)
+    total = np.bincount(bins[used], modes.transfer[used], limits.size - 1)
+    square = np.bincount(bins[used], modes.error[used] ** 2, limits.size - 1)
+    filled = np.where(count > 0, count, np.nan)
+    rows, row = np.unique(np.floor(modes.length / length_bin).astype(int), return_inverse=True)
+    spacing = modes.delay[1] - modes.delay[0]
+    column = np.abs(np.rint(modes.delay / spacing).astype(int))
+    cell = (row[:, None] * (column.max() + 1) + column)[known]
+    shape = (rows.size, column.max() + 1)
+    members, sums = (np.bincount(cell, weights, shape[0] * shape[1]) for weights in (None, modes.transfer[known]))
+    return ExpectedBins(
+        k=(limits[1:] + limits[:-1]) / 2,
+        bin_edges=limits,
+        outside=total / filled,
+        outside_error=np.sqrt(square) / filled,
+        length_edges=np.column_stack([rows, rows + 1]) * length_bin,
+        delay=spacing * np.arange(shape[1]),
+        by_length=(sums / np.where(members > 0, members, np.nan)).reshape(shape),
+    )

@@ -1,0 +1,70 @@
+"""One model per group on an array that is nearly redundant: harmless alone, harmful with gains that are not smooth."""
+
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+
+from calstudy.calibrate.calamity import calibrate
+from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.instrument.layouts import make_layout
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.telescope import make_template
+from calstudy.power.delay import delay_transform
+from calstudy.visibilities import antenna_indices, from_cube, to_cube
+
+INSTRUMENT = {
+    "layout": {"kind": "hex", "side": 2, "spacing": "14 m"},
+    "beam": "gaussian",
+    "channels": {"first": "167.075 MHz", "width": "240 kHz", "count": 96},
+    "times": {"integration": "2 s", "count": 1},
+}
+NOISE = 1e-4
+
+
+@pytest.fixture(scope="module")
+def window_rms():
+    """Return the rms of the calibrated residual far outside the wedge, over that of the noise."""
+    instrument = InstrumentSettings.model_validate(INSTRUMENT)
+    template = make_template(instrument)
+    first, second = antenna_indices(template).T
+    frequencies = template.freq_array
+    positions = make_layout(instrument.layout).enu
+    rng = np.random.default_rng(0)
+    directions = rng.uniform(-0.6, 0.6, (200, 2))
+    directions = np.column_stack([directions, np.sqrt(1 - (directions**2).sum(axis=1))])
+    fluxes = rng.pareto(1.5, 200)
+    offsets = 0.015 * rng.standard_normal(positions.shape)
+    rough = 1 + 0.1 * (rng.standard_normal((len(positions), 96)) + 1j * rng.standard_normal((len(positions), 96)))
+    shape = (template.Nbls, 96)
+    noise = NOISE * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
+
+    def measure(displaced: bool, chromatic: bool, calibrator: str) -> float:
+        moved = positions + displaced * offsets
+        lags = (moved[second] - moved[first]) @ directions.T / speed_of_light
+        foregrounds = np.exp(-2j * np.pi * lags[:, None] * frequencies[:, None]) @ fluxes
+        foregrounds /= np.sqrt(np.mean(np.abs(foregrounds) ** 2))
+        gains = rough if chromatic else np.ones_like(rough)
+        measured = gains[first] * gains[second].conj() * (foregrounds + noise)
+        data, sky = (from_cube(template, cube[None, :, :, None]) for cube in (measured, foregrounds))
+        residual = calibrate(data, CalibrationSettings(calibrator=calibrator), sky).residual
+        far = np.abs(np.arange(96) - 48) > 24
+        left, thermal = (
+            delay_transform(cube, frequencies, "blackman-harris")[:, far]
+            for cube in (to_cube(residual)[0, :, :, 0], noise)
+        )
+        return float(np.sqrt(np.mean(np.abs(left) ** 2) / np.mean(np.abs(thermal) ** 2)))
+
+    return measure
+
+
+@pytest.mark.parametrize(("displaced", "chromatic"), [(False, True), (True, False)])
+def test_rough_gains_or_displaced_antennas_alone_leave_noise(window_rms, displaced, chromatic):
+    assert window_rms(displaced, chromatic, "calamity-redundant") < 1.3
+
+
+def test_together_they_carry_the_misfit_of_the_groups_out_of_the_wedge(window_rms):
+    assert window_rms(True, True, "calamity-redundant") > 3
+
+
+def test_one_model_per_baseline_does_not_care(window_rms):
+    assert window_rms(True, True, "calamity") < 1.3

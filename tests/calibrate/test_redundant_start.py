@@ -1,0 +1,74 @@
+"""Redundant calibration as a start: gains up to what redundancy cannot know, and flags without influence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_calamity import SETTINGS, make_uvdata
+from toy import FREQUENCIES, HEX, make_toy, scattered
+
+from calstudy.calibrate.calamity import calibrate
+from calstudy.calibrate.measured import measure
+from calstudy.calibrate.problem import gain_products
+from calstudy.calibrate.settings import RedundantStart
+from calstudy.errors import InputError
+from calstudy.instrument.layouts import redundant_groups
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+
+
+@pytest.fixture(scope="module")
+def hexagon():
+    """A perfect hexagon whose antennas have cables of up to 600 ns, and small errors besides."""
+    toy = make_toy(HEX, noise=1e-4)
+    delays = np.random.default_rng(4).uniform(-300e-9, 300e-9, 7)
+    return replace(toy, gains=toy.gains * np.exp(2j * np.pi * delays[:, None] * (FREQUENCIES - FREQUENCIES[0])))
+
+
+def start_of(toy, delays, change=None):
+    data = make_uvdata(toy, 1)
+    if change is not None:
+        change(data)
+    settings = SETTINGS.model_copy(update={"initial_gains": RedundantStart(kind="redundant", delays=delays)})
+    return data, settings, measure(data, settings).start[..., 0, 0]
+
+
+def test_gains_are_right_up_to_what_redundancy_cannot_know(hexagon):
+    _, _, start = start_of(hexagon, delays=True)
+    ratio = gain_products(start / hexagon.gains, hexagon.antennas)
+    groups = redundant_groups(hexagon.vectors, 0.5)
+    assert groups.index.max() + 1 < len(ratio)
+    ratio = np.where(groups.conjugated[:, None], ratio.conj(), ratio)
+    for group in range(groups.index.max() + 1):
+        members = ratio[groups.index == group]
+        assert np.abs(members / members[0] - 1).max() < 5e-3
+
+
+def test_long_cables_are_within_reach_of_the_fit_from_there_but_not_from_unity(hexagon):
+    data, settings, _ = start_of(hexagon, delays=True)
+    near, far = calibrate(data, settings).solutions[0], calibrate(data, SETTINGS).solutions[0]
+    assert near.status == "converged"
+    assert near.loss_history[0] < 0.1 * far.loss_history[0]
+    assert near.loss_history[-1] < 0.1 * far.loss_history[-1]
+
+
+def test_flagged_samples_have_no_influence(hexagon):
+    def flag(data):
+        data.flag_array[3, 10:14] = True
+        data.flag_array[:, 40] = True
+        data.flag_array[5] = True
+
+    def spoil(data):
+        flag(data)
+        data.data_array[data.flag_array] = 1e6
+
+    clean, dirty = start_of(hexagon, True, flag)[2], start_of(hexagon, True, spoil)[2]
+    assert np.allclose(clean, dirty)
+    assert np.isfinite(clean).all()
+
+
+def test_arrays_without_redundancy_are_refused():
+    with pytest.raises(InputError, match="needs redundant baselines"):
+        start_of(make_toy(scattered(5)), delays=False)
