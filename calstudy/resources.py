@@ -20,6 +20,11 @@ def free_memory() -> int:
     return psutil.virtual_memory().available
 
 
+def resident_memory() -> int:
+    """Return the bytes of memory that this process holds now."""
+    return psutil.Process().memory_info().rss
+
+
 @dataclass
 class Usage:
     """Elapsed seconds, processor seconds and peak resident memory (bytes) of a block of code in this process.

@@ -23,9 +23,11 @@ class Case:
     Attributes
     ----------
     antennas, channels
-        Their numbers; the band is the paper's 30.72 MHz however many channels it has.
+        Their numbers.
     extent
-        Diameter of the array in m.
+        Diameter of the array in m, where it is a random one.
+    first, band
+        Centre of the first channel, and number of channels times their width, Hz; the paper's by default.
     gain_scatter, noise, eor
         Scatter of the gains per channel, noise and EoR over the rms of the foregrounds.
     integration
@@ -37,6 +39,8 @@ class Case:
     antennas: int = 36
     channels: int = 384
     extent: float = 176.0
+    first: float = FIRST_CHANNEL
+    band: float = BAND
     gain_scatter: float = 0.1
     noise: float = 1e-3
     eor: float = 0.0
@@ -46,11 +50,18 @@ class Case:
     @property
     def frequencies(self) -> np.ndarray:
         """Channel centres, Hz, (channels,)."""
-        return FIRST_CHANNEL + BAND / self.channels * np.arange(self.channels)
+        return self.first + self.band / self.channels * np.arange(self.channels)
 
 
 class Simulation:
     """Antennas, sky and gains of a case.
+
+    Parameters
+    ----------
+    case
+        Size, band, noise, seed.
+    positions
+        East, north, up of `case.antennas` antennas in m, (Nants, 3); by default at random within `case.extent`.
 
     Attributes
     ----------
@@ -62,14 +73,10 @@ class Simulation:
         True gains, constant in time, (Nants, Nfreqs).
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, positions: np.ndarray | None = None) -> None:
         self.case = case
         rng = np.random.default_rng(case.seed)
-        radius = case.extent / 2 * np.sqrt(rng.uniform(0, 1, case.antennas))
-        angle = rng.uniform(0, 2 * np.pi, case.antennas)
-        # Two antennas at the rim make the longest baseline what it is said to be.
-        radius[:2], angle[:2] = case.extent / 2, (0.0, np.pi)
-        self.positions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(case.antennas)])
+        self.positions = _disc(case, rng) if positions is None else positions
         self.antennas = np.column_stack(np.triu_indices(case.antennas, 1))
         self._east, self._north, self._flux = _sky(rng)
         shape = (case.antennas, case.channels)
@@ -116,6 +123,15 @@ class Simulation:
             flag_weights(np.zeros(shape, bool)),
             np.ones(self.gains.shape, complex),
         )
+
+
+def _disc(case: Case, rng: np.random.Generator) -> np.ndarray:
+    """Return antennas at random in a flat disc, (Nants, 3), m."""
+    radius = case.extent / 2 * np.sqrt(rng.uniform(0, 1, case.antennas))
+    angle = rng.uniform(0, 2 * np.pi, case.antennas)
+    # Two antennas at the rim make the longest baseline what it is said to be.
+    radius[:2], angle[:2] = case.extent / 2, (0.0, np.pi)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(case.antennas)])
 
 
 def _complex_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

@@ -46,6 +46,18 @@ class PaperStep:
         self._optimizer = tf.keras.optimizers.Adamax(LEARNING_RATE)
         self._optimizer.build(self.variables)
         self.step = tf.function(self._step)
+        self.model_sum = tf.function(self._model_sum)
+
+    @property
+    def basis_bytes(self) -> int:
+        """Size of the padded basis, the paper's A."""
+        return 4 * int(tf.size(self._basis))
+
+    def _model_sum(self) -> tuple[tf.Tensor, ...]:
+        """Work out the sum over the basis alone, sum u A, and its gradient: what the paper says dominates a step."""
+        with tf.GradientTape() as tape:
+            parts = [tf.reduce_sum(u * self._basis, axis=0) for u in self.variables[2:]]
+        return tuple(tape.gradient(parts, self.variables[2:], output_gradients=self._data))
 
     def _step(self) -> tf.Tensor:
         with tf.GradientTape() as tape:

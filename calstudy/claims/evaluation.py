@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from calstudy.claims import calibration, low_snr, redundant, window
+from calstudy.claims import calibration, computation, low_snr, redundant, window
 from calstudy.claims.facts import Role
+from calstudy.claims.run_times import RunTimes
 from calstudy.claims.statement import Claim, Statement
 from calstudy.claims.study import Study, Unevaluated
 
 STATEMENTS: tuple[Statement, ...] = tuple(
     item
-    for module in (calibration, window, redundant, low_snr)
+    for module in (calibration, window, redundant, low_snr, computation)
     for item in vars(module).values()
     if isinstance(item, Statement)
 )
@@ -24,9 +25,9 @@ REDUNDANT_FROM = 0.5
 def roles_of(study: Study) -> tuple[Role, ...]:
     """Return the parts that a run can play, from its gains, its array, its calibrator and its solver."""
     kind = study.corruption.gains.kind
-    if kind == "reflection":
+    if kind == "reflection" and study.calibration.code is None:
         return ("low_snr",)
-    if kind != "per-channel":
+    if kind != "per-channel" or study.calibration.code is not None:
         return ()
     try:
         fraction = study.agreement["redundant_fraction"]
@@ -38,7 +39,7 @@ def roles_of(study: Study) -> tuple[Role, ...]:
     return ("minimally_redundant", "paper_solver") if papers else ("minimally_redundant",)
 
 
-def evaluate(studies: Mapping[Role, Study]) -> list[Claim]:
+def evaluate(studies: Mapping[Role, Study | RunTimes]) -> list[Claim]:
     """Evaluate every statement on the runs that play its roles.
 
     Parameters

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.claims.evaluation import evaluate, roles_of
+from calstudy.claims.run_times import RunTimes
 from calstudy.claims.statement import Claim
 from calstudy.claims.study import Study
 from calstudy.claims.tables import write_claims
@@ -29,7 +30,7 @@ def evaluate_folder(folder: Path) -> EvaluatedRun:
     Parameters
     ----------
     folder
-        Of a run (``experiment.yaml``, ``tables/``) or of a collection, whose members' folders are beside it.
+        Of a run (``experiment.yaml``, ``tables/``), or of a collection, whose members' folders are beside it.
 
     Raises
     ------
@@ -37,7 +38,9 @@ def evaluate_folder(folder: Path) -> EvaluatedRun:
         If it is neither, or cannot be written.
     """
     manifest = _manifest(folder)
-    if "members" in manifest:
+    if manifest.get("kind") == "runtime":
+        studies = {"run_time": RunTimes.of(manifest["name"], _tables(folder))}
+    elif "members" in manifest:
         members = manifest["members"]
         studies = {role: _study(folder.resolve().parent / members[name]) for role, name in manifest["roles"].items()}
     else:
@@ -61,7 +64,11 @@ def _manifest(folder: Path) -> dict[str, Any]:
         ) from None
 
 
-def _study(folder: Path) -> Study:
+def _tables(folder: Path) -> Path:
     if not (folder / "tables").is_dir():
         raise InputError(f"{folder}: has no tables; run the experiment again")
-    return Study.of(read_mapping(folder / "experiment.yaml"), [folder / "tables"])
+    return folder / "tables"
+
+
+def _study(folder: Path) -> Study:
+    return Study.of(read_mapping(folder / "experiment.yaml"), [_tables(folder)])

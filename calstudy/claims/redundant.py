@@ -6,7 +6,7 @@ import numpy as np
 
 from calstudy.claims.bins import bias_extent, fraction_within, ratio, recovered, rms_power, used_bins
 from calstudy.claims.calibration import FACTOR_OF_TWO
-from calstudy.claims.statement import Above, Finding, Source, Within
+from calstudy.claims.statement import Above, Consistent, Finding, Source, Within
 from calstudy.claims.study import Study
 
 REDUNDANT = Source("Performance on a Redundant Array", ("minimally_redundant", "redundant"))
@@ -73,6 +73,18 @@ def redundant_signal_recovered(redundant: Study) -> Finding:
     residual, signal = (redundant.spherical(name, "outside-wedge") for name in ("residual", "eor"))
     used = used_bins(residual, signal, k_min=K_LOSS)
     return fraction_within((residual.power - signal.power).real[used], residual.error[used])
+
+
+@REDUNDANT.states(
+    "in both scenarios, it recovers relatively unbiased estimates of the power spectrum within the EoR window "
+    "(Conclusion)",
+    "mean P^R/P^S of the redundant array outside the wedge at k >= 0.3; error of the difference, the EoR being common",
+    Consistent(1),
+    "no bias beyond the errors",
+    roles=("redundant",),
+)
+def redundant_residual_unbiased(redundant: Study) -> Finding:
+    return recovered(*(redundant.spherical(name, "outside-wedge") for name in ("residual", "eor")), K_LOSS, np.inf)
 
 
 def _extra_loss(minimal: Study, redundant: Study, k_min: float, k_max: float) -> Finding:

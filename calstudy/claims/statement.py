@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
 from calstudy.claims.facts import Role
+from calstudy.claims.run_times import RunTimes
 from calstudy.claims.study import Study, Unevaluated
 
 Verdict = Literal["PASS", "FAIL", "not evaluated"]
@@ -17,6 +18,7 @@ ROLES: dict[Role, str] = {
     "redundant_modelling": "a run of the redundant array with one model per group (calibrator: calamity-redundant)",
     "low_snr": "a run with reflection gains",
     "paper_solver": "a run of the minimally redundant array with the paper's solver (solver: adamax)",
+    "run_time": "a run of experiments/runtime.yaml",
 }
 """The parts that runs play in the paper, and which run can play each."""
 
@@ -145,7 +147,7 @@ class Statement:
     roles: tuple[Role, ...]
     measure: Callable[..., Finding]
 
-    def evaluate(self, studies: Mapping[Role, Study]) -> Claim:
+    def evaluate(self, studies: Mapping[Role, Study | RunTimes]) -> Claim:
         """Measure it, or say why it cannot be."""
         missing = [ROLES[role] for role in self.roles if role not in studies]
         if missing:

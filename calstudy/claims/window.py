@@ -88,6 +88,28 @@ def leakage_far_above_signal(study: Study) -> Finding:
 
 
 @RESULTS.states(
+    "after running CALAMITY, these systematics are effectively removed",
+    "|P^V| in the window over |P^R|; medians",
+    Above(100),
+    "what is effectively removed is lower by two orders of magnitude at least",
+)
+def systematics_removed_from_window(study: Study) -> Finding:
+    return _row_ratio(study, "uncalibrated", ("residual",))
+
+
+@RESULTS.states(
+    "clear positive and negative fluctuations arising from noise",
+    "part of the window in which P^N is negative",
+    Within(0.4, 0.6),
+    "the product of independent noise has no preferred sign",
+)
+def noise_has_both_signs(study: Study) -> Finding:
+    noise = study.wedge("noise")
+    negative = noise.power.real[window(study, noise)] < 0
+    return Finding(float(negative.mean()), float(0.5 / np.sqrt(negative.size)))
+
+
+@RESULTS.states(
     "over most cylindrical modes, these residuals are roughly consistent with the injected EoR signal level",
     "part of the window in which P^R is within 95 % errors (noise + sample) of P^S",
     Above(0.5),

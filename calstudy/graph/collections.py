@@ -32,11 +32,11 @@ class CollectionGraph:
     def _figure(self, name: str) -> Task:
         compared = {role: self.graphs[self.collection.roles[role]] for role in COMPARED}
         notes = list(dict.fromkeys(note for graph in compared.values() for note in graph.footnotes))
-        settings = {"figure": name, "notes": notes}
         if name == "layouts":
-            settings["layouts"] = {role: graph.sections["instrument"]["layout"] for role, graph in compared.items()}
-            return Task("combined-figure", name, settings)
-        return Task("combined-figure", name, settings, {role: graph.spectra for role, graph in compared.items()})
+            layouts = {role: graph.sections["instrument"]["layout"] for role, graph in compared.items()}
+            return Task("combined-figure", name, {"figure": name, "notes": [], "layouts": layouts})
+        inputs = {role: graph.spectra for role, graph in compared.items()}
+        return Task("combined-figure", name, {"figure": name, "notes": notes}, inputs)
 
     @cached_property
     def claims(self) -> Task:

@@ -11,14 +11,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from calstudy.calibrate.memory import Dimensions, solve_memory
+from calstudy.calibrate.settings import BasisSettings, CalibrationSettings
+from calstudy.graph.solve_estimates import FIRST_ORDER_STEP, PAPER_SAMPLES, basis_vectors, memory_of, seconds_of
 from calstudy.graph.tasks import Task
+from calstudy.instrument.settings import Channels
 
 LIBRARIES_MEMORY = 0.8e9
 COMPLEX128, COMPLEX64 = 16, 8
 SOURCES = 546_000
 TIME_NODES, FREQUENCY_NODES = 16, 96
-PAPER_SAMPLES = 630 * 384
-ADAMAX_STEP = 3e-3
+ADAMAX_STEP = FIRST_ORDER_STEP
+# The paper's padded step, per byte of its basis.
+PADDED_SECONDS = 1e-9
+PADDED_COPIES = 7
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,8 @@ def _simulate_chunk(task: Task) -> Cost:
         channels = min(size.channels, FREQUENCY_NODES) if nodes else size.channels
     pieces = min(simulation["chunks"], size.channels)
     seconds = _engine_seconds(simulation["engine"], sources, times * channels / pieces, size.antennas)
+    if simulation["engine"] in ("auto", "dense"):
+        seconds *= 1 + 1.5 * len(_instrument(task).get("antenna_beams", ()))
     disk = size.samples / size.channels * channels / pieces * COMPLEX128
     memory = LIBRARIES_MEMORY + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
     return Cost(6 + seconds, memory, disk)
@@ -118,18 +126,31 @@ def _corrupt(task: Task) -> Cost:
 
 
 def _calibrate_chunk(task: Task) -> Cost:
-    size = _size(_instrument(task))
-    solver = task.settings["calibration"]["solver"]
-    pieces = task.settings["count"]
-    solves = size.times * size.polarizations / pieces
-    if solver["name"] == "gauss-newton":
-        # Cost of the normal matrices, baselines x channels x vectors^2, dominates.
-        seconds = 6 + (1.5 + 0.3 * solves) * (size.baselines * size.channels / PAPER_SAMPLES)
-    else:
-        steps = min(solver["max_steps"], 10_000)
-        seconds = 6 + solves * steps * ADAMAX_STEP * size.baselines * size.channels / PAPER_SAMPLES
-    memory = LIBRARIES_MEMORY + 1.5e9 * (size.antennas / 36) ** 2 * (size.channels / 384)
+    instrument = _instrument(task)
+    size = _size(instrument)
+    calibration, pieces = task.settings["calibration"], task.settings["count"]
+    solves = size.times * size.polarizations / calibration.get("integrations_per_solve", 1) / pieces
+    together = size.baselines * size.channels * calibration.get("integrations_per_solve", 1)
+    seconds = seconds_of(calibration["solver"], solves, together)
+    # Files are read whole, with flags and sample counts; results are made for the piece.
+    files = (COMPLEX64 + COMPLEX128 + 10) * size.samples + 8 * COMPLEX128 * size.samples / pieces
+    memory = memory_of(instrument, calibration, size.antennas) + files
     return Cost(seconds, memory, 2 * size.samples * COMPLEX64 / pieces)
+
+
+def _expected_loss(task: Task) -> Cost:
+    size = _size(_instrument(task))
+    work = size.baselines * size.channels / PAPER_SAMPLES
+    return Cost(6 + 0.8 * task.settings["probes"] * work, LIBRARIES_MEMORY + 1.5e9 * work, 1e6)
+
+
+def _convergence(task: Task) -> Cost:
+    size, solver = _size(_instrument(task)), task.settings["calibration"]["solver"]
+    work = size.baselines * size.channels / PAPER_SAMPLES
+    step = 0.3 if solver["name"] == "gauss-newton" else ADAMAX_STEP
+    steps = min(solver["max_steps"], max(task.settings["steps"]) if step == ADAMAX_STEP else 10)
+    data = 4 * size.samples * COMPLEX64
+    return Cost(20 + 2 * steps * step * work, LIBRARIES_MEMORY + 1.5e9 * work + data, 1e6)
 
 
 def _calibrate(task: Task) -> Cost:
@@ -153,6 +174,31 @@ def _agreement(task: Task) -> Cost:
     return Cost(2 + samples * 1e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
 
 
+def _step_times(task: Task) -> Cost:
+    array, samples = task.settings["array"], task.settings["samples"]
+    channels = Channels.model_validate(array["channels"])
+    basis = BasisSettings.model_validate(array["basis"])
+    antennas = antenna_count(array["layout"])
+    vectors = basis_vectors(task.settings["longest"], channels, basis)
+    baselines = antennas * (antennas - 1) // 2
+    padded = 4 * vectors * baselines * channels.count
+    work = baselines * channels.count / PAPER_SAMPLES
+    solves = samples["solves"] * (0.4 + 1.3 * work)
+    steps = PADDED_SECONDS * padded * samples["steps"] + 50 * ADAMAX_STEP * work * samples["calls"]
+    dimensions = Dimensions(antennas, baselines, baselines, channels.count, vectors, baselines * vectors)
+    memory = solve_memory(dimensions, CalibrationSettings()) + PADDED_COPIES * padded
+    return Cost(30 + steps + solves, memory, 1e5)
+
+
+def _descent(task: Task) -> Cost:
+    array = task.settings["array"]
+    antennas = antenna_count(array["layout"])
+    work = antennas * (antennas - 1) / 2 * array["channels"]["count"] / PAPER_SAMPLES
+    instrument = {**array, "times": {"count": 1}}
+    memory = memory_of(instrument, {"basis": array["basis"]}, antennas)
+    return Cost(20 + ADAMAX_STEP * work * task.settings["max_steps"], memory, 1e6)
+
+
 ESTIMATES: Mapping[str, Callable[[Task], Cost]] = {
     "simulate-chunk": _simulate_chunk,
     "simulate": _simulate,
@@ -167,12 +213,22 @@ ESTIMATES: Mapping[str, Callable[[Task], Cost]] = {
     "difference": lambda task: Cost(1, disk=_size(_instrument(task)).baselines * 1e4),
     "transfer": lambda task: Cost(4, disk=1e6),
     "transfer-figure": lambda task: Cost(3, disk=1e6),
+    "expected-loss": _expected_loss,
+    "expected-loss-figure": lambda task: Cost(3, disk=1e6),
+    "convergence": _convergence,
+    "convergence-figure": lambda task: Cost(3, disk=1e6),
     "sweep": lambda task: Cost(3, disk=1e6),
     "agreement": _agreement,
     "claims": lambda task: Cost(1, disk=1e5),
     "combined-claims": lambda task: Cost(1, disk=1e5),
+    "step-times": _step_times,
+    "descent": _descent,
+    "runtime": lambda task: Cost(1, disk=1e5),
+    "runtime-figure": lambda task: Cost(2, disk=1e6),
+    "runtime-claims": lambda task: Cost(1, disk=1e5),
     "figure": lambda task: Cost(3, disk=1e6),
     "combined-figure": lambda task: Cost(3, disk=1e6),
+    "validate": lambda task: Cost(60, 3e9, 1e6),
 }
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+from calstudy.calibrate.settings import MODELS_AT_ONCE
 from calstudy.experiment.model import Component, Experiment, Variant
 from calstudy.running.store import digest_file, digest_json
 from calstudy.simulate.settings import SimulationSettings
@@ -15,6 +16,7 @@ from calstudy.simulate.settings import SimulationSettings
 PARITIES = ("even", "odd")
 # Inputs of the spectra besides the variants, whose names cannot hold a colon.
 EOR_REFERENCE, NOISE_REFERENCE = "reference:eor", "reference:noise"
+BEAMS = ("beam", "antenna_beams")
 DEFAULT_CHUNKS = SimulationSettings().chunks
 
 
@@ -108,6 +110,10 @@ class Graph:
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
         self._sections = experiment.model_dump(mode="json")
+        if experiment.calibration.code is None:
+            # A field that came later: products made before it are still the same.
+            del self._sections["calibration"]["code"]
+        self._models_at_once = self._sections["calibration"].pop("models_at_once")
 
     @property
     def sections(self) -> Mapping[str, Any]:
@@ -119,8 +125,8 @@ class Graph:
 
     @property
     def _frame(self) -> dict[str, Any]:
-        """The instrument without its beam: antennas, channels, times and polarizations."""
-        return {key: value for key, value in self._sections["instrument"].items() if key != "beam"}
+        """The instrument without its beams: antennas, channels, times and polarizations."""
+        return {key: value for key, value in self._sections["instrument"].items() if key not in BEAMS}
 
     @cached_property
     def foregrounds(self) -> Task | None:
@@ -201,17 +207,22 @@ class Graph:
         inputs = {"data": data}
         if self.foregrounds is not None:
             inputs["sky_model"] = self.foregrounds
+        label = f"{data.label} {{}}/{count}"
         chunks = {
-            f"chunk{index:03d}": Task(
-                "calibrate-chunk",
-                f"{data.label} {index + 1}/{count}",
-                {**settings, "index": index, "count": count},
-                inputs,
-                temporary=True,
+            f"chunk{index:03d}": self._calibration_chunk(
+                label.format(index + 1), {**settings, "index": index, "count": count}, inputs
             )
             for index in range(count)
         }
         return Task("calibrate", data.label, {}, chunks)
+
+    def _calibration_chunk(self, label: str, settings: Mapping[str, Any], inputs: Mapping[str, Task]) -> Task:
+        """Return the calibration of some integrations, under the key that it has however little is held at a time."""
+        usual = Task("calibrate-chunk", label, settings, inputs, temporary=True)
+        if self._models_at_once == MODELS_AT_ONCE:
+            return usual
+        calibration = {**settings["calibration"], "models_at_once": self._models_at_once}
+        return replace(usual, settings={**settings, "calibration": calibration}, equivalent=usual)
 
     def average(self, variant: Variant, parity: str) -> Task:
         """Return one realization of a variant, fringe-stopped and averaged over the run."""
@@ -268,11 +279,17 @@ class Graph:
     @cached_property
     def figures(self) -> list[Task]:
         """The figures asked for."""
+        from calstudy.graph.convergence import convergence_figure
         from calstudy.graph.figures import figure_task
-        from calstudy.graph.transfers import transfer_figure
+        from calstudy.graph.transfers import expected_loss_figure, transfer_figure
 
+        own = {
+            "signal-loss": transfer_figure,
+            "expected-loss": expected_loss_figure,
+            "convergence": convergence_figure,
+        }
         names = self.experiment.outputs.figures
-        return [transfer_figure(self) if name == "signal-loss" else figure_task(self, name) for name in names]
+        return [own[name](self) if name in own else figure_task(self, name) for name in names]
 
     @cached_property
     def transfer(self) -> Task | None:

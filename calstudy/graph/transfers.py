@@ -5,6 +5,11 @@ from __future__ import annotations
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.graph.tasks import PARITIES, Graph, Task
 
+# Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
+# further within a bin.
+PROBES = 16
+EXPECTED_POWER = ("taper", "cosmology", "bins", "wedge_buffer", "length_bin")
+
 
 def transfer_task(graph: Graph) -> Task:
     """Return the task that measures T of an experiment that `measures_signal_loss`."""
@@ -32,3 +37,22 @@ def transfer_figure(graph: Graph) -> Task:
     """Return the task that draws T of an experiment that `measures_signal_loss`."""
     settings = {"notes": list(graph.footnotes), "wedge_buffer": graph.experiment.power.wedge_buffer}
     return Task("transfer-figure", "signal-loss", settings, {"transfer": transfer_task(graph)})
+
+
+def expected_loss_figure(graph: Graph) -> Task:
+    """Return the task that draws what the fit of the middle integration is expected to leave, against injection."""
+    residual, power = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]], graph.sections["power"]
+    inputs = {"data": graph.data(residual, "even"), "calibration": graph.calibration(residual, "even")}
+    if graph.foregrounds is not None:
+        inputs["sky_model"] = graph.foregrounds
+    settings = {
+        "calibration": graph.sections["calibration"],
+        "power": {name: power[name] for name in power if name in EXPECTED_POWER},
+        "integration": graph.experiment.instrument.times.count // 2,
+        "probes": PROBES,
+    }
+    expected = Task("expected-loss", "expected signal loss", settings, inputs)
+    shown = {"notes": list(graph.footnotes), "wedge_buffer": graph.experiment.power.wedge_buffer}
+    return Task(
+        "expected-loss-figure", "expected-loss", shown, {"expected": expected, "transfer": transfer_task(graph)}
+    )

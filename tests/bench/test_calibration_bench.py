@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tensorflow as tf
 
-from calstudy.bench.calibration import measure, use_device
+from calstudy.bench.calibration import adamax_step, clock_of, measure, use_device
 from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.bench.paper_step import PaperStep
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
@@ -47,6 +48,23 @@ def test_the_table_has_every_ratio():
     assert rows["that over the default solver, cold"].value.startswith("at least")
     assert rows["2 integrations"].note.endswith("converged")
     assert rows["default solver, cold"].value.endswith("CPU s")
+
+
+def test_steps_run_in_the_context_of_a_gpu(monkeypatch):
+    """There is no GPU here: with soft placement TensorFlow puts on the processor what the code asks a GPU for."""
+    monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: [kind])
+    placement = tf.config.get_soft_device_placement()
+    tf.config.set_soft_device_placement(True)
+    try:
+        with use_device("gpu"):
+            simulation = Simulation(SMALL)
+            problem = simulation.problem(0, simulation.structure())
+            step = PaperStep(problem).step
+            first = float(step())
+            assert float(step()) < first
+            assert adamax_step(problem, clock_of("gpu")) > 0
+    finally:
+        tf.config.set_soft_device_placement(placement)
 
 
 def test_a_missing_device_is_a_sentence(monkeypatch):

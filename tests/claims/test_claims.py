@@ -68,8 +68,11 @@ def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(ma
             },
         ),
         ({"recovered": 0.97}, {"residual-unbiased-outside-wedge"}),
-        ({"leakage": 0.0}, {"leakage-fills-window", "leakage-far-above-signal"}),
-        ({"leakage": 30.0}, {"leakage-far-above-signal"}),
+        (
+            {"leakage": 0.0},
+            {"leakage-fills-window", "leakage-far-above-signal", "systematics-removed-from-window"},
+        ),
+        ({"leakage": 30.0}, {"leakage-far-above-signal", "systematics-removed-from-window"}),
         ({"window_leak": 50.0}, {"foregrounds-contained"}),
         ({"foregrounds": 1e5, "sidelobes": 10.0}, {"residual-without-eor-90-db-below-foregrounds"}),
         ({"sidelobes": 0.0}, {"residual-beats-taper-outside-wedge"}),
@@ -130,8 +133,10 @@ def compare(make_study, **redundant):
 
 def test_claims_on_the_redundant_array_hold_in_the_papers_world(make_study):
     claims = compare(make_study, recovered=0.96)
-    assert failing(claims) == set(), [claim for claim in claims if claim.verdict == "FAIL"]
-    assert all(claim.verdict == "PASS" for claim in claims)
+    # More loss on all scales, and no bias: with errors this small only one of the two can be.
+    contradicted = {"redundant-residual-unbiased"}
+    assert failing(claims) == contradicted, [claim for claim in claims if claim.verdict == "FAIL"]
+    assert all(claim.verdict == "PASS" for claim in claims if claim.name not in contradicted)
 
 
 @pytest.mark.parametrize(
@@ -140,6 +145,7 @@ def test_claims_on_the_redundant_array_hold_in_the_papers_world(make_study):
         ({"leakage": 1e6}, {"uncalibrated-systematics-suppressed"}),
         ({"recovered": 0.3}, {"redundant-signal-recovered", "redundant-modelling-same-power"}),
         ({"recovered": 1.0}, {"more-loss-on-all-scales"}),
+        ({"recovered": 0.96}, {"redundant-residual-unbiased"}),
         ({"recovered_small_k": 1.0, "recovered": 1.0}, {"more-loss-at-small-k", "bias-reaches-larger-k"}),
         ({"agreement": {"residual_over_noise_outside": 3.0}}, {"redundant-modelling-same-visibilities"}),
     ],

@@ -1,0 +1,64 @@
+"""Run times as the claims see them: the table that a run-time study leaves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calstudy.bench.scaling import PowerLaw, fit_power_law
+from calstudy.claims.study import Unevaluated
+
+RUNTIME = "runtime.json"
+
+
+@dataclass(frozen=True)
+class RunTimes:
+    """One run-time study.
+
+    Attributes
+    ----------
+    name
+        Of the run.
+    table
+        What `calstudy.stages.runtime` wrote: ``cases``, one per array and device, and ``descent``.
+    """
+
+    name: str
+    table: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, name: str, folder: Path) -> RunTimes:
+        """Read the table of a run."""
+        return cls(name, json.loads((folder / RUNTIME).read_text(encoding="utf-8")))
+
+    def cases(self, panel: str, device: str = "cpu") -> list[Mapping[str, Any]]:
+        """Return the arrays of one panel, the smallest first; raises Unevaluated if that device was not timed."""
+        found = [case for case in self.table["cases"] if (case["panel"], case["device"]) == (panel, device)]
+        if not found:
+            raise Unevaluated(f"needs run times on a {device}; run it with --scale {device} where there is one")
+        return sorted(found, key=lambda case: case["size"])
+
+    def medians(self, panel: str, kind: str, device: str = "cpu") -> np.ndarray:
+        """Return median seconds of each array, (Nsizes,)."""
+        return np.array([case["seconds"][kind]["median"] for case in self.cases(panel, device)])
+
+    def column(self, panel: str, name: str, device: str = "cpu") -> np.ndarray:
+        """Return a property of each array, (Nsizes,)."""
+        return np.array([case[name] for case in self.cases(panel, device)], float)
+
+    def scaling(self, panel: str, kind: str, against: str = "size", device: str = "cpu") -> PowerLaw:
+        """Fit the medians as a power of a property of the arrays."""
+        return fit_power_law(self.column(panel, against, device), self.medians(panel, kind, device))
+
+    def steps_to(self, excess: str) -> float:
+        """Return how many steps the paper's solver took to come within a fraction of the minimum."""
+        descent = self.table["descent"]
+        steps = descent["steps_to"][excess]
+        if steps is None:
+            raise Unevaluated(f"not within {100 * float(excess):g} % of the minimum after {descent['max_steps']} steps")
+        return float(steps)
