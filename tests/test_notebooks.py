@@ -11,6 +11,7 @@ NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 EXPERIMENTS = NOTEBOOKS.parent / "experiments"
 REDUCED = {
     "first-study": ["instrument.times.count=3", "sky.foregrounds.count=500", "sky.eor.nside=16"],
+    "own-calibrator": ["instrument.times.count=2", "sky.eor.nside=16", "outputs.figures=[]"],
     "signal-loss": [
         "instrument.times.count=2",
         "sky.foregrounds.count=300",

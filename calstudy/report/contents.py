@@ -17,14 +17,21 @@ FIRST_FIGURES = ("sweep", "layout", "wedge", "spherical", "signal-loss", "gains"
 CAPTIONS = {
     "sweep": "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars.",
     "layout": "The array.",
+    "layouts": "The two arrays.",
     "gains": "Gains of two antennas: true, recovered, and their ratio.",
     "model": "Foregrounds of one baseline: true and fitted.",
     "data": "Data of one baseline, fitted gains times model, and what is left.",
     "baselines": "RMS over time of delay-transformed visibilities of several baselines.",
     "wedge": "Cylindrical power spectra; negative values in blue.",
     "spherical": "Spherical power spectra with 95 % bars; open where negative.",
+    "convergence": "What solvers leave of the foregrounds in even and odd alike, against their steps, over the EoR.",
+    "spherical-excised": "Spherical power spectra outside the wedge with 95 % bars; open where negative.",
+    "spherical-comparison": "Spherical power spectra outside the wedge, of both arrays; below, enlarged.",
     "signal-loss": "What the calibration leaves of the EoR: T = P^R / P^S, per k and per baseline length and delay.",
+    "expected-loss": "Signal loss expected from the fit alone, against what injection measures.",
     "reflections": "Delay transform of the true gains.",
+    "runtime-rows": "Run time against the number of antennas, rows of eight: medians, central 95 %, fitted powers.",
+    "runtime-line": "Run time against the longest baseline of a line: medians, central 95 %, fitted powers.",
 }
 REGIONS = {"outside-wedge": "outside the wedge", "inside-wedge": "inside the wedge"}
 

@@ -1,0 +1,111 @@
+"""What a regression found, as a table for the terminal and as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from calstudy.errors import InputError
+from calstudy.regression.comparison import ArrayComparison, ClaimComparison
+
+REGRESSION_JSON = "regression.json"
+COLOURS = {"same": "green", "moved": "yellow", "beyond": "bold red"}
+LISTED = 20
+"""Arrays that moved within their tolerance are listed up to this number, the farthest first; all are in the JSON."""
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A run against a reference: names of both folders, and all comparisons."""
+
+    reference: str
+    run: str
+    arrays: list[ArrayComparison]
+    claims: list[ClaimComparison]
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing is beyond its tolerance."""
+        return all(item.status != "beyond" for item in (*self.arrays, *self.claims))
+
+
+def tally(items: Sequence[ArrayComparison] | Sequence[ClaimComparison]) -> str:
+    """Count the statuses in one line."""
+    statuses = [item.status for item in items]
+    return ", ".join(f"{statuses.count(status)} {status}" for status in COLOURS)
+
+
+def write_json(regression: Regression, folder: Path) -> Path:
+    """Write everything into ``regression.json`` in a folder; raises InputError if it cannot."""
+    path = folder / REGRESSION_JSON
+    text = json.dumps({**asdict(regression), "holds": regression.holds}, indent=1, ensure_ascii=False)
+    try:
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return path
+
+
+def show(regression: Regression, console: Console) -> None:
+    """Print the count per figure, what moved and by how much, and the claims that moved."""
+    console.print(f"{regression.reference} against {regression.run}", markup=False, highlight=False)
+    for figure in dict.fromkeys(item.figure for item in regression.arrays):
+        console.print(
+            f"  {figure}: {tally([item for item in regression.arrays if item.figure == figure])}", markup=False
+        )
+    console.print(f"  claims: {tally(regression.claims) if regression.claims else 'none in the reference'}")
+    arrays = list(_listed(regression.arrays))
+    if arrays:
+        console.print(_array_table(arrays))
+        hidden = sum(item.status != "same" for item in regression.arrays) - len(arrays)
+        for item in arrays:
+            if item.status == "beyond":
+                allowed = item.told or f"allowed: {item.tolerance} ({item.why})"
+                console.print(f"{item.figure}: {item.name}: {allowed}", markup=False)
+        if hidden:
+            console.print(f"... and {hidden} more that moved within their tolerance")
+    claims = [item for item in regression.claims if item.status != "same"]
+    if claims:
+        console.print(_claim_table(claims))
+    verdict = "holds" if regression.holds else "DOES NOT HOLD: what is 'beyond' is farther than its tolerance"
+    console.print(f"{regression.reference}: {verdict}", markup=False, highlight=False)
+
+
+def _listed(items: Sequence[ArrayComparison]) -> Iterator[ArrayComparison]:
+    yield from (item for item in items if item.status == "beyond")
+    moved = [item for item in items if item.status == "moved"]
+    yield from sorted(moved, key=lambda item: -(item.rms or item.relative or 0))[:LISTED]
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.2g}"
+
+
+def _array_table(items: Sequence[ArrayComparison]) -> Table:
+    table = Table(title="what moved", title_justify="left")
+    table.add_column("array", overflow="fold")
+    for heading in ("", "of largest", "largest σ", "rms σ", "mean σ"):
+        table.add_column(heading, no_wrap=True)
+    for item in items:
+        deviations = (_number(value) for value in (item.relative, item.largest, item.rms, item.shift))
+        status = f"[{COLOURS[item.status]}]{item.status}[/]"
+        table.add_row(f"{item.figure}: {escape(item.name)}", status, *deviations)
+    return table
+
+
+def _claim_table(items: Sequence[ClaimComparison]) -> Table:
+    table = Table(title="claims that moved", title_justify="left")
+    table.add_column("claim", overflow="fold")
+    for heading in ("", "was", "is", "σ"):
+        table.add_column(heading)
+    for item in items:
+        was = f"{_number(item.reference)} {item.reference_verdict}".strip()
+        now = f"{_number(item.measured)} {item.verdict}".strip()
+        table.add_row(item.name, f"[{COLOURS[item.status]}]{item.status}[/]", was, now, _number(item.sigmas))
+    return table

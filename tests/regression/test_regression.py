@@ -1,0 +1,208 @@
+"""Regression: a study against itself, another draw of the noise, another beam, other units, and what is kept."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from tiny import tiny
+from typer.testing import CliRunner
+
+from calstudy.claims.statement import Claim
+from calstudy.cli import app
+from calstudy.errors import InputError
+from calstudy.experiment.collection import load_study
+from calstudy.experiment.files import load, override
+from calstudy.regression.comparison import compare_array, compare_claims, compare_figures
+from calstudy.regression.reference import accept, find_references, read_reference, read_run
+from calstudy.regression.remake import remake
+from calstudy.regression.tables import Regression, show
+from calstudy.running.runs import run
+
+QUIET = Console(quiet=True)
+FIGURES = ["layout", "gains", "data", "wedge", "spherical"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("regression")
+
+
+@pytest.fixture(scope="module")
+def places(folder) -> list[str]:
+    return [f"outputs.store={folder / 'store'}", f"outputs.runs={folder / 'runs'}"]
+
+
+@pytest.fixture(scope="module")
+def finished(folder) -> Path:
+    """The folder of a finished run of the tiny experiment."""
+    path = folder / "tiny.yaml"
+    path.write_text(yaml.safe_dump(override(tiny(folder), "outputs.figures", FIGURES)))
+    return run(load(path)).folder
+
+
+@pytest.fixture(scope="module")
+def reference(folder, finished) -> Path:
+    accept(finished, folder / "references" / "tiny")
+    return folder / "references" / "tiny"
+
+
+def statuses(reference: Path, made: Path) -> dict[str, str]:
+    """Return the status of every array, by figure and name."""
+    found = compare_figures(read_reference(reference).figures, read_run(made).figures)
+    return {f"{item.figure}: {item.name}": item.status for item in found}
+
+
+def test_a_reference_is_small_and_names_no_place_of_the_machine(reference, finished, folder):
+    names = {path.name for path in reference.iterdir()}
+    kept = {f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "npz")}
+    assert names == kept | {"claims.json", "claims.md", "manifest.json", "experiment.yaml"}
+    assert str(folder) not in (reference / "experiment.yaml").read_text()
+    assert load(reference / "experiment.yaml").instrument == load(finished / "experiment.yaml").instrument
+
+
+def test_made_again_from_the_store_nothing_moves(reference, finished, places):
+    assert remake(reference, places, 1, None, None, QUIET) == finished
+    assert set(statuses(reference, finished).values()) == {"same"}
+    claims = compare_claims(read_reference(reference).claims, read_run(finished).claims)
+    assert {item.status for item in claims} == {"same"}
+
+
+def test_another_draw_of_the_noise_moves_what_is_drawn_by_its_error_bars(reference, places):
+    again = remake(reference, [*places, "corruption.noise.seeds=[13,14]"], 1, None, None, QUIET)
+    found = compare_figures(read_reference(reference).figures, read_run(again).figures)
+    assert not [item for item in found if item.status == "beyond"]
+    moved = {f"{item.figure}: {item.name}": item for item in found if item.status == "moved"}
+    for name in ("spherical: all_modes.noise.power", "wedge: noise.power", "data: noise.values"):
+        assert 0.4 < moved[name].rms < 1.6, name
+    # What the noise does not enter is the same.
+    same = {f"{item.figure}: {item.name}" for item in found if item.status == "same"}
+    assert {"gains: true.values", "wedge: eor.power", "layout: enu"} <= same
+
+
+def test_another_beam_is_caught(reference, places):
+    changed = [*places, "instrument.beam={kind: airy, diameter: 10 m}"]
+    found = statuses(reference, remake(reference, changed, 1, None, None, QUIET))
+    for name in ("data: reference.values", "spherical: all_modes.uncalibrated.power", "wedge: uncorrupted.power"):
+        assert found[name] == "beyond", name
+    assert found["gains: true.values"] == "same"
+
+
+@pytest.mark.parametrize(
+    ("figure", "name"),
+    [("spherical", "all_modes.uncorrupted.power"), ("wedge", "uncalibrated.power"), ("data", "reference.values")],
+)
+def test_other_units_are_caught(reference, figure, name):
+    arrays = read_reference(reference).figures[figure]
+    little_h = 0.6774**3
+    assert compare_array(figure, name, arrays, arrays[name]).status == "same"
+    assert compare_array(figure, name, arrays, arrays[name] / little_h).status == "beyond"
+
+
+def test_a_small_loss_at_all_scales_shows_in_the_mean():
+    """A tenth less power in each of 400 bins of 10 % error is within every error bar, and 14 standard errors in all."""
+    rng = np.random.default_rng(1)
+    power = 1 + 0.1 * rng.standard_normal(400) + 0j
+    series = {"power": power, "noise_error": np.full(400, 0.0), "sample_error": np.full(400, 0.1)}
+    arrays = {f"excised.residual.{key}": value for key, value in {**series, "noise_modes": np.ones(400)}.items()}
+    redrawn = compare_array("spherical", "excised.residual.power", arrays, 1 + 0.1 * rng.standard_normal(400) + 0j)
+    assert redrawn.status == "moved"
+    assert redrawn.rms == pytest.approx(1, abs=0.15)
+    lost = compare_array("spherical", "excised.residual.power", arrays, 0.9 * power)
+    assert lost.largest < 2
+    assert lost.shift == pytest.approx(-0.1 * 20 / (np.sqrt(2) * 0.1), rel=0.02)
+    assert lost.status == "beyond"
+
+
+def test_what_is_missing_new_or_of_another_shape_is_told():
+    reference = {"data": {"a": np.zeros(3), "b": np.zeros(3)}, "wedge": {"c": np.array("title")}}
+    made = {"data": {"a": np.zeros(4), "new": np.zeros(2)}, "wedge": {"c": np.array("heading")}}
+    found = {item.name: (item.status, item.told) for item in compare_figures(reference, made)}
+    assert found["a"] == ("beyond", "shape (4,), was (3,)")
+    assert found["b"] == ("beyond", "missing")
+    assert found["new"][0] == "moved"
+    assert found["c"] == ("beyond", "different")
+    nan = compare_array("layout", "enu", {"enu": np.array([1.0, np.nan])}, np.array([np.nan, 1.0]))
+    assert (nan.status, nan.told) == ("beyond", "finite in other places")
+
+
+def test_times_of_a_machine_are_told_and_never_too_far():
+    found = compare_array("runtime-rows", "seconds", {"seconds": np.ones(3)}, 7 * np.ones(3))
+    assert (found.status, found.relative) == ("moved", 6)
+    other_device = compare_figures({"runtime-rows": {"gpu": np.ones(3)}}, {"runtime-rows": {"cpu": np.ones(2)}})
+    assert {item.status for item in other_device} == {"moved"}
+
+
+@pytest.mark.parametrize(
+    ("uncertainty", "measured", "verdict", "status"),
+    [
+        (0.1, 1.0, "PASS", "same"),
+        (0.1, 1.2, "PASS", "moved"),
+        (0.1, 1.2, "FAIL", "moved"),
+        (0.1, 1.4, "FAIL", "beyond"),
+        (0.0, 1.1, "FAIL", "beyond"),
+        (0.1, None, "not evaluated", "beyond"),
+    ],
+)
+def test_a_verdict_may_change_with_a_number_that_moved_within_its_error(uncertainty, measured, verdict, status):
+    texts = {"section": "", "sentence": "", "quantity": "", "threshold": "", "why": "", "reason": "", "runs": ()}
+    old = Claim(name="claim", measured=1.0, uncertainty=uncertainty, verdict="PASS", **texts)
+    new = dataclasses.replace(old, measured=measured, verdict=verdict)
+    assert [item.status for item in compare_claims([old], [new])] == [status]
+    assert [item.status for item in compare_claims([old], [])] == ["beyond"]
+    assert [item.status for item in compare_claims([], [new])] == ["moved"]
+
+
+def test_the_command_answers_with_its_exit_status_and_overwrites_only_if_told(tmp_path, finished):
+    command, kept = CliRunner(), tmp_path / "kept"
+    new = command.invoke(app, ["regress", str(kept), "--against", str(finished), "--update"])
+    assert (new.exit_code, new.output.splitlines()[-1]) == (0, f"{kept}: new reference")
+    arrays = dict(np.load(kept / "gains.npz"))
+    np.savez(kept / "gains.npz", **{**arrays, "true.values": 2 * arrays["true.values"]})
+    before = (kept / "gains.npz").read_bytes()
+    moved = command.invoke(app, ["regress", str(kept), "--against", str(finished)])
+    assert moved.exit_code == 1
+    assert "true.values" in moved.output
+    assert (kept / "gains.npz").read_bytes() == before
+    told = json.loads((finished / "regression.json").read_text())
+    assert not told["holds"]
+    assert [item["name"] for item in told["arrays"] if item["status"] == "beyond"] == ["true.values"]
+    updated = command.invoke(app, ["regress", str(kept), "--against", str(finished), "--update"])
+    assert updated.exit_code == 0
+    assert command.invoke(app, ["regress", str(kept), "--against", str(finished)]).exit_code == 0
+
+
+def test_folders_that_hold_nothing_are_told(tmp_path, reference):
+    assert find_references([reference.parent]) == [reference]
+    with pytest.raises(InputError, match="holds no reference results"):
+        find_references([tmp_path])
+    with pytest.raises(InputError, match="is not the folder of a finished run"):
+        read_run(tmp_path)
+
+
+def test_the_table_lists_what_is_beyond_first():
+    arrays = {"true.values": np.ones(4), "recovered.values": np.ones((1, 4)), "residual.values": np.full((1, 4), 0.1)}
+    made = {**arrays, "true.values": np.full(4, 1.1), "recovered.values": np.full((1, 4), 1.05)}
+    text = io.StringIO()
+    found = compare_figures({"gains": arrays}, {"gains": made})
+    show(Regression("here", "there", found, []), Console(file=text, width=140))
+    lines = [line for line in text.getvalue().splitlines() if "gains: " in line and "│" in line]
+    assert ["true.values" in line and "beyond" in line for line in lines] == [True, False]
+    assert "DOES NOT HOLD" in text.getvalue()
+
+
+@pytest.mark.parametrize("name", ["minredundant", "redundant", "redundant-modelling", "lowsnr", "paper"])
+def test_the_published_references_can_be_read_and_made_again(name):
+    kept = Path(__file__).parents[2] / "figures" / name
+    if not kept.exists():
+        pytest.skip("not published yet")
+    results = read_reference(kept)
+    assert results.figures
+    assert results.claims
+    study = load_study(kept / "experiment.yaml")
+    assert study.name == name
+    assert {item.status for item in compare_figures(results.figures, results.figures)} == {"same"}
