@@ -1,4 +1,4 @@
-"""The command line: ``calstudy run | plan | calibrate | claims | report | data``.
+"""The command line: ``calstudy run | plan | calibrate | claims | report | regress | validate | data``.
 
 Only light modules are imported here, so that ``calstudy --help`` answers at once.
 """
@@ -17,6 +17,8 @@ from calstudy import __version__
 from calstudy.commands.bench import bench_app
 from calstudy.commands.calibrate import calibrate
 from calstudy.commands.check import check_app
+from calstudy.commands.regress import regress
+from calstudy.commands.validate import validate
 from calstudy.errors import ExperimentError, InputError
 from calstudy.running import ranks
 
@@ -27,9 +29,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-data_app = typer.Typer(help="Catalogues that are downloaded once.", no_args_is_help=True)
+data_app = typer.Typer(help="Files that are downloaded once.", no_args_is_help=True)
 app.add_typer(data_app, name="data")
 app.command()(calibrate)
+app.command()(regress)
+# Step -1 is an argument, not an option.
+app.command(context_settings={"ignore_unknown_options": True})(validate)
 app.add_typer(bench_app, name="bench")
 app.add_typer(check_app, name="check")
 
@@ -132,15 +137,16 @@ def fields() -> None:
 
 @data_app.command()
 def fetch(
-    name: Annotated[str, typer.Argument(help="What to fetch: gleam.")],
+    name: Annotated[str, typer.Argument(help="What to fetch: gleam or beam.")],
     directory: Annotated[Path | None, typer.Option(help="Where to put it; by default the user's data folder.")] = None,
 ) -> None:
-    """Download a catalogue, check it, and keep it for later runs."""
+    """Download the GLEAM catalogue or the MWA's beam, check it, and keep it for later runs."""
+    if name not in ("gleam", "beam"):
+        raise InputError(f"calstudy data fetch {name}: nothing that can be fetched (allowed: gleam, beam)")
+    from calstudy.instrument.beam_file import fetch_beam
     from calstudy.sky.gleam import fetch_gleam
 
-    if name != "gleam":
-        raise InputError(f"calstudy data fetch {name}: not a catalogue that can be fetched (allowed: gleam)")
-    path = fetch_gleam(directory)
+    path = fetch_gleam(directory) if name == "gleam" else fetch_beam(directory)
     typer.echo(f"{path}")
 
 

@@ -11,12 +11,20 @@ def _sky(experiment: Experiment) -> str | None:
     foregrounds = experiment.sky.foregrounds
     if foregrounds.kind == "g4jy-and-counts":
         return "sky: G4Jy bright sources + synthetic faint ones from counts, not GLEAM"
-    if foregrounds.kind == "file":
+    if foregrounds.kind in ("file", "code"):
         return f"sky: {foregrounds.path.name}, not GLEAM"
     return None
 
 
 def _beam(experiment: Experiment) -> str | None:
+    others = sum(len(group.antennas) for group in experiment.instrument.antenna_beams.values())
+    own = _own_beam(experiment)
+    if not others:
+        return own
+    return f"{own or 'beam: the MWA embedded element'}; antennas with another: {others}"
+
+
+def _own_beam(experiment: Experiment) -> str | None:
     beam = experiment.instrument.beam
     if beam.kind != "mwa-embedded-element":
         return f"beam: {beam.kind}, not the MWA embedded element"

@@ -55,7 +55,7 @@ def test_all_faults_of_a_file_are_told_on_standard_error(tmp_path):
         (["run", "tiny.yaml", "--set", "outputs.runs=/proc/no"], "outputs.runs = '/proc/no': cannot be written"),
         (["run", "tiny.yaml", "--scheduler", "tcp://127.0.0.1:1"], "tcp://127.0.0.1:1: cannot connect"),
         (["run", "tiny.yaml", "--set", "instrument.layout.spacing=250 m"], "the longest baseline has 500 m"),
-        (["data", "fetch", "gleem"], "not a catalogue that can be fetched (allowed: gleam)"),
+        (["data", "fetch", "gleem"], "nothing that can be fetched (allowed: gleam, beam)"),
     ],
 )
 def test_a_mistake_is_one_clear_sentence(tmp_path, arguments, told):

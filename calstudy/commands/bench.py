@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
+
+from calstudy.errors import InputError
 
 bench_app = typer.Typer(help="Measure what the parts cost on this machine.", no_args_is_help=True)
 
@@ -81,3 +84,47 @@ def calibrate(
     show("calibrator", HEADINGS, table, Console(highlight=False))
     if output is not None:
         write(output, HEADINGS, table)
+
+
+@bench_app.command()
+def memory(
+    antennas: Annotated[str, typer.Option(help="Sizes, separated by commas.")] = "36,128",
+    channels: Annotated[int, typer.Option(min=64)] = 384,
+    max_memory: Annotated[str, typer.Option(metavar="SIZE", help="What one solve may take.")] = "16 GB",
+    max_steps: Annotated[int, typer.Option(min=1, help="Steps of the default solver at most.")] = 100,
+    output: Output = None,
+) -> None:
+    """Solve one integration of growing arrays, each in a process of its own: planned and measured memory, time."""
+    from calstudy.bench.solve_size import HEADINGS, measure_solve
+    from calstudy.bench.tables import require_writable, show, write
+    from calstudy.running.capacity import parse_memory
+
+    if output is not None:
+        require_writable(output)
+    budget, sizes = parse_memory(max_memory), _sizes(antennas)
+    console, rows = Console(highlight=False), []
+    with console.status("") as status:
+        for size in sizes:
+            status.update(f"{size} antennas")
+            found = measure_solve(size, channels, budget, max_steps)
+            rows.append(
+                (
+                    f"{found.antennas}",
+                    f"{found.baselines}",
+                    f"{found.models_at_once}",
+                    f"{found.planned / 1e9:.1f} GB",
+                    f"{found.measured / 1e9:.1f} GB",
+                    f"{found.cpu_seconds:.0f}",
+                    f"{found.n_steps}, {found.status}",
+                )
+            )
+    show(f"one cold solve, {channels} channels, one core", HEADINGS, rows, console)
+    if output is not None:
+        write(output, HEADINGS, rows)
+
+
+def _sizes(text: str) -> list[int]:
+    """Return the numbers of antennas in a text such as ``36,128``; raises InputError for anything else."""
+    if not re.fullmatch(r"\d+(,\d+)*", text) or min(map(int, text.split(","))) < 3:
+        raise InputError(f"--antennas {text}: write whole numbers of at least 3, separated by commas, such as 36,128")
+    return [int(part) for part in text.split(",")]

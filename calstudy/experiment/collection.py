@@ -9,16 +9,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from calstudy.claims.facts import Role
+from calstudy.claims.facts import ExperimentRole
 from calstudy.errors import ExperimentError, InputError
 from calstudy.experiment.files import apply_scale, load, override, parse_override, read_mapping, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
+from calstudy.experiment.runtime import KEY, RuntimeStudy, validate_runtime
 from calstudy.schema import Section, choice, fault
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 CombinedFigure = Literal["layouts", "spherical-comparison"]
-USUAL_MEMBERS: dict[Role, str] = {
+USUAL_MEMBERS: dict[ExperimentRole, str] = {
     "minimally_redundant": "minredundant",
     "redundant": "redundant",
     "redundant_modelling": "redundant-modelling",
@@ -26,7 +27,7 @@ USUAL_MEMBERS: dict[Role, str] = {
     "paper_solver": "paper-solver",
 }
 """Members that play the roles if the file says nothing else."""
-COMPARED: tuple[Role, ...] = ("minimally_redundant", "redundant")
+COMPARED: tuple[ExperimentRole, ...] = ("minimally_redundant", "redundant")
 
 
 class Member(Section):
@@ -46,7 +47,7 @@ class CollectionFile(Section):
         description="Experiment files, each with its own run folder."
     )
     figures: Annotated[tuple[CombinedFigure, ...], Field(strict=False)] = ()
-    roles: dict[Role, str] = Field(
+    roles: dict[ExperimentRole, str] = Field(
         default_factory=dict, description="Which member is which run of the paper, where its name does not say so."
     )
 
@@ -78,7 +79,7 @@ class Collection:
     name: str
     description: str
     members: Mapping[str, Experiment]
-    roles: Mapping[Role, str]
+    roles: Mapping[ExperimentRole, str]
     figures: tuple[CombinedFigure, ...]
 
     @property
@@ -87,13 +88,15 @@ class Collection:
         return next(iter(self.members.values())).outputs
 
 
-def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Experiment | Collection:
-    """Read an experiment or a collection, whichever the file holds.
+def load_study(
+    path: Path, scale: str | None = None, overrides: Sequence[str] = ()
+) -> Experiment | Collection | RuntimeStudy:
+    """Read an experiment, a collection or a run-time study, whichever the file holds.
 
     Parameters
     ----------
     path
-        The YAML file; one with the key `experiments` is a collection.
+        The YAML file; one with the key `experiments` is a collection, one with `runtime` a run-time study.
     scale, overrides
         As for `calstudy.experiment.files.load`; those of a collection go to every member.
 
@@ -105,6 +108,8 @@ def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = 
         If fields are unknown, missing, or hold values that are not allowed.
     """
     data = read_mapping(path)
+    if KEY in data:
+        return validate_runtime(data, scale, overrides)
     if "experiments" not in data:
         return load(path, scale, overrides)
     try:
@@ -171,7 +176,7 @@ def _load_member(member: Member, path: Path, scale: str | None, overrides: Seque
     return experiment
 
 
-def _roles(file: CollectionFile, members: Mapping[str, Experiment]) -> dict[Role, str]:
+def _roles(file: CollectionFile, members: Mapping[str, Experiment]) -> dict[ExperimentRole, str]:
     """Return who plays which role; raises ExperimentError if a member is named that is not there or cannot play it."""
     roles = {role: name for role, name in USUAL_MEMBERS.items() if name in members} | file.roles
     for role, name in roles.items():

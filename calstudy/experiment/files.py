@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from calstudy.errors import ExperimentError, InputError
 from calstudy.experiment.messages import nearest, sentences
 from calstudy.experiment.model import Experiment
+from calstudy.plugins import Plugin, plugin_fault
 
 
 class _Loader(yaml.SafeLoader):
@@ -38,15 +39,27 @@ _Loader.add_implicit_resolver(
 )
 
 
+UNKNOWN_TAG = re.compile(r"could not determine a constructor for the tag '(.*)'")
+
+
 def parse_yaml(text: str, origin: str) -> Any:
     """Parse YAML text; raises InputError with one sentence (origin, line, problem) if it is not valid."""
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f" line {error.problem_mark.line + 1}:" if error.problem_mark else ""
-        raise InputError(f"{origin}:{line} {error.problem or 'not valid YAML'}") from None
+        raise InputError(f"{origin}:{line} {_problem(error)}") from None
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{origin}: not valid YAML ({str(error).splitlines()[0]})") from None
+
+
+def _problem(error: yaml.MarkedYAMLError) -> str:
+    tag = UNKNOWN_TAG.search(error.problem or "")
+    if tag is None:
+        return error.problem or "not valid YAML"
+    if tag[1] == "tag:yaml.org,2002:merge":
+        return "merge keys (<<) are not read; write the block out"
+    return f"the tag {tag[1]} is refused: only texts, numbers, lists and blocks of keys are read, never objects"
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -111,12 +124,21 @@ def _input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, Ba
         value, path = getattr(section, field), f"{prefix}{field}"
         if isinstance(value, BaseModel) and field != "outputs":
             yield from _input_files(value, f"{path}.")
+        elif isinstance(value, Mapping):
+            for name, block in value.items():
+                if isinstance(block, BaseModel):
+                    yield from _input_files(block, f"{path}.{name}.")
         elif isinstance(value, Path):
             yield path, section, field
 
 
 def expand_user(path: Path, field: str) -> Path:
-    """Replace a leading ~ by the home folder; raises InputError, naming the field, if there is no such user."""
+    """Replace a leading ~ by the home folder; raises InputError, naming the field, if there is no such user.
+
+    Or if no file can have this name.
+    """
+    if "\0" in str(path):
+        raise InputError(f"{field} = {str(path)!r}: no file can have this name")
     try:
         return path.expanduser()
     except RuntimeError:
@@ -146,21 +168,38 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
     if faults:
         raise ExperimentError(faults)
     resolved_experiment = Experiment.model_validate(resolved)
+    _require_functions(resolved_experiment)
     for name in ("store", "runs"):
         expand_user(getattr(experiment.outputs, name), f"outputs.{name}")
-    _require_inspected_antennas(resolved_experiment)
+    _require_known_antennas(resolved_experiment)
     return resolved_experiment
 
 
-def _require_inspected_antennas(experiment: Experiment) -> None:
+def _require_functions(experiment: Experiment) -> None:
+    plugins = [
+        (path.removesuffix(".path"), section)
+        for path, section, _ in _input_files(experiment)
+        if isinstance(section, Plugin)
+    ]
+    faults = [f"{path}.{fault}" for path, section in plugins if (fault := plugin_fault(section)) is not None]
+    if faults:
+        raise ExperimentError(faults)
+
+
+def _require_known_antennas(experiment: Experiment) -> None:
     from calstudy.graph.estimates import antenna_count
 
     count = antenna_count(experiment.instrument.layout.model_dump())
-    highest = max(place for pair in experiment.outputs.inspect.pairs for place in pair)
-    if highest >= count:
-        raise ExperimentError(
-            [f"outputs.inspect: names antenna {highest}, but the layout has {count} antennas, counted from 0"]
-        )
+    named = {"outputs.inspect": [place for pair in experiment.outputs.inspect.pairs for place in pair]}
+    for name, group in experiment.instrument.antenna_beams.items():
+        named[f"instrument.antenna_beams.{name}.antennas"] = list(group.antennas)
+    faults = [
+        f"{field}: names antenna {max(places)}, but the layout has {count} antennas, counted from 0"
+        for field, places in named.items()
+        if max(places) >= count
+    ]
+    if faults:
+        raise ExperimentError(faults)
 
 
 def validate(data: Mapping[str, Any], base: Path) -> Experiment:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.calibrate.settings import CalibrationSettings, FirstOrderSettings, GaussNewtonSettings, Solver
 from calstudy.constants import HYDROGEN_LINE
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.instrument.settings import InstrumentSettings
@@ -29,6 +29,8 @@ FigureName = Literal[
     "spherical-excised",
     "reflections",
     "signal-loss",
+    "expected-loss",
+    "convergence",
 ]
 SIGNAL_LOSS_VARIANTS = ("residual", "residual_without_eor", "eor")
 FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
@@ -42,6 +44,8 @@ FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
     "spherical": ("eor",),
     "spherical-excised": ("eor",),
     "signal-loss": SIGNAL_LOSS_VARIANTS,
+    "expected-loss": SIGNAL_LOSS_VARIANTS,
+    "convergence": SIGNAL_LOSS_VARIANTS,
 }
 """Names of the variants that each figure cannot do without."""
 
@@ -102,6 +106,26 @@ class Inspection(Section):
         return self
 
 
+def _followed_solvers() -> dict[str, Solver]:
+    return {
+        "Gauss-Newton (default)": GaussNewtonSettings(),
+        "Adamax 0.01": FirstOrderSettings(name="adamax", tolerance=0.0, max_steps=16_000),
+    }
+
+
+class Convergence(Section):
+    """What the figure `convergence` follows: how much of the foregrounds solvers leave after so many steps."""
+
+    integrations: int = Field(3, ge=1, description="How many, spread over the run; each is solved from the start.")
+    solvers: Annotated[dict[str, Solver], Field(min_length=1, max_length=5)] = Field(
+        default_factory=_followed_solvers, description="By the names that they have in the figure."
+    )
+    steps: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)] = Field(
+        (1, 2, 3, 4, 6, 8, 10, 20, 50, 100, 200, 500, 1000, 2000, 4000, 8000, 16_000),
+        description="After how many steps they are looked at, besides their end.",
+    )
+
+
 class Outputs(Section):
     """What is drawn, and where products and run folders go."""
 
@@ -116,6 +140,7 @@ class Outputs(Section):
         "signal-loss",
     )
     inspect: Inspection = Inspection()
+    convergence: Convergence = Convergence()
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all experiments.")
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
 
@@ -187,10 +212,11 @@ class Experiment(Section):
 
     @model_validator(mode="after")
     def _signal_loss_is_told(self) -> Experiment:
-        if "signal-loss" in self.outputs.figures and not self.measures_signal_loss:
+        asking = [name for name in ("signal-loss", "expected-loss", "convergence") if name in self.outputs.figures]
+        if asking and not self.measures_signal_loss:
             raise fault(
                 "variants",
-                "of the figure 'signal-loss' must be residual and residual_without_eor, which differ in the EoR alone "
+                f"of the figure {asking[0]!r} must be residual and residual_without_eor, which differ in the EoR alone "
                 "and have calibrate: true, and eor, with components [eor] alone",
             )
         return self

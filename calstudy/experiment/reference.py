@@ -13,6 +13,8 @@ from pydantic_core import PydanticUndefined
 
 from calstudy.experiment.collection import CollectionFile, Member
 from calstudy.experiment.model import Experiment
+from calstudy.experiment.runtime import RuntimeStudy
+from calstudy.instrument.settings import AntennaBeam
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -67,12 +69,16 @@ def _rows(model: type[BaseModel]) -> Iterator[str]:
             yield f"| `{name}` | {_kind(info)} | {_default(info)} | {info.description or ''} |"
 
 
-def _section(model: type[BaseModel], path: str) -> Iterator[str]:
+def _plain_section(model: type[BaseModel]) -> Iterator[str]:
     yield (model.__doc__ or "").strip().replace("\n    ", "\n")
     yield ""
     rows = list(_rows(model))
     if rows:
         yield from ("| field | takes | default | |", "|---|---|---|---|", *rows, "")
+
+
+def _section(model: type[BaseModel], path: str) -> Iterator[str]:
+    yield from _plain_section(model)
     for name, info in model.model_fields.items():
         blocks = _blocks(info.annotation)
         inner = f"{path}.{name}" if path else name
@@ -102,6 +108,11 @@ def field_reference() -> str:
         "## `variants`: each",
         "",
         *_section(Experiment.model_fields["variants"].annotation.__args__[1], "variants"),
+        "## `instrument.antenna_beams`: each",
+        "",
+        *_plain_section(AntennaBeam),
+        "`beam` takes what `instrument.beam` does.",
+        "",
         "# Collection files",
         "",
         "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run",
@@ -111,5 +122,12 @@ def field_reference() -> str:
         "## `experiments`: each",
         "",
         *_section(Member, "experiments"),
+        "",
+        "# Run-time files",
+        "",
+        "A file with the key `runtime` is a run-time study. `python -m calstudy run` times the solvers here,",
+        "one array after the other; what it measured is kept under a key that names the machine.",
+        "",
+        *_section(RuntimeStudy, ""),
     ]
     return "\n".join(lines).rstrip() + "\n"

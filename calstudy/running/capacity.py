@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from calstudy.calibrate.memory import LEAST_MODELS
 from calstudy.errors import InputError
 from calstudy.experiment.model import Experiment
 from calstudy.graph.estimates import LIBRARIES_MEMORY, estimate
@@ -13,9 +14,18 @@ from calstudy.resources import cores, free_memory
 from calstudy.running import ranks
 from calstudy.running.store import Store
 
+Targets = Callable[[Graph], Sequence[Task]]
+"""Which products of an experiment are wanted."""
+
 BYTES = {"MB": 1e6, "GB": 1e9, "TB": 1e12}
 SHARED_STAGE = "simulate-chunk"
 """The stage whose pieces may be made smaller without changing its results."""
+STREAMED_STAGE = "calibrate-chunk"
+"""The stage that may work on fewer baselines at a time without changing its results."""
+
+
+def _whole_run(graph: Graph) -> Sequence[Task]:
+    return graph.targets
 
 
 def parse_memory(text: str) -> float:
@@ -37,7 +47,11 @@ def parse_memory(text: str) -> float:
 
 
 def fit(
-    experiment: Experiment, workers: int | None, max_memory: str | None, scheduler: str | None = None
+    experiment: Experiment,
+    workers: int | None,
+    max_memory: str | None,
+    scheduler: str | None = None,
+    targets: Targets = _whole_run,
 ) -> tuple[Experiment, int]:
     """Choose the number of workers, and cut simulations finely enough for them, within the memory.
 
@@ -54,11 +68,13 @@ def fit(
         What all workers together may take, such as "6 GB", or None for what is free now.
     scheduler
         Address of a cluster, whose memory is not looked at, or None.
+    targets
+        Which products are to be made, by default all that a run is for.
 
     Returns
     -------
     experiment
-        The same, perhaps with more `simulation.chunks`.
+        The same, perhaps with more `simulation.chunks` and fewer `calibration.models_at_once`.
     workers
         Not more than the memory holds; those that were asked for, if no memory was given.
 
@@ -76,24 +92,27 @@ def fit(
     # The parent process holds the libraries, too.
     budget = memory - LIBRARIES_MEMORY
     hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
-    cut = _cut(experiment, budget / hoped)
-    needs = {task: estimate(task).memory for task in _missing(cut)}
+    cut = _stream(_cut(experiment, budget / hoped, targets), budget / hoped, targets)
+    needs = {task: estimate(task).memory for task in _missing(cut, targets)}
     if not needs:
         return cut, workers or hoped
     largest = max(needs, key=needs.__getitem__)
-    if needs[largest] > budget:
-        source = "--max-memory leaves" if max_memory else "this machine has"
-        raise InputError(
-            f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage} ({largest.label}) needs "
-            f"about {needs[largest] / 1e9:.1f} GB; give it more with --max-memory, or use fewer antennas, channels, "
-            "integrations or sources"
-        )
+    _require_room(largest, needs[largest], budget, "--max-memory leaves" if max_memory else "this machine has")
     if ranks.count() > 1:
         return cut, 1
     fitting = max(1, int(budget // needs[largest]))
     if workers is not None and max_memory is None:
         return cut, workers
     return cut, min(hoped, fitting)
+
+
+def _require_room(largest: Task, need: float, budget: float, source: str) -> None:
+    if need > budget:
+        raise InputError(
+            f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage} ({largest.label}) needs "
+            f"about {need / 1e9:.1f} GB; give it more with --max-memory, or use fewer antennas, channels, "
+            "integrations or sources"
+        )
 
 
 def _require_sharing(experiment: Experiment, workers: int | None, scheduler: str | None) -> None:
@@ -110,23 +129,34 @@ def _require_sharing(experiment: Experiment, workers: int | None, scheduler: str
         )
 
 
-def _cut(experiment: Experiment, share: float) -> Experiment:
+def _cut(experiment: Experiment, share: float, targets: Targets) -> Experiment:
     """Double the number of simulation chunks until each takes no more than its share, or they are single channels."""
     cut = experiment
-    while cut.simulation.chunks < cut.instrument.channels.count and _largest_chunk(cut) > share:
+    while cut.simulation.chunks < cut.instrument.channels.count and _largest(cut, targets, SHARED_STAGE) > share:
         chunks = min(2 * cut.simulation.chunks, cut.instrument.channels.count)
         finer = cut.model_copy(update={"simulation": cut.simulation.model_copy(update={"chunks": chunks})})
-        if _largest_chunk(finer) > 0.95 * _largest_chunk(cut):
+        if _largest(finer, targets, SHARED_STAGE) > 0.95 * _largest(cut, targets, SHARED_STAGE):
             break  # What is left is the sky itself.
         cut = finer
     return cut
 
 
-def _largest_chunk(experiment: Experiment) -> float:
-    return max((estimate(task).memory for task in _missing(experiment) if task.stage == SHARED_STAGE), default=0.0)
+def _stream(experiment: Experiment, share: float, targets: Targets) -> Experiment:
+    """Halve the number of foreground models that are worked on at a time until a solve takes no more than its share."""
+    fitted = experiment
+    while fitted.calibration.models_at_once > LEAST_MODELS and _largest(fitted, targets, STREAMED_STAGE) > share:
+        fewer = max(fitted.calibration.models_at_once // 2, LEAST_MODELS)
+        calibration = fitted.calibration.model_copy(update={"models_at_once": fewer})
+        fitted = fitted.model_copy(update={"calibration": calibration})
+    return fitted
 
 
-def _missing(experiment: Experiment) -> Sequence[Task]:
+def _largest(experiment: Experiment, targets: Targets, stage: str) -> float:
+    missing = _missing(experiment, targets)
+    return max((estimate(task).memory for task in missing if task.stage == stage), default=0.0)
+
+
+def _missing(experiment: Experiment, targets: Targets) -> Sequence[Task]:
     """Return the tasks whose products a run would have to make, by a quick look into the store."""
     store, found = Store(experiment.outputs.store), {}
 
@@ -136,6 +166,6 @@ def _missing(experiment: Experiment) -> Sequence[Task]:
             for needed in task.inputs.values():
                 visit(needed)
 
-    for task in Graph(experiment).targets:
+    for task in targets(Graph(experiment)):
         visit(task)
     return tuple(found.values())

@@ -12,8 +12,10 @@ from rich.table import Table
 from calstudy.claims.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
 from calstudy.experiment.collection import Collection
 from calstudy.experiment.model import Experiment
+from calstudy.experiment.runtime import RuntimeStudy
 from calstudy.graph.collections import CollectionGraph
 from calstudy.graph.estimates import LIBRARIES_MEMORY, Cost, estimate
+from calstudy.graph.runtimes import RuntimeGraph
 from calstudy.graph.sweeps import SweepGraph
 from calstudy.graph.tasks import Graph, Task
 from calstudy.resources import free_memory
@@ -36,8 +38,8 @@ def _gigabytes(count: float) -> str:
 
 
 def show_plan(
-    study: Experiment | Collection,
-    graph: Graph | CollectionGraph | SweepGraph,
+    study: Experiment | Collection | RuntimeStudy,
+    graph: Graph | CollectionGraph | SweepGraph | RuntimeGraph,
     folders: Sequence[Path],
     workers: int,
     console: Console,

@@ -13,7 +13,8 @@ from calstudy.instrument.layouts import make_layout
 
 def require_basis_fits(experiment: Experiment) -> None:
     """Raise InputError if the channels cannot hold the foreground basis of the longest baseline."""
-    if not any(variant.calibrate for variant in experiment.variants.values()):
+    own = experiment.calibration.code is not None
+    if own or not any(variant.calibrate for variant in experiment.variants.values()):
         return
     channels = experiment.instrument.channels
     longest = pdist(make_layout(experiment.instrument.layout).enu).max()

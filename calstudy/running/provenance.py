@@ -58,9 +58,20 @@ def git_commit() -> str | None:
         return None
 
 
+def processor() -> str:
+    """Return the model of this machine's processor, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
 def machine() -> dict[str, Any]:
-    """Return the processor count, memory, system and Python of this machine."""
+    """Return the processor and its cores, memory, system and Python of this machine."""
     return {
+        "processor": processor(),
         "cores": cores(),
         "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
         "system": f"{platform.system()} {platform.machine()}",

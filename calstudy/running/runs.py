@@ -67,14 +67,15 @@ def run_folder(experiment: Experiment) -> Path:
 
     The same experiment has the same folder; a changed one never overwrites it.
     """
-    without = {"outputs": {"store", "runs"}, "scales": True, "simulation": {"chunks"}}
+    pieces = {"simulation": {"chunks"}, "calibration": {"models_at_once"}}
+    without = {"outputs": {"store", "runs"}, "scales": True, **pieces}
     content = experiment.model_dump(mode="json", exclude=without)
     return experiment.outputs.runs.expanduser().resolve() / f"{experiment.name}-{digest_json(content)[:8]}"
 
 
 def open_folder(folder: Path) -> None:
     """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
-    results = {"report.html", "figures", "tables", "points", "claims.json", "claims.md"}
+    results = {"report.html", "figures", "tables", "points", "claims.json", "claims.md", "regression.json"}
     known = results | {MANIFEST, "experiment.yaml", "run.log"}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,9 +125,10 @@ def publish(products: list[Product], folder: Path) -> None:
             partial.replace(folder / name)
 
 
-def _manifest(experiment: Experiment, graph: Graph, products: dict[str, Product], made: set[str]) -> dict[str, Any]:
+def product_entries(tasks: Sequence[Task], products: dict[str, Product], made: set[str]) -> list[dict[str, Any]]:
+    """Return what a manifest says of every product: what it was made from, what it took, and by which run."""
     entries = []
-    for task in graph.tasks:
+    for task in tasks:
         if task.key in products:
             record = products[task.key].record
             fields = (
@@ -141,6 +143,10 @@ def _manifest(experiment: Experiment, graph: Graph, products: dict[str, Product]
                 "inputs",
             )
             entries.append({**{field: record[field] for field in fields}, "made_by_this_run": task.key in made})
+    return entries
+
+
+def _manifest(experiment: Experiment, graph: Graph, products: dict[str, Product], made: set[str]) -> dict[str, Any]:
     return {
         "name": experiment.name,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -149,7 +155,7 @@ def _manifest(experiment: Experiment, graph: Graph, products: dict[str, Product]
         "git_commit": git_commit(),
         "versions": package_versions(),
         "machine": machine(),
-        "products": entries,
+        "products": product_entries(graph.tasks, products, made),
     }
 
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 from uuid import uuid4
 
@@ -24,6 +25,8 @@ from filelock import FileLock
 from calstudy.errors import InputError
 
 RECORD = "product.json"
+PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Stages and keys: names of folders, and of nothing above or below."""
 
 
 def digest_file(path: Path) -> str:
@@ -49,6 +52,12 @@ class Product:
     def size(self) -> int:
         """Bytes of all its files."""
         return sum(entry["bytes"] for entry in self.record["files"].values())
+
+
+def _inside(name: str) -> bool:
+    """Return whether a recorded file is in its product's folder, and not elsewhere by an absolute path or by dots."""
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
 
 class Store:
@@ -79,7 +88,15 @@ class Store:
             raise InputError(f"outputs.store = {str(self.root)!r}: cannot be written ({error.strerror})") from None
 
     def folder(self, stage: str, key: str) -> Path:
-        """Return where the product with this stage and key is, or would be."""
+        """Return where the product with this stage and key is, or would be.
+
+        Raises
+        ------
+        ValueError
+            If either is not a plain name, so that the folder would be elsewhere.
+        """
+        if not (PLAIN.fullmatch(stage) and PLAIN.fullmatch(key)):
+            raise ValueError(f"stage {stage!r} and key {key!r} of a product must be plain names")
         return self.root / stage / key
 
     def find(self, stage: str, key: str) -> Product | None:
@@ -89,6 +106,8 @@ class Store:
             record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
             sizes = {name: (folder / name).stat().st_size for name in record["files"]}
         except (OSError, ValueError, KeyError, TypeError):
+            return None
+        if not all(_inside(name) for name in sizes):
             return None
         if record.get("key") != key or any(sizes[name] != entry["bytes"] for name, entry in record["files"].items()):
             return None

@@ -8,8 +8,10 @@ from rich.console import Console
 
 from calstudy.experiment.collection import Collection
 from calstudy.experiment.model import Experiment
+from calstudy.experiment.runtime import RuntimeStudy
 from calstudy.experiment.sweep import Sweep, expand
 from calstudy.graph.collections import CollectionGraph
+from calstudy.graph.runtimes import RuntimeGraph
 from calstudy.graph.sweeps import SweepGraph
 from calstudy.graph.tasks import Graph
 from calstudy.running.capacity import fit
@@ -17,6 +19,7 @@ from calstudy.running.collection_runs import collection_folder, run_collection
 from calstudy.running.plans import show_claims, show_collection_result, show_plan, show_result
 from calstudy.running.preflight import require_basis_fits
 from calstudy.running.runs import run, run_folder
+from calstudy.running.runtime_runs import fit_runtime, run_runtime, runtime_folder, timed_machine
 from calstudy.running.sweep_runs import run_sweep
 
 Study = Experiment | Collection | Sweep
@@ -56,19 +59,25 @@ def _experiments(study: Study) -> list[Experiment]:
     return [study]
 
 
-def plan_study(study: Study, workers: int | None, max_memory: str | None, console: Console) -> None:
+def plan_study(study: Study | RuntimeStudy, workers: int | None, max_memory: str | None, console: Console) -> None:
     """Print what a run would do.
 
     Parameters
     ----------
     study
-        An experiment, with a sweep or without, or a collection.
+        An experiment, with a sweep or without, a collection, or a run-time study.
     workers, max_memory
         As for `calstudy.capacity.fit`.
     console
         Where it is written.
     """
+    if isinstance(study, RuntimeStudy):
+        fit_runtime(study, workers, max_memory, None)
+        show_plan(study, RuntimeGraph(study, timed_machine(study)), [runtime_folder(study)], 1, console)
+        return
     study, count = fit_study(study, workers, max_memory)
+    for experiment in _experiments(study):
+        require_basis_fits(experiment)
     if isinstance(study, Collection):
         folders = [run_folder(experiment) for experiment in study.members.values()] + [collection_folder(study)]
         show_plan(study, CollectionGraph(study), folders, count, console)
@@ -79,19 +88,25 @@ def plan_study(study: Study, workers: int | None, max_memory: str | None, consol
 
 
 def run_study(
-    study: Study, workers: int | None, max_memory: str | None, scheduler: str | None, console: Console
+    study: Study | RuntimeStudy, workers: int | None, max_memory: str | None, scheduler: str | None, console: Console
 ) -> None:
     """Run an experiment or a collection, and print what was made and which claims hold; parameters as above.
 
     Parameters
     ----------
     study
-        An experiment, with a sweep or without, or a collection.
+        An experiment, with a sweep or without, a collection, or a run-time study.
     workers, max_memory
         As for `calstudy.capacity.fit`.
     scheduler, console
         As for `calstudy.runs.run`.
     """
+    if isinstance(study, RuntimeStudy):
+        fit_runtime(study, workers, max_memory, scheduler)
+        timed = run_runtime(study, console)
+        show_result(timed, console)
+        show_claims(timed.folder, console)
+        return
     study, count = fit_study(study, workers, max_memory, scheduler)
     for experiment in _experiments(study):
         require_basis_fits(experiment)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pyuvdata import UVCal, UVData
 
-from calstudy.calibrate.calamity import calibrate
+from calstudy.calibrate.own import run_calibrator
 from calstudy.calibrate.settings import CalibrationSettings
 from calstudy.stages.files import read_json, read_visibilities, write_json, write_visibilities
 from calstudy.stages.registry import Job
@@ -22,6 +22,7 @@ def _integrations(data: UVData, index: int, count: int, together: int) -> UVData
 
     A run ends where one group of integrations that are solved `together` ends.
     """
+    together = min(together, data.Ntimes)
     groups = -(-data.Ntimes // together)
     edges = np.linspace(0, groups, count + 1).round().astype(int) * together
     first, last = edges[index] * data.Nbls, min(edges[index + 1], data.Ntimes) * data.Nbls
@@ -38,7 +39,7 @@ def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     if "sky_model" in job.inputs:
         sky_model = read_visibilities(job.inputs["sky_model"] / "visibilities.uvh5")
         sky_model = _integrations(sky_model, index, count, together)
-    result = calibrate(data, settings, sky_model)
+    result = run_calibrator(data, settings, sky_model)
     result.gains.write_calh5(job.output / GAINS)
     for name, uvd in zip(VISIBILITIES, (result.model, result.residual), strict=True):
         write_visibilities(uvd, job.output / name, single=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 from calstudy.claims.evaluation import evaluate as evaluate_claims
 from calstudy.claims.evaluation import roles_of
+from calstudy.claims.run_times import RunTimes
 from calstudy.claims.statement import Claim
 from calstudy.claims.study import Study
 from calstudy.claims.tables import tally, write_claims
@@ -31,6 +32,12 @@ def evaluate_combined(job: Job) -> Mapping[str, Any]:
         for role, member in job.settings["roles"].items()
     }
     return _write(job, evaluate_claims(studies))
+
+
+def evaluate_run_times(job: Job) -> Mapping[str, Any]:
+    """Write claims.json and claims.md of a run-time study."""
+    study = RunTimes.of(job.settings["title"], job.inputs["runtime"])
+    return _write(job, evaluate_claims({"run_time": study}))
 
 
 def _write(job: Job, claims: Sequence[Claim]) -> dict[str, Any]:

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import TypeAdapter
-from scipy.constants import speed_of_light
 
-from calstudy.instrument.beams import make_beam
+from calstudy.instrument.antenna_beams import make_beams
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.power.cosmology import make_cosmology
 from calstudy.simulate.chunks import Chunk, assemble, check_interpolation, plan_chunks, simulate_chunk
 from calstudy.simulate.engine import make_engine
-from calstudy.simulate.floor import MAIN_LOBES, DelayFloor, delay_floor
+from calstudy.simulate.floor import DelayFloor, delay_floor, floor_buffers
 from calstudy.simulate.nodes import integration_times
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.eor import EorField
@@ -25,7 +24,7 @@ from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import Eor, Foregrounds
 from calstudy.stages.files import read_visibilities, write_json, write_visibilities
 from calstudy.stages.registry import Job
-from calstudy.visibilities import baseline_vectors, from_cube, to_cube
+from calstudy.visibilities import from_cube, to_cube
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
@@ -48,7 +47,7 @@ class _Scene:
         self.instrument = InstrumentSettings.model_validate(settings["instrument"])
         self.simulation = SimulationSettings.model_validate(settings["simulation"])
         self.template = make_template(self.instrument)
-        self.beam = make_beam(self.instrument.beam, self.instrument.channels)
+        self.beam = make_beams(self.instrument, self.template.telescope.Nants)
         self.engine = make_engine(self.simulation)
         self.stand_ins = [self.beam.stand_in] if self.beam.stand_in else []
 
@@ -67,8 +66,9 @@ class _Scene:
     @property
     def smooth(self) -> bool:
         """Whether sky and beam vary smoothly from channel to channel, so that frequency nodes suffice."""
-        interpolation = getattr(self.instrument.beam, "interpolation", "chebyshev")
-        return not self.is_eor and interpolation == "chebyshev" and self._foregrounds.spectral_type in SMOOTH_SPECTRA
+        beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
+        smooth = all(getattr(beam, "interpolation", "chebyshev") == "chebyshev" for beam in beams)
+        return not self.is_eor and smooth and self._foregrounds.spectral_type in SMOOTH_SPECTRA
 
     @cached_property
     def chunks(self) -> list[Chunk]:
@@ -125,21 +125,15 @@ def _check(scene: _Scene, cube: np.ndarray) -> dict[str, Any] | None:
     channels = slice(-CHECKED, None) if scene.is_eor else slice(None)
     indices = np.arange(scene.template.Nfreqs)[channels]
     sky = scene.sky(indices)
-    return asdict(
-        check_interpolation(scene.engine, sky, scene.beam, scene.template, cube, grid, channels=channels, count=CHECKED)
-    )
+    simulate = partial(scene.engine.simulate, sky, scene.beam)
+    return asdict(check_interpolation(simulate, scene.template, cube, grid, channels=channels, count=CHECKED))
 
 
 def _floors(data: UVData) -> dict[str, Any]:
     """Measure the delay floor with both tapers, where the band leaves delays beyond the horizon for them."""
-    width = float(np.diff(data.freq_array).mean())
-    horizon = float(np.linalg.norm(baseline_vectors(data), axis=1).max()) / speed_of_light
-    floors = {}
-    for taper, lobe in MAIN_LOBES.items():
-        buffer = max(100e-9, lobe / (width * data.Nfreqs))
-        if horizon + buffer + 1 / (width * data.Nfreqs) < 0.5 / width:
-            floors[taper] = _as_json(delay_floor(data, buffer=buffer, taper=taper))
-    return floors
+    return {
+        taper: _as_json(delay_floor(data, buffer=buffer, taper=taper)) for taper, buffer in floor_buffers(data).items()
+    }
 
 
 def _as_json(floor: DelayFloor) -> dict[str, Any]:

@@ -5,13 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calstudy.bench.scaling import summarize_runtime
 from calstudy.figures.baselines import draw_baselines
 from calstudy.figures.data import draw_data
 from calstudy.figures.domains import horizon_delay, in_two_domains
 from calstudy.figures.gains import compare_gains, draw_gains
 from calstudy.figures.model import draw_model
 from calstudy.figures.reflections import draw_reflections
-from calstudy.figures.runtime import draw_runtime, summarize_runtime
+from calstudy.figures.runtime import draw_runtime
 
 C = 299792458.0
 FREQUENCY = 167.075e6 + 80e3 * np.arange(384)
@@ -153,8 +154,9 @@ def test_run_times_give_back_their_power_law(exponent, amplitude):
     rng = np.random.default_rng(34)
     scatter = np.exp(0.2 * rng.permuted(np.tile(np.linspace(-1, 1, 1001), (4, 1)), axis=1))
     series = summarize_runtime("CPU", size, amplitude * size[:, None] ** exponent * scatter)
-    assert series.exponent == pytest.approx(exponent)
-    assert series.amplitude == pytest.approx(amplitude)
+    assert series.fit.exponent == pytest.approx(exponent)
+    assert series.fit.amplitude == pytest.approx(amplitude)
+    assert series.fit.error < 1e-9
     np.testing.assert_allclose(series.high / series.median, np.exp(0.2 * 0.95), rtol=1e-3)
     np.testing.assert_allclose(series.median / series.low, np.exp(0.2 * 0.95), rtol=1e-3)
 
@@ -163,21 +165,23 @@ def test_run_time_figure_has_medians_bands_and_fits():
     size = np.array([8.0, 16, 32])
     rng = np.random.default_rng(35)
     series = [summarize_runtime(name, size, size[:, None] ** 2 * np.exp(rng.normal(size=(3, 99)))) for name in "ab"]
-    axes = draw_runtime(series, "number of antennas").axes[0]
+    figure = draw_runtime(series, "number of antennas")
+    axes = figure.axes[0]
     for index, item in enumerate(series):
         markers, fit = axes.get_lines()[2 * index : 2 * index + 2]
         np.testing.assert_allclose(xy(markers), (size, item.median))
-        np.testing.assert_allclose(fit.get_ydata(), item.amplitude * size**item.exponent)
+        np.testing.assert_allclose(fit.get_ydata(), item.fit.amplitude * size**item.fit.exponent)
         vertices = axes.collections[index].get_paths()[0].vertices
         for x, low, high in zip(size, item.low, item.high, strict=True):
             at_size = vertices[vertices[:, 0] == x, 1]
             assert (at_size.min(), at_size.max()) == pytest.approx((low, high))
-        assert f"{item.exponent:.2f}" in fit.get_label()
+    told = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert all(f"{item.fit.exponent:.2f}" in text for item, text in zip(series, told, strict=True))
 
 
 def test_run_times_that_cannot_be_fitted_are_refused():
-    for size, seconds in (([8], [[1.0]]), ([8, 16], [[1.0], [0.0]]), ([8, 16], [1.0, 2.0])):
+    for size, seconds in (([8, 16], [[1.0], [2.0]]), ([8, 16, 32], [[1.0], [2.0], [0.0]]), ([8, 16, 32], [1.0] * 3)):
         with pytest.raises(ValueError, match="run times 'x': expected positive times"):
             summarize_runtime("x", size, seconds)
-    with pytest.raises(ValueError, match="1 to 4 series, not 0"):
+    with pytest.raises(ValueError, match="1 to 8 series, not 0"):
         draw_runtime([], "number of antennas")

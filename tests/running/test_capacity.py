@@ -37,6 +37,11 @@ def test_other_texts_are_refused(text):
         parse_memory(text)
 
 
+def test_only_what_is_wanted_has_to_fit(paper):
+    assert fit(paper, 8, "8 GB", targets=lambda graph: [graph.gains]) == (paper, 8)
+    assert fit(paper, 8, "8 GB", targets=lambda graph: [graph.foregrounds])[1] > fit(paper, 8, "8 GB")[1]
+
+
 def test_less_memory_means_smaller_pieces_and_fewer_workers(paper):
     plenty, many = fit(paper, 8, "100 GB")
     assert (plenty, many) == (paper, 8)
@@ -86,3 +91,32 @@ def test_the_number_of_chunks_in_a_file_does_not_change_the_product(tmp_path):
         for count in (1, 2, 16, 32)
     }
     assert len(keys) == 1
+
+
+@pytest.fixture
+def many(tmp_path) -> Experiment:
+    """All 128 tiles, with an empty store."""
+    changes = ["instrument.layout={kind: mwa-compact}", "instrument.times.count=2", "calibration.chunks=1"]
+    return load(EXPERIMENTS / "minredundant.yaml", None, [f"outputs.store={tmp_path / 'store'}", *changes])
+
+
+def solve_estimate(experiment: Experiment) -> float:
+    return max(estimate(task).memory for task in Graph(experiment).tasks if task.stage == "calibrate-chunk")
+
+
+def test_solves_work_on_fewer_models_where_memory_is_short(many):
+    plenty, _ = fit(many, 1, "200 GB")
+    assert plenty.calibration == many.calibration
+    share = solve_estimate(many) - 3e8
+    little, _ = fit(many, 1, f"{(share + 0.8e9) / 1e9:.3f} GB")
+    assert little.calibration.models_at_once < many.calibration.models_at_once
+    assert solve_estimate(little) <= share + 1e6
+    before, after = Graph(many), Graph(little)
+    assert [task.key for task in before.targets] == [task.key for task in after.targets]
+    told = [task.settings["calibration"] for task in after.tasks if task.stage == "calibrate-chunk"]
+    assert {settings["models_at_once"] for settings in told} == {little.calibration.models_at_once}
+
+
+def test_solves_that_cannot_fit_are_refused(many):
+    with pytest.raises(InputError, match=r"--max-memory leaves 1\.2 GB .* needs about \d+\.\d GB"):
+        fit(many, 1, "2 GB")

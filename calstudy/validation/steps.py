@@ -1,0 +1,184 @@
+"""What a step of the ladder says: the file that names its experiments, its rung and its criteria."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError, model_validator
+
+from calstudy.claims.statement import Above, Below, Consistent, Threshold, Within
+from calstudy.errors import ExperimentError, InputError
+from calstudy.experiment.files import override, parse_override, read_mapping, validate
+from calstudy.experiment.messages import sentences
+from calstudy.experiment.model import Experiment
+from calstudy.schema import Section, fault
+
+LADDER = Path(__file__).resolve().parents[2] / "experiments" / "validation"
+"""Folder of the steps of this checkout."""
+SCALES = ("full", "small")
+
+
+class Must(Section):
+    """What a measured number must be: one of the four."""
+
+    below: float | None = Field(None, description="At most this.")
+    above: float | None = Field(None, description="At least this.")
+    within: Annotated[tuple[float, float], Field(strict=False)] | None = Field(None, description="Between these two.")
+    equal: float | None = Field(None, description="This, within `sigmas` times the uncertainty.")
+    sigmas: float = Field(3.0, gt=0)
+
+    @model_validator(mode="after")
+    def _one_condition(self) -> Must:
+        given = [name for name in ("below", "above", "within", "equal") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise fault("", "must have exactly one of below, above, within, equal")
+        return self
+
+    @property
+    def threshold(self) -> Threshold:
+        """The condition, as the claims of the paper have them."""
+        if self.below is not None:
+            return Below(self.below)
+        if self.above is not None:
+            return Above(self.above)
+        if self.within is not None:
+            return Within(*self.within)
+        return Consistent(self.equal, self.sigmas)
+
+
+class Criterion(Section):
+    """One number that decides about a step."""
+
+    measures: str = Field(description="Name of the finding of the step's rung.")
+    quantity: str = Field(description="What that is, in words.")
+    must: Must
+    small: Must | None = Field(None, description="What it must be at small scale, where sampling errors are larger.")
+    full_only: bool = Field(False, description="Whether it does not apply at small scale; `why` tells.")
+    why: str = Field(description="Why this threshold.")
+
+    def condition(self, scale: str) -> Threshold:
+        """Return what the number must be at a scale."""
+        return (self.small if scale == "small" and self.small is not None else self.must).threshold
+
+
+class StepExperiment(Section):
+    """One experiment of a step."""
+
+    file: Path = Field(strict=False, description="The experiment file; a relative path starts at the step's file.")
+    overrides: dict[str, Any] = Field(default_factory=dict, description="Fields to change (dotted path: value).")
+    small: Path | None = Field(None, strict=False, description="The experiment file at small scale.")
+    small_overrides: dict[str, Any] = Field(default_factory=dict, description="The same at small scale.")
+
+
+class StepFile(Section):
+    """One step of the ladder."""
+
+    step: str = Field(pattern=r"^-?[0-9]+(\.[0-9]+)?$", description="Its number.")
+    title: str
+    proves: str
+    rung: str = Field(description="What measures it, a key of `calstudy.validation.rungs.RUNGS`.")
+    parameters: dict[str, Any] = Field(default_factory=dict, description="What the rung is told.")
+    small_parameters: dict[str, Any] = Field(default_factory=dict, description="What it is told at small scale.")
+    experiments: dict[str, StepExperiment] = Field(default_factory=dict)
+    criteria: Annotated[tuple[Criterion, ...], Field(strict=False, min_length=1)]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step at one scale, its experiments validated.
+
+    Attributes
+    ----------
+    name, title, proves, rung, criteria
+        As in the file.
+    parameters
+        What the rung is told.
+    experiments
+        By the names they have in the step.
+    scale
+        "full" or "small".
+    """
+
+    name: str
+    title: str
+    proves: str
+    rung: str
+    parameters: Mapping[str, Any]
+    experiments: Mapping[str, Experiment]
+    criteria: Sequence[Criterion]
+    scale: str
+
+
+def load_step(path: Path, scale: str = "full", overrides: Sequence[str] = ()) -> Step:
+    """Read one step of the ladder.
+
+    Parameters
+    ----------
+    path
+        The YAML file.
+    scale
+        "full", or "small" for the experiments and parameters under `small`.
+    overrides
+        ``path=value`` texts, applied to every experiment last of all.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read.
+    ExperimentError
+        If fields of the step or of an experiment are unknown, missing, or hold values that are not allowed.
+    """
+    from calstudy.validation.rungs import RUNGS
+
+    data = read_mapping(path)
+    try:
+        file = StepFile.model_validate(data)
+    except ValidationError as error:
+        raise ExperimentError([f"{path}: {sentence}" for sentence in sentences(error, StepFile, data)]) from None
+    if file.rung not in RUNGS:
+        raise ExperimentError([f"{path}: rung = {file.rung!r}: not a rung (allowed: {', '.join(RUNGS)})"])
+    small = scale == "small"
+    experiments = {
+        name: _load_experiment(name, item, path.resolve().parent, small, overrides)
+        for name, item in file.experiments.items()
+    }
+    parameters = {**file.parameters, **(file.small_parameters if small else {})}
+    criteria = tuple(item for item in file.criteria if not (small and item.full_only))
+    return Step(file.step, file.title, file.proves, file.rung, parameters, experiments, criteria, scale)
+
+
+def _load_experiment(name: str, item: StepExperiment, base: Path, small: bool, overrides: Sequence[str]) -> Experiment:
+    file = item.small if small and item.small is not None else item.file
+    path = base / file
+    data = read_mapping(path)
+    for dotted, value in (item.small_overrides if small else item.overrides).items():
+        data = override(data, dotted, value)
+    for text in overrides:
+        data = override(data, *parse_override(text))
+    try:
+        return validate(data, path.resolve().parent)
+    except ExperimentError as error:
+        raise ExperimentError([f"experiments.{name} ({file}): {sentence}" for sentence in error.faults]) from None
+
+
+def load_ladder(
+    names: Sequence[str] = (), scale: str = "full", overrides: Sequence[str] = (), folder: Path = LADDER
+) -> list[Step]:
+    """Read the steps with these names, or all, in the order of their numbers; raises as `load_step`, and
+
+    InputError
+        If the folder holds no steps, or none of a given name.
+    """
+    if scale not in SCALES:
+        raise InputError(f"--scale {scale}: not a scale of the ladder (allowed: {', '.join(SCALES)})")
+    files = {str(read_mapping(path).get("step")): path for path in sorted(folder.glob("*.yaml"))}
+    if not files:
+        raise InputError(f"{folder}: holds no steps of the ladder; run in a checkout of calstudy, or give --ladder DIR")
+    unknown = [name for name in names if name not in files]
+    ordered = sorted(files, key=float)
+    if unknown:
+        raise InputError(f"{unknown[0]}: not a step of the ladder (there are: {', '.join(ordered)})")
+    return [load_step(files[name], scale, overrides) for name in ordered if not names or name in names]

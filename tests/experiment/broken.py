@@ -1,0 +1,236 @@
+"""Broken experiment files, many of them, the same in every run: what a hurried user, or a bad editor, may hand in."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from tiny import tiny
+
+from calstudy.experiment.files import validate
+
+SEED = 20220422
+
+NOTHING: list[Any] = [None, [], {}, "", "banana", math.nan, math.inf, True, -7, 3.14159, [[]], {"a": 1}, [None]]
+QUANTITIES: list[Any] = [
+    "5 banana",
+    "3 kg",
+    "nan",
+    "inf Hz",
+    "80",
+    80,
+    80.0,
+    "ten MHz",
+    "1e999 m",
+    "-5 m",
+    "0 s",
+    "1 2 s",
+]
+NUMBERS: list[Any] = ["3", "three", "1e3 x", -1, -0.5, 1e300, 10**30, 0, 2.5]
+CHOICES: list[Any] = ["nonsense", "Gauss-Newton", "none of these", 7, ["xx"], {"kind": "nonsense"}, {"kind": 3}]
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A file that must be refused, or that is harmless after all.
+
+    Attributes
+    ----------
+    name
+        What is wrong with it.
+    text
+        Its content, bytes.
+    field
+        What a refusal must name one of: the field or its block, or the file's own name; anything if empty.
+    """
+
+    name: str
+    text: bytes
+    field: tuple[str, ...]
+
+
+def _leaves(block: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for key, value in block.items():
+        yield (*above, key), value
+        if isinstance(value, dict):
+            yield from _leaves(value, (*above, key))
+
+
+def _with(data: dict[str, Any], path: tuple[str, ...], value: Any) -> dict[str, Any]:
+    changed = copy.deepcopy(data)
+    block = changed
+    *parents, last = path
+    for step in parents:
+        block = block[step]
+    block[last] = value
+    return changed
+
+
+def _pool(value: Any) -> list[Any]:
+    if isinstance(value, str) and value[:1].isdigit():
+        return QUANTITIES + NOTHING
+    if isinstance(value, bool | int | float):
+        return NUMBERS + NOTHING
+    if isinstance(value, str):
+        return CHOICES + NOTHING
+    return NOTHING + CHOICES + NUMBERS
+
+
+def resolved(folder: Path) -> dict[str, Any]:
+    """Return the tiny experiment with every field filled in."""
+    data = validate(tiny(folder), folder).model_dump(mode="json")
+    return {key: value for key, value in data.items() if key not in ("scales", "sweep")}
+
+
+def wrong_values(folder: Path, per_field: int = 1) -> Iterator[Broken]:
+    """Yield the whole experiment with one field changed to something it is hardly meant to be."""
+    data, rng = resolved(folder), random.Random(SEED)
+    for path, value in _leaves(data):
+        for index, wrong in enumerate(rng.sample(_pool(value), per_field)):
+            text = yaml.safe_dump(_with(data, path, wrong), sort_keys=False).encode()
+            yield Broken(f"{'.'.join(path)}={wrong!r}#{index}", text, path[-2:])
+
+
+def unknown_keys(folder: Path) -> Iterator[Broken]:
+    """Yield the experiment with a misspelt key in each of its blocks."""
+    data = resolved(folder)
+    for path, value in _leaves(data):
+        if isinstance(value, dict):
+            key = f"{next(iter(value), 'x')}x"
+            text = yaml.safe_dump(_with(data, (*path, key), 1), sort_keys=False).encode()
+            yield Broken(f"unknown {'.'.join(path)}.{key}", text, (key,))
+
+
+def missing_files(folder: Path) -> Iterator[Broken]:
+    """Yield experiments that name input files which are not there, or are folders."""
+    data = tiny(folder)
+    for path, block in (
+        ("instrument.layout", {"kind": "csv"}),
+        ("instrument.beam", {"kind": "beamfits"}),
+        ("instrument.beam", {"kind": "mwa-embedded-element"}),
+        ("sky.foregrounds", {"kind": "file"}),
+        ("sky.foregrounds", {"kind": "gleam"}),
+        ("corruption.gains", {"kind": "file"}),
+        ("calibration.initial_gains", {"kind": "file"}),
+        ("calibration.weights", {"kind": "file"}),
+    ):
+        for file in ("no-such-file.dat", ".", "/dev/null/x", "~nobody-of-that-name/x", "a\x00b"):
+            section, field = path.split(".")
+            changed = copy.deepcopy(data)
+            changed.setdefault(section, {})[field] = {**block, "path": file}
+            text = yaml.safe_dump(changed, sort_keys=False).encode()
+            yield Broken(f"{path}: {block['kind']} at {file!r}", text, (field,))
+
+
+LAYOUTS = {
+    "empty": "",
+    "header alone": "east_m,north_m,up_m\n",
+    "one antenna": "east_m,north_m,up_m\n0,0,0\n",
+    "duplicate position": "east_m,north_m,up_m\n0,0,0\n0,0,0\n14,0,0\n28,0,0\n",
+    "duplicate number": "east_m,north_m,up_m,number\n0,0,0,1\n14,0,0,1\n28,0,0,2\n",
+    "duplicate name": "east_m,north_m,up_m,name\n0,0,0,a\n14,0,0,a\n28,0,0,b\n",
+    "not a number": "east_m,north_m,up_m\n0,0,0\n14,x,0\n28,0,0\n",
+    "nan": "east_m,north_m,up_m\n0,0,0\nnan,0,0\n28,0,0\n",
+    "infinite": "east_m,north_m,up_m\n0,0,0\ninf,0,0\n28,0,0\n",
+    "missing column": "east_m,north_m\n0,0\n14,0\n28,0\n",
+    "short row": "east_m,north_m,up_m\n0,0,0\n14,0\n28,0,0\n",
+    "long row": "east_m,north_m,up_m\n0,0,0\n14,0,0,7\n28,0,0\n",
+    "far away": "east_m,north_m,up_m\n0,0,0\n1e9,0,0\n28,0,0\n",
+    "negative number": "east_m,north_m,up_m,number\n0,0,0,-1\n14,0,0,1\n28,0,0,2\n",
+    "fractional number": "east_m,north_m,up_m,number\n0,0,0,1.5\n14,0,0,1\n28,0,0,2\n",
+    "not text": "\x00\x01\x02\xff",
+    "semicolons": "east_m;north_m;up_m\n0;0;0\n14;0;0\n",
+}
+"""Bad tables of antenna positions."""
+
+
+def bad_layouts(folder: Path) -> Iterator[Broken]:
+    """Yield experiments whose layout is a CSV file with a fault."""
+    for index, (name, table) in enumerate(LAYOUTS.items()):
+        path = folder / f"layout{index}.csv"
+        path.write_bytes(table.encode("latin-1"))
+        data = _with(tiny(folder), ("instrument", "layout"), {"kind": "csv", "path": str(path)})
+        yield Broken(f"layout: {name}", yaml.safe_dump(data, sort_keys=False).encode(), (path.name, "longest baseline"))
+
+
+def bad_texts(folder: Path) -> Iterator[Broken]:
+    """Yield files that are not the YAML of a block of keys, or not safe to build."""
+    good = yaml.safe_dump(tiny(folder), sort_keys=False)
+    laughs = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+        f"{new}: &{new} [{', '.join(f'*{old}' for _ in range(9))}]\n" for old, new in itertools.pairwise("abcdefghi")
+    )
+    texts = {
+        "empty": b"",
+        "comment": b"# nothing\n",
+        "list": b"- name\n- instrument\n",
+        "number": b"3\n",
+        "text": b"quickstart\n",
+        "tab": b"name: x\n\tinstrument: {}\n",
+        "unclosed": b"name: {x\n",
+        "duplicate key": b"name: x\nname: y\n",
+        "duplicate inner key": good.encode() + b"power: {taper: hann, taper: none}\n",
+        "number as key": b"name: x\n3: y\n",
+        "list as key": b"? [a, b]\n: y\n",
+        "null key": b"name: x\n~: y\n",
+        "two documents": b"name: x\n---\nname: y\n",
+        "latin-1": "name: é\n".encode("latin-1"),
+        "utf-16": good.encode("utf-16"),
+        "nul": good.encode() + b"\x00",
+        "control": b"name: \x07x\n",
+        "binary": bytes(range(256)),
+        "undefined alias": b"name: *x\n",
+        "recursive alias": b"name: &x [*x]\n",
+        "recursive block": b"name: x\ninstrument: &i {beam: *i}\n",
+        "merge key": b"name: x\ninstrument: &i {beam: airy}\nsky: {<<: *i}\n",
+        "billion laughs": laughs.encode(),
+        "deep": b"name: " + b"[" * 3000 + b"]" * 3000,
+        "deep blocks": b"name: " + b"{a: " * 2000 + b"x" + b"}" * 2000,
+        "system": b"name: !!python/object/apply:os.system ['touch pwned']\n",
+        "object": b"name: !!python/object:calstudy.errors.InputError {}\n",
+        "module": b"name: !!python/module:os\n",
+        "python name": b"name: !!python/name:os.system\n",
+        "python tuple": b"name: x\nsweep: !!python/tuple [1, 2]\n",
+        "own tag": b"name: !experiment x\n",
+        "binary tag": b"name: !!binary aGVsbG8=\n",
+        "set tag": b"name: x\nvariants: !!set {a, b}\n",
+        "timestamp": b"name: 2022-04-22\n",
+        "bad timestamp": b"name: 2022-99-99\n",
+        "bad int tag": b"name: !!int x\n",
+        "bad float tag": b"name: !!float x\n",
+        "sexagesimal": b"name: x\ninstrument: {times: {start_lst: 1:30:00}}\n",
+        "octal": b"name: 0777\n",
+        "huge integer": b"name: x\nsky: {eor: {seed: " + b"9" * 5000 + b"}}\n",
+        "missing name": yaml.safe_dump({k: v for k, v in tiny(folder).items() if k != "name"}).encode(),
+        "path as name": good.replace("name: tiny", "name: ../tiny").encode(),
+        "absolute name": good.replace("name: tiny", "name: /tmp/tiny").encode(),
+        "dots as name": good.replace("name: tiny", "name: ..").encode(),
+        "escaping variant": good.encode() + b"variants: {../x: {components: [eor]}}\n",
+        "empty variants": good.encode() + b"variants: {}\n",
+        "bad sweep": good.encode() + b"sweep: {no.such.field: [1, 2]}\n",
+        "empty sweep": good.encode() + b"sweep: {sky.eor.seed: []}\n",
+        "sweep of a block": good.encode() + b"sweep: {sky.eor.seed.x: [1]}\n",
+        "sweep of wrong values": good.encode() + b"sweep: {sky.eor.seed: [1, banana]}\n",
+        "sweep with dots": good.encode() + b"sweep: {'..': [1]}\n",
+        "same seeds": good.replace("factor: 2", "factor: 2\n    seeds: [3, 3]").encode(),
+        "collection of nothing": b"name: x\nexperiments: []\n",
+        "collection without name": b"experiments: [x.yaml]\n",
+        "collection of a missing file": b"name: x\nexperiments: [nowhere.yaml]\n",
+        "collection of numbers": b"name: x\nexperiments: [3]\n",
+        "collection of itself": b"name: x\nexperiments: [file.yaml]\n",
+        "collection with a bad figure": b"name: x\nexperiments: [file.yaml]\nfigures: [banana]\n",
+    }
+    for name, text in texts.items():
+        yield Broken(name, text, ())
+
+
+def all_broken(folder: Path) -> list[Broken]:
+    """Return all of them."""
+    makers = (wrong_values, unknown_keys, missing_files, bad_layouts, bad_texts)
+    return [item for make in makers for item in make(folder)]
