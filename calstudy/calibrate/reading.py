@@ -32,7 +32,7 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
     Raises
     ------
     InputError
-        If a path does not exist, or pyuvdata cannot read it.
+        If a path does not exist, pyuvdata cannot read it, or its antennas have no place.
     """
     for path in paths:
         if not path.exists():
@@ -45,6 +45,8 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
         raise InputError(f"{', '.join(names)}: cannot be read as visibilities ({_first_sentence(error)})") from None
     if data.data_array is None:
         raise InputError(f"{', '.join(names)}: holds no visibilities")
+    if not np.isfinite(data.telescope.antenna_positions).all():
+        raise InputError(f"{', '.join(names)}: antenna positions are not finite")
     return data
 
 
