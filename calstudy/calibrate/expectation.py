@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from pyuvdata import UVData
 
-from calstudy.calibrate.absorption import DENSE, DelayModes, ExpectedTransfer, expected_transfer, jacobian_size
+from calstudy.calibrate.absorption import DENSE, ExpectedTransfer, expected_transfer, jacobian_size
 from calstudy.calibrate.measured import make_problem, measure
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.calibrate.tangent import DelayModes
 from calstudy.visibilities import to_cube
 
 PROBES = 16

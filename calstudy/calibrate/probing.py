@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import tensorflow as tf
 
@@ -18,9 +16,7 @@ from calstudy.calibrate.solvers.preconditioners import (
     solve_antennas,
     solve_channels,
 )
-
-if TYPE_CHECKING:
-    from calstudy.calibrate.absorption import DelayModes, Tangent
+from calstudy.calibrate.tangent import DelayModes, Tangent
 
 CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from calstudy.calibrate.absorption import DelayModes, expected_transfer
+from calstudy.calibrate.absorption import expected_transfer
 from calstudy.calibrate.measured import make_problem, measure
 from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.calibrate.tangent import DelayModes
 from calstudy.errors import InputError
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.expected import BaselineModes, ExpectedBins, bin_expected

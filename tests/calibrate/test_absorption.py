@@ -9,11 +9,12 @@ import pytest
 from test_calibration_loss import redundant_structure
 from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
-from calstudy.calibrate.absorption import DelayModes, expected_transfer
+from calstudy.calibrate.absorption import expected_transfer
 from calstudy.calibrate.gain_space import gain_vectors
 from calstudy.calibrate.problem import flag_weights, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import WarmStart, solve_warm
+from calstudy.calibrate.tangent import DelayModes
 
 MODES = DelayModes(FREQUENCIES)
 
