@@ -8,22 +8,10 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import numpy as np
 import pytest
+from observations import small_instrument
 from pyuvdata import UVData
 
-from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
-
-
-def small_instrument(**changes: object) -> InstrumentSettings:
-    """Return a five-antenna, 16-channel, 3-integration observation, with sections replaced by `changes`."""
-    sections = {
-        "layout": {"kind": "hex", "side": 2, "spacing": "14 m"},
-        "beam": "gaussian",
-        "channels": {"count": 16, "width": "240 kHz"},
-        "times": {"count": 3},
-        **changes,
-    }
-    return InstrumentSettings.model_validate(sections)
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import small_instrument
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from observations import small_instrument
 
 from calstudy.calibrate.settings import CalibrationSettings
 from calstudy.calibrate.structure import make_structure
