@@ -56,16 +56,18 @@ def regress(
             accept(against, folders[0])
             console.print(f"{folders[0]}: new reference", markup=False)
             return
-    holds = True
+    made, holds = {}, True
     for reference in find_references(folders or [Path("figures")]):
         run = against or remake(reference, overrides or (), workers, max_memory, scheduler, console)
         regression = _compare(reference, run)
         show(regression, console)
         write_json(regression, run)
-        if update:
-            accept(run, reference)
-            console.print(f"{reference}: updated", markup=False)
+        made[reference] = run
         holds = holds and (regression.holds or update)
+    # After all runs, whose manifests would otherwise call the checkout changed.
+    for reference, run in made.items() if update else ():
+        accept(run, reference)
+        console.print(f"{reference}: updated", markup=False)
     if not holds:
         raise typer.Exit(EXIT_MOVED)
 
