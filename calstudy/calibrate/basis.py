@@ -24,26 +24,41 @@ GRID_TOLERANCE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Bucket:
-    """Models that share one basis.
+    """Models that share one basis, or, if it is joint, one set of coefficients.
 
     Attributes
     ----------
     half_width
-        Largest modelled delay, in s.
+        Largest modelled delay, in s; None for a joint bucket.
     members
         Indices of the models in this bucket, shape (Nmembers,).
     vectors
-        Orthonormal sequences, shape (Nfreqs, Nvec), float64.
+        Orthonormal sequences, shape (Nfreqs, Nvec), float64, for which every member has coefficients of its own; or,
+        in a joint bucket, (Nmembers, Nfreqs, Nvec), orthonormal over all members together, with coefficients that the
+        members have in common.
     """
 
-    half_width: float
+    half_width: float | None
     members: np.ndarray
     vectors: np.ndarray
+
+    @property
+    def joint(self) -> bool:
+        """Whether the members have their coefficients in common."""
+        return self.vectors.ndim == 3
+
+    @property
+    def n_coefficients(self) -> int:
+        """Number of complex coefficients of the members together."""
+        return self.vectors.shape[-1] * (1 if self.joint else self.members.size)
 
 
 @dataclass(frozen=True, eq=False)
 class ForegroundBasis:
     """The bases of all foreground models (one model per baseline, or one per redundant group).
+
+    A model is one spectrum; models that are tied to each other by common coefficients are the members of a joint
+    bucket.
 
     Attributes
     ----------
@@ -60,7 +75,7 @@ class ForegroundBasis:
     @property
     def n_coefficients(self) -> int:
         """Number of complex coefficients of all models together."""
-        return sum(bucket.members.size * bucket.vectors.shape[1] for bucket in self.buckets)
+        return sum(bucket.n_coefficients for bucket in self.buckets)
 
 
 def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarray:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from pyuvdata import UVCal, UVData
 
+from calstudy.calibrate.joint import JointGroup
 from calstudy.calibrate.measured import Measured, make_problem, measure
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
 from calstudy.calibrate.products import make_gains, make_visibilities
@@ -52,6 +53,7 @@ def calibrate(
     sky_model: UVData | None = None,
     gains: UVCal | None = None,
     progress: Progress | None = None,
+    joint: Sequence[JointGroup] = (),
 ) -> CalibrationResult:
     """Solve for gains and foregrounds, independently for every polarization and every integration or group of them.
 
@@ -70,18 +72,20 @@ def calibrate(
         Where to start, before what `settings.initial_gains` says.
     progress
         Called after each solve with the number done and the total.
+    joint
+        Groups of baselines with common coefficients, before what `settings.joint_basis` says.
 
     Raises
     ------
     InputError
-        If weights or gains do not fit the data, or the sky-based calibrator has no sky model.
+        If weights, gains or joint groups do not fit the data, or the sky-based calibrator has no sky model.
     ValueError
         If the data are not rectangular, not finite where unflagged, of cross-hand polarizations, without any baseline
         to fit, or differ from the sky model in shape; or if the basis does not fit into the channels.
     """
     if settings.code is not None:
         raise InputError("calibration.calibrator: 'code' stands for another calibrator; it is run in studies only")
-    measured = measure(data, settings, sky_model, gains)
+    measured = measure(data, settings, sky_model, gains, joint)
     return _collect(measured, _solve_all(settings, measured, progress))
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from pyuvdata import UVData
 
 from calstudy.calibrate.absorption import DENSE, ExpectedTransfer, expected_transfer, jacobian_size
+from calstudy.calibrate.joint import JointGroup
 from calstudy.calibrate.measured import make_problem, measure
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import CalibrationSettings
@@ -21,6 +24,7 @@ def expect(
     result: CalibrationResult,
     sky_model: UVData | None = None,
     polarization: int = 0,
+    joint: Sequence[JointGroup] = (),
 ) -> ExpectedTransfer | None:
     """Return what is expected to be left of a white signal in the middle one of the usable solves.
 
@@ -29,7 +33,7 @@ def expect(
 
     Parameters
     ----------
-    data, settings, sky_model
+    data, settings, sky_model, joint
         As they were given to `calstudy.calibrate.calamity.calibrate`.
     result
         What it returned.
@@ -50,7 +54,7 @@ def expect(
         return None
     record = usable[len(usable) // 2]
     times = slice(record.integration, record.integration + record.n_integrations)
-    measured = measure(data, settings, sky_model)
+    measured = measure(data, settings, sky_model, joint=joint)
     problem = make_problem(measured, settings, times, polarization)
     solved = result.gains
     rows = np.searchsorted(solved.ant_array, measured.numbers, sorter=np.argsort(solved.ant_array))

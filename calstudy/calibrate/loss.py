@@ -18,9 +18,9 @@ def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tenso
     Parameters
     ----------
     coefficients
-        For each bucket, u of shape (2, Nmembers, Nvec).
+        For each bucket, u of shape (2, Nmembers, Nvec); (2, 1, Nvec) for a joint bucket.
     bases
-        For each bucket, the basis A of shape (Nvec, Nfreqs).
+        For each bucket, the basis A of shape (Nvec, Nfreqs); (Nvec, Nmembers, Nfreqs) for a joint bucket.
 
     Returns
     -------
@@ -28,9 +28,12 @@ def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tenso
     """
     real, imaginary = [], []
     for u, basis in zip(coefficients, bases, strict=True):
-        both = tf.reshape(u, [-1, basis.shape[0]]) @ basis
-        real.append(both[: u.shape[1]])
-        imaginary.append(both[u.shape[1] :])
+        n_vectors, n_frequencies = basis.shape[0], basis.shape[-1]
+        both = tf.reshape(u, [-1, n_vectors]) @ tf.reshape(basis, [n_vectors, -1])
+        both = tf.reshape(both, [-1, n_frequencies])
+        n_members = both.shape[0] // 2
+        real.append(both[:n_members])
+        imaginary.append(both[n_members:])
     return tf.concat(real, axis=0), tf.concat(imaginary, axis=0)
 
 

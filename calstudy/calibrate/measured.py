@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pyuvdata import UVCal, UVData
 
+from calstudy.calibrate.joint import JointGroup
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.products import require_parallel_hands
 from calstudy.calibrate.redundant_start import redundant_start
@@ -49,7 +51,11 @@ class Measured:
 
 
 def measure(
-    data: UVData, settings: CalibrationSettings, sky_model: UVData | None = None, gains: UVCal | None = None
+    data: UVData,
+    settings: CalibrationSettings,
+    sky_model: UVData | None = None,
+    gains: UVCal | None = None,
+    joint: Sequence[JointGroup] = (),
 ) -> Measured:
     """Collect what is fitted; parameters and errors as in `calstudy.calibrate.calamity.calibrate`."""
     fitted = _fitted_baselines(data, settings.autos)
@@ -61,7 +67,7 @@ def measure(
     elif settings.calibrator == "sky-based":
         raise InputError("calibration.calibrator: 'sky-based' needs a sky model, and there is none")
     _require_finite(data)
-    structure, numbers = make_structure(data, settings)
+    structure, numbers = make_structure(data, settings, joint)
     if gains is None and settings.initial_gains.kind == "file":
         gains = read_gains(settings.initial_gains.path, "calibration.initial_gains.path")
     if gains is None and settings.initial_gains.kind == "redundant":

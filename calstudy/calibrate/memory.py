@@ -42,7 +42,7 @@ class Dimensions:
     def of(cls, structure: FitStructure) -> Dimensions:
         """Return those of a fit structure."""
         basis = structure.basis
-        widest = max(bucket.vectors.shape[1] for bucket in basis.buckets)
+        widest = max(bucket.vectors.shape[-1] for bucket in basis.buckets)
         return cls(
             structure.n_antennas,
             structure.n_baselines,

@@ -41,7 +41,8 @@ def read_settings(path: Path | None, changes: dict[str, Any], overrides: list[st
         settings = CalibrationSettings.model_validate(content)
     except ValidationError as error:
         raise ExperimentError(sentences(error, CalibrationSettings, content)) from None
-    for block in (settings.weights, settings.initial_gains):
-        if block.kind == "file" and not block.path.exists():
+    blocks = [block for block in (settings.weights, settings.initial_gains) if block.kind == "file"]
+    for block in (*blocks, settings.joint_basis):
+        if block is not None and not block.path.exists():
             raise InputError(f"{block.path}: no such file")
     return settings

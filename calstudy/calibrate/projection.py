@@ -4,6 +4,9 @@ For gains g and a baseline p = (a, b) write G_p = g_a g_b* and D_p = w_p |G_p|^2
 likelihood is linear least squares in u_R, with normal matrix N_R = A^T (sum_p D_p) A over the baselines of R. Putting
 its solution back leaves a function of the gains alone (Golub & Pereyra 1973), whose gradient and Gauss-Newton matrix
 are below for a relative change eta of the gains, g (1 + eta).
+
+Models m that have their coefficients in common count as one, whose channels are those of all of them, one after the
+other: N = sum_m A_m^T D_m A_m.
 """
 
 from __future__ import annotations
@@ -42,10 +45,11 @@ class Projection(NamedTuple):
         F on the baselines, shape (2, Nbls, Nfreqs), float32.
     absorber
         W of the models of each stretch, shape (Nmembers, Q, Q), float32: foregrounds answer a weighted change y of the
-        visibilities of their group with ``Q W Q^T y``, where Q is the common basis.
+        visibilities of their group with ``Q W Q^T y``, where Q is the common basis. For a joint piece the root S of
+        ``W = S^T S`` instead, shape (1, Nvec, Nmembers * Q), W being that of all members together.
     roots
         For each piece roots R of the inverse of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel without the
-        common basis is ``Q W Q^T = (R A^T)^T (R A^T)``.
+        common basis is ``Q W Q^T = (R A^T)^T (R A^T)``. The members of a joint piece have one R together.
     """
 
     loss: tf.Tensor
@@ -77,7 +81,8 @@ class Projector:
     common
         Orthonormal basis Q that spans all bases, (Nfreqs, rank), float32.
     overlaps
-        A^T Q of each piece, (Nvec, rank), float32.
+        A^T Q of each piece, (Nvec, rank), float32; one member after the other, (Nvec, Nmembers * rank), if it is
+        joint.
 
     The loss, its gradient and N are evaluated in float64: in float32 the scale of the gains drifts unseen. The inner
     products of the iteration need only float32.
@@ -87,12 +92,15 @@ class Projector:
         self.tensors = tensors
         self._stretches = tensors.stretches
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
-        left, singular, _ = np.linalg.svd(np.concatenate(distinct, axis=1), full_matrices=False)
+        left, singular, _ = np.linalg.svd(
+            np.concatenate([_side_by_side(basis) for basis in distinct], axis=1), full_matrices=False
+        )
         common = left[:, singular > SPAN_CUTOFF * singular[0]]
         self.common = tf.constant(common, tf.float32)
         self.rank = common.shape[1]
-        self._bases = [tf.constant(basis, tf.float64) for basis in tensors.bases]
-        self.overlaps = [tf.constant(basis.T @ common, tf.float32) for basis in tensors.bases]
+        self._joint = [basis.ndim == 3 for basis in tensors.bases]
+        self._bases = [tf.constant(basis.reshape(-1, basis.shape[-1]), tf.float64) for basis in tensors.bases]
+        self.overlaps = [tf.constant(_overlap(basis, common), tf.float32) for basis in tensors.bases]
         self.project = tf.function(self._project)
 
     def _factor(self, curvature: tf.Tensor, basis: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
@@ -111,6 +119,25 @@ class Projector:
         root = tf.linalg.triangular_solve(tf.linalg.cholesky(normal + ridge * identity), identity)
         again = tf.linalg.cholesky(identity + ridge * tf.matmul(root, root, transpose_b=True))
         return tf.linalg.cholesky(normal), tf.matmul(again, root, transpose_a=True)
+
+    def spread(self, index: int, root: tf.Tensor, by_member: bool = False) -> tf.Tensor:
+        """Return R A^T Q of one piece: for every model (Nvec, rank), for a joint piece (Nvec, Nmembers * rank).
+
+        Parameters
+        ----------
+        index, root
+            The piece, and its R.
+        by_member
+            Return the rows of all members, one after the other, (Nmembers * Nvec, rank), also of a joint piece.
+        """
+        overlap = self.overlaps[index]
+        n_vectors = overlap.shape[0]
+        rows = tf.reshape(root, [-1, n_vectors]) @ overlap
+        if not by_member:
+            return tf.reshape(rows, [-1, n_vectors, overlap.shape[1]])
+        if self._joint[index]:
+            rows = tf.transpose(tf.reshape(rows, [n_vectors, -1, self.rank]), [1, 0, 2])
+        return tf.reshape(rows, [-1, self.rank])
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
         pieces: list[_Piece] = []
@@ -137,7 +164,7 @@ class Projector:
 
     def _project_piece(self, index: int, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> _Piece:
         """Eliminate the foregrounds of one piece of models."""
-        tensors, basis, overlap = self.tensors, self._bases[index], self.overlaps[index]
+        tensors, basis = self.tensors, self._bases[index]
         start, (first, last) = tensors.slices[index][0], tensors.baseline_slices[index]
         visibilities, weights = visibilities[:, first:last], weights[first:last]
         products = tensors.gain_products(gains, first, last)
@@ -149,14 +176,15 @@ class Projector:
         else:
             group_curvature = tf.math.segment_sum(curvature, owner)
             matched = tf.stack([tf.math.segment_sum(part, owner) for part in tf.unstack(matched)])
-        factor, root = self._factor(group_curvature, basis)
-        n_frequencies, n_vectors = basis.shape
-        projected = tf.reshape(tf.reshape(matched, [-1, n_frequencies]) @ basis, [2, -1, n_vectors])
+        # More than the channels of one model where all members of a joint piece are one.
+        length, n_vectors = basis.shape
+        factor, root = self._factor(tf.reshape(group_curvature, [-1, length]), basis)
+        projected = tf.reshape(tf.reshape(matched, [-1, length]) @ basis, [2, -1, n_vectors])
         coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
         coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
-        model = tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, n_frequencies])
+        model = tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, tensors.n_frequencies])
         root = tf.cast(root, tf.float32)
-        spread = tf.reshape(tf.reshape(root, [-1, n_vectors]) @ overlap, [-1, n_vectors, self.rank])
+        spread = self.spread(index, root)
         baseline_model = model if owner is None else tf.gather(model, owner, axis=1)
         residual = visibilities - pairs.multiply(products, baseline_model)
         return _Piece(
@@ -165,15 +193,17 @@ class Projector:
             pairs.conjugate_multiply(baseline_model, weights * pairs.conjugate_multiply(products, residual)),
             tf.cast(curvature, tf.float32),
             tf.cast(baseline_model, tf.float32),
-            tf.matmul(spread, spread, transpose_a=True),
+            spread if self._joint[index] else tf.matmul(spread, spread, transpose_a=True),
             root,
         )
 
     def absorb(self, values: tf.Tensor, absorber: tuple[tf.Tensor, ...]) -> tf.Tensor:
         """Return ``Q W Q^T values`` for each model; values and result (2, Nmodels, Nfreqs)."""
-        edges = [self.tensors.models_of(stretch) for stretch in self._stretches]
-        parts = zip(edges, absorber, strict=True)
-        answers = [self._absorb_stretch(values[:, first:last], matrices) for (first, last), matrices in parts]
+        answers = []
+        for stretch, matrices in zip(self._stretches, absorber, strict=True):
+            first, last = self.tensors.models_of(stretch)
+            absorb = self._absorb_joint if self._joint[stretch[0]] else self._absorb_stretch
+            answers.append(absorb(values[:, first:last], matrices))
         return answers[0] if len(answers) == 1 else tf.concat(answers, axis=1)
 
     def _absorb_stretch(self, values: tf.Tensor, absorber: tf.Tensor) -> tf.Tensor:
@@ -184,6 +214,14 @@ class Projector:
         outer = tf.matmul(tf.reshape(inner, [-1, rank]), self.common, transpose_b=True)
         return tf.reshape(outer, tf.shape(values))
 
+    def _absorb_joint(self, values: tf.Tensor, root: tf.Tensor) -> tf.Tensor:
+        """Return the answer of a joint piece, whose members respond to each other's changes."""
+        n_frequencies, rank = self.common.shape
+        inner = tf.reshape(tf.reshape(values, [-1, n_frequencies]) @ self.common, [2, -1])
+        inner = tf.matmul(inner, root[0], transpose_b=True) @ root[0]
+        outer = tf.matmul(tf.reshape(inner, [-1, rank]), self.common, transpose_b=True)
+        return tf.reshape(outer, tf.shape(values))
+
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs), float32."""
         tensors = self.tensors
@@ -191,3 +229,15 @@ class Projector:
         change = curvature * pairs.multiply(model, tensors.relative_change(eta))
         absorbed = tensors.to_baselines(self.absorb(tensors.sum_pairs_over_group(change), projection.absorber))
         return tensors.sum_over_antenna(pairs.conjugate_multiply(model, change - curvature * absorbed))
+
+
+def _side_by_side(basis: np.ndarray) -> np.ndarray:
+    """Return a basis (Nfreqs, Nvec), or those of all members of a joint piece, (Nfreqs, Nmembers * Nvec)."""
+    return basis if basis.ndim == 2 else np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)
+
+
+def _overlap(basis: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """Return A^T Q, (Nvec, rank), or those of all members of a joint piece, (Nvec, Nmembers * rank)."""
+    if basis.ndim == 2:
+        return basis.T @ common
+    return np.moveaxis(basis.transpose(0, 2, 1) @ common, 0, 1).reshape(basis.shape[-1], -1)

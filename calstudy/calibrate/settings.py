@@ -132,6 +132,12 @@ class RedundantStart(Section):
 InitialGains = Annotated[UnityStart | FileStart | RedundantStart, Field(discriminator="kind"), choice("kind", "unity")]
 
 
+class JointBasisSettings(Section):
+    """Foreground models of several baselines at once, from an .npz file (see the page on calibration)."""
+
+    path: Path = Field(strict=False)
+
+
 class CalibrationSettings(Section):
     """The calibrator, its foreground basis and its solver."""
 
@@ -147,6 +153,13 @@ class CalibrationSettings(Section):
     )
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are one group.")
     basis: BasisSettings = BasisSettings()
+    # Left out where it is not used, so that calibrations without it are identified as before.
+    joint_basis: JointBasisSettings | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="Groups of baselines with common coefficients and vectors of your own, in place of the DPSS basis; "
+        "other baselines keep theirs.",
+    )
     solver: Solver = GaussNewtonSettings()
     prior: Literal["sum", "post-hoc", "gains", "none"] = Field(
         "sum",
@@ -180,4 +193,12 @@ class CalibrationSettings(Section):
     def _code_goes_with_its_calibrator(self) -> CalibrationSettings:
         if (self.calibrator == "code") != (self.code is not None):
             raise fault("code", "goes with calibrator: code, and that needs it")
+        return self
+
+    @model_validator(mode="after")
+    def _joint_basis_is_used(self) -> CalibrationSettings:
+        if self.joint_basis is not None and self.calibrator not in ("calamity", "calamity-redundant"):
+            raise fault(
+                "joint_basis", f"goes with the calibrators calamity and calamity-redundant, not {self.calibrator}"
+            )
         return self

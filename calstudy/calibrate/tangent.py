@@ -54,7 +54,8 @@ class Tangent:
     conjugated
         Baselines that see the conjugate of their model, (Nbls,) bool.
     sequences
-        For each model its baselines, and orthonormal sequences on all of them, (Nmembers, Nfreqs, Nkept), real.
+        For each model, or joint bucket of models, its baselines, and orthonormal sequences on all of them,
+        (Nmembers, Nfreqs, Nkept), real.
     """
 
     roots: np.ndarray
@@ -71,6 +72,10 @@ class Tangent:
         sequences = []
         if not problem.frozen:
             for bucket in structure.basis.buckets:
+                if bucket.joint:
+                    row, members = np.nonzero(structure.groups == bucket.members[:, None])
+                    sequences.append((members, _orthonormal(roots[members], bucket.vectors[row])))
+                    continue
                 for index in bucket.members:
                     members = np.flatnonzero(structure.groups == index)
                     sequences.append((members, _orthonormal(roots[members], bucket.vectors)))
@@ -97,8 +102,11 @@ class Tangent:
 
 
 def _orthonormal(roots: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of the sequences (Nfreqs, Nvec), weighted by `roots` (Nmembers, Nfreqs)."""
-    weighted = (roots[:, :, None] * vectors).reshape(-1, vectors.shape[1])
+    """Return an orthonormal basis of the sequences, weighted by `roots` (Nmembers, Nfreqs).
+
+    The sequences are (Nfreqs, Nvec), the same on all members, or (Nmembers, Nfreqs, Nvec).
+    """
+    weighted = (roots[:, :, None] * vectors).reshape(-1, vectors.shape[-1])
     left, singular, _ = np.linalg.svd(weighted, full_matrices=False)
     kept = singular > SPAN_CUTOFF * max(singular[0], np.finfo(float).tiny)
     return left[:, kept].reshape(*roots.shape, -1)

@@ -46,15 +46,17 @@ class FitTensors:
         Whether any baselines share a model.
     model_index
         Model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model.
+    coupled
+        Whether any baselines share a model or coefficients.
     slices
-        Range of models of each piece: a bucket, or a part of a large one.
+        Range of models of each piece: a bucket, or a part of a large one that is not joint.
     baseline_slices
         Range of baselines that have the models of each piece.
     stretches
         Consecutive pieces that are worked on together, as ranges of their indices: as many as have `models_at_once`
-        baselines, or one that has more.
+        baselines, or one that has more or is joint.
     bases
-        Basis of each piece, shape (Nfreqs, Nvec), float64 arrays.
+        Basis of each piece, shape (Nfreqs, Nvec), or (Nmodels, Nfreqs, Nvec) if it is joint, float64 arrays.
     gain_vectors
         As in the structure.
     orientation
@@ -84,13 +86,16 @@ class FitTensors:
         self.slices, self.bases, first = [], [], 0
         for bucket in buckets:
             last = first + bucket.members.size
-            for start in range(first, last, piece):
-                self.slices.append((start, min(start + piece, last)))
+            step = bucket.members.size if bucket.joint else piece
+            for start in range(first, last, step):
+                self.slices.append((start, min(start + step, last)))
                 self.bases.append(bucket.vectors)
             first = last
         edges = np.searchsorted(position[self._order], self.slices)
         self.baseline_slices = [(int(start), int(end)) for start, end in edges]
-        self.stretches = _stretches(self.baseline_slices, piece)
+        joint = [basis.ndim == 3 for basis in self.bases]
+        self.coupled = self.shared or any(joint)
+        self.stretches = _stretches(self.baseline_slices, piece, joint)
         self.gain_vectors = structure.gain_vectors
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
 
@@ -165,11 +170,12 @@ class FitTensors:
         return self.baseline_slices[stretch[0]][0], self.baseline_slices[stretch[-1]][1]
 
 
-def _stretches(slices: Sequence[tuple[int, int]], most: int) -> list[range]:
-    """Return ranges of consecutive slices that hold `most` elements together, or one slice that holds more."""
+def _stretches(slices: Sequence[tuple[int, int]], most: int, alone: Sequence[bool]) -> list[range]:
+    """Return ranges of consecutive slices that hold `most` elements together, or one that holds more or is `alone`."""
     first, found = 0, []
     for index in range(1, len(slices) + 1):
-        if index == len(slices) or slices[index][1] - slices[first][0] > most:
+        full = index == len(slices) or slices[index][1] - slices[first][0] > most
+        if full or alone[index] or alone[first]:
             found.append(range(first, index))
             first = index
     return found

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_calibration_loss import redundant_structure
+from test_joint_basis import joined
 from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
 from calstudy.calibrate.absorption import expected_transfer
@@ -36,11 +37,14 @@ def brute_force(problem, gains, model):
                 moved = change[first] * gains[second].conj() + gains[first] * change[second].conj()
                 tangents.append(roots * moved * model)
         for bucket in structure.basis.buckets:
-            for index in bucket.members:
-                for vector in bucket.vectors.T:
+            # Each member has coefficients of its own, or all of them together.
+            for members in [bucket.members] if bucket.joint else bucket.members[:, None]:
+                sequences = bucket.vectors if bucket.joint else bucket.vectors[None]
+                for column in range(sequences.shape[2]):
                     moved = np.zeros(shape, complex)
-                    for p in np.flatnonzero(structure.groups == index):
-                        moved[p] = (np.conj(unit) if structure.conjugated[p] else unit) * vector
+                    for index, vector in zip(members, sequences[:, :, column], strict=True):
+                        for p in np.flatnonzero(structure.groups == index):
+                            moved[p] = (np.conj(unit) if structure.conjugated[p] else unit) * vector
                     tangents.append(roots * products * moved)
     # The phases of g_a g_b* turn the plane of each sample, which isotropic signals do not see.
     turned = np.array(tangents) * (np.abs(products) / products)
@@ -59,8 +63,12 @@ def in_the_basis(toy, structure, seed=2):
     rng = np.random.default_rng(seed)
     model = np.empty(toy.foregrounds.shape, complex)
     for bucket in structure.basis.buckets:
-        for index in bucket.members:
-            spectrum = bucket.vectors @ complex_normal(rng, (bucket.vectors.shape[1],))
+        common = complex_normal(rng, (bucket.vectors.shape[-1],)) if bucket.joint else None
+        for row, index in enumerate(bucket.members):
+            if common is not None:
+                spectrum = bucket.vectors[row] @ common
+            else:
+                spectrum = bucket.vectors @ complex_normal(rng, (bucket.vectors.shape[1],))
             for p in np.flatnonzero(structure.groups == index):
                 model[p] = spectrum.conj() if structure.conjugated[p] else spectrum
     return model
@@ -74,7 +82,9 @@ def case(kind):
     gains = toy.gains
     if kind == "flags":
         flags[2, 10:14] = flags[4] = flags[:, 40] = True
-    if kind == "smooth gains":
+    if kind.startswith("joint"):
+        structure = joined(structure)
+    if kind.endswith("smooth gains"):
         vectors = gain_vectors(FREQUENCIES, 400e-9, 1e-12)
         structure = replace(structure, gain_vectors=vectors)
         gains = 1 + 0.3 * complex_normal(np.random.default_rng(1), (5, vectors.shape[1])) @ vectors.T
@@ -83,7 +93,7 @@ def case(kind):
     return toy.problem(structure, visibilities=data, weights=flag_weights(flags)), gains, model
 
 
-KINDS = ["any gains", "flags", "smooth gains", "redundant"]
+KINDS = ["any gains", "flags", "smooth gains", "redundant", "joint", "joint, smooth gains"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -92,7 +102,9 @@ def test_exact_diagonal_is_that_of_the_projector_on_all_tangent_vectors(kind):
     found = expected_transfer(problem, gains, model, MODES)
     brute = brute_force(problem, gains, model)
     # Smooth gains times foregrounds come close to other foregrounds: there the solver's damping matters a little.
-    assert np.allclose(found.transfer, brute, rtol=0, atol=1e-2 if kind == "smooth gains" else 5e-4, equal_nan=True)
+    assert np.allclose(
+        found.transfer, brute, rtol=0, atol=1e-2 if kind.endswith("smooth gains") else 5e-4, equal_nan=True
+    )
     assert np.isnan(found.transfer).all(axis=1).sum() == (kind == "flags")
     assert np.nanmax(brute) - np.nanmin(brute) > 0.5
     total = found.transfer + found.foregrounds + found.gains

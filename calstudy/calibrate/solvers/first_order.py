@@ -108,6 +108,13 @@ class Optimizer:
         return tf.constant(self.learning_rate, step.dtype)
 
 
+def _coefficients(model: tf.Tensor, basis: np.ndarray) -> tf.Tensor:
+    """Return the coefficients of models (2, Nmembers, Nfreqs) in an orthonormal basis; see `foreground_model`."""
+    if basis.ndim == 2:
+        return model @ basis
+    return tf.reshape(model, [2, 1, -1]) @ basis.reshape(-1, basis.shape[-1])
+
+
 def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
     """Apply a function to all tensors of parameters, or of several alike."""
     return tf.nest.map_structure(function, *parameters)
@@ -152,7 +159,7 @@ class Kernels:
         self.tensors = FitTensors(structure)
         self.projector = Projector(self.tensors)
         self.space = GainSpace(structure.gain_vectors, self.dtype)
-        self.bases = [tf.constant(basis.T, self.dtype) for basis in self.tensors.bases]
+        self.bases = [tf.constant(np.moveaxis(basis, -1, 0), self.dtype) for basis in self.tensors.bases]
         self._optimizer, self._with_prior = optimizer, prior == "sum"
         self.descend = tf.function(self._descend, jit_compile=True)
 
@@ -166,7 +173,9 @@ class Kernels:
         else:
             best = self.projector.project(start, exact.visibilities, exact.weights).model
             parts = zip(self.tensors.slices, self.tensors.bases, strict=True)
-            coefficients = tuple(tf.cast(best[:, first:last] @ basis, self.dtype) for (first, last), basis in parts)
+            coefficients = tuple(
+                tf.cast(_coefficients(best[:, first:last], basis), self.dtype) for (first, last), basis in parts
+            )
         target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
         measured = (exact.visibilities, exact.weights)
         data = FitData(*(tf.cast(part, self.dtype) for part in measured), pairs.to_pair(target, self.dtype), model)

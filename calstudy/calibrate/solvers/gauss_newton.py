@@ -81,13 +81,14 @@ class Kernels:
     ----------
     by_channel
         Whether the antenna blocks of each channel are the preconditioner throughout: couplings between antennas remain
-        the strong ones where baselines share models, and are the only ones where the foregrounds are frozen.
+        the strong ones where baselines share models or coefficients, and are the only ones where the foregrounds are
+        frozen.
     """
 
     def __init__(self, structure: FitStructure, frozen: bool = False) -> None:
         self.tensors = FitTensors(structure)
         self.frozen = frozen
-        self.by_channel = (self.tensors.shared or frozen) and structure.gain_vectors is None
+        self.by_channel = (self.tensors.coupled or frozen) and structure.gain_vectors is None
         self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(self.tensors)
         self.space = GainSpace(structure.gain_vectors, tf.float32)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)

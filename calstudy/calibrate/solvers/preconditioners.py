@@ -71,7 +71,7 @@ class AntennaRows(NamedTuple):
 def antenna_rows(tensors: FitTensors) -> AntennaRows:
     """Return the rows of each antenna, for sequences stacked model after model."""
     sizes = np.concatenate(
-        [np.full(e - s, b.shape[1]) for (s, e), b in zip(tensors.slices, tensors.bases, strict=True)]
+        [np.full(e - s, b.shape[-1]) for (s, e), b in zip(tensors.slices, tensors.bases, strict=True)]
     )
     starts = np.cumsum(sizes) - sizes
     model = np.arange(tensors.n_baselines) if tensors.model_index is None else tensors.model_index.numpy()
@@ -107,10 +107,7 @@ def antenna_blocks(projector: Projector, projection: Projection) -> tf.Tensor:
     tensors, common = projector.tensors, projector.common
     # In the common basis, for all the sequences at once would be the largest array of a solve.
     rows = tf.concat(
-        [
-            tf.reshape(root, [-1, overlap.shape[0]]) @ overlap
-            for root, overlap in zip(projection.roots, projector.overlaps, strict=True)
-        ],
+        [projector.spread(index, root, by_member=True) for index, root in enumerate(projection.roots)],
         axis=0,
     )
     weighted = projection.curvature * projection.baseline_model
