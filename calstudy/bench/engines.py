@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -13,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calstudy.bench.apart import ask
 from calstudy.errors import InputError
 
 REFERENCE = "pyuvsim"
@@ -25,8 +22,6 @@ CANDIDATES = (
     ("pyuvsim", "double"),
 )
 """Engines and precisions that are compared. matvis in single precision rounds its phases to 1e-4 and is left out."""
-
-SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -131,14 +126,5 @@ def compare_engines(work: Work, engines: list[str], tell: Callable[[str], None] 
 def _run(work: Work, engine: str, precision: str, folder: Path) -> tuple[dict[str, float], np.ndarray]:
     path = folder / f"{engine}-{precision}.npy"
     request = {"work": asdict(work), "engine": engine, "precision": precision, "path": str(path)}
-    result = subprocess.run(
-        [sys.executable, "-m", "calstudy.bench.engine_process", json.dumps(request)],
-        env={**os.environ, **SINGLE_THREAD},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if result.returncode:
-        reason = (result.stderr.strip().splitlines() or ["no message"])[-1]
-        raise InputError(f"{engine} ({precision}) failed: {reason}")
-    return json.loads(result.stdout.splitlines()[-1]), np.load(path, allow_pickle=False)
+    usage = ask("calstudy.bench.engine_process", request)
+    return usage, np.load(path, allow_pickle=False)

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from astropy import constants
+
+from calstudy.power.spherical import outside_wedge
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def bin_expected(modes: BaselineModes, edges: Sequence[float], buffer: float, le
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(modes.transfer)
-    outside = known & (np.abs(modes.delay) > modes.length[:, None] / constants.c.value + buffer)
+    outside = known & outside_wedge(modes, buffer)
     bins = np.searchsorted(limits, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
     used = outside & (bins >= 0) & (bins < limits.size - 1)
     count = np.bincount(bins[used], minlength=limits.size - 1)

@@ -11,6 +11,7 @@ from astropy import constants
 from calstudy.power.errors import noise_modes, sample_modes
 
 if TYPE_CHECKING:
+    from calstudy.power.expected import BaselineModes
     from calstudy.power.settings import KBins, PowerSettings
     from calstudy.power.spectra import DelaySpectra
 
@@ -57,10 +58,10 @@ def make_bin_edges(bins: KBins) -> np.ndarray:
     return bins.min + bins.width * np.arange(count + 1)
 
 
-def outside_wedge(spectra: DelaySpectra, buffer: float) -> np.ndarray:
-    """Return which modes have |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool."""
-    horizon = spectra.length / constants.c.value
-    return np.abs(spectra.delay) > horizon[:, None] + buffer
+def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndarray:
+    """Return which modes have |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool, for Nu lengths and Nd delays."""
+    horizon = modes.length / constants.c.value
+    return np.abs(modes.delay) > horizon[:, None] + buffer
 
 
 def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool) -> SphericalSpectrum:

@@ -56,7 +56,7 @@ def run_collection(collection: Collection, workers: int, scheduler: str | None, 
     collection
         Validated.
     workers, scheduler, console
-        As for `calstudy.runs.run`.
+        As for `calstudy.running.runs.run`.
 
     Raises
     ------

@@ -28,7 +28,7 @@ Study = Experiment | Collection | Sweep
 def fit_study(
     study: Study, workers: int | None, max_memory: str | None, scheduler: str | None = None
 ) -> tuple[Study, int]:
-    """Fit an experiment, or all of a collection or sweep, to the machine, as `calstudy.capacity.fit` does.
+    """Fit an experiment, or all of a collection or sweep, to the machine, as `calstudy.running.capacity.fit` does.
 
     An experiment with a sweep becomes the family of its points.
     """
@@ -67,7 +67,7 @@ def plan_study(study: Study | RuntimeStudy, workers: int | None, max_memory: str
     study
         An experiment, with a sweep or without, a collection, or a run-time study.
     workers, max_memory
-        As for `calstudy.capacity.fit`.
+        As for `calstudy.running.capacity.fit`.
     console
         Where it is written.
     """
@@ -97,9 +97,9 @@ def run_study(
     study
         An experiment, with a sweep or without, a collection, or a run-time study.
     workers, max_memory
-        As for `calstudy.capacity.fit`.
+        As for `calstudy.running.capacity.fit`.
     scheduler, console
-        As for `calstudy.runs.run`.
+        As for `calstudy.running.runs.run`.
     """
     if isinstance(study, RuntimeStudy):
         fit_runtime(study, workers, max_memory, scheduler)

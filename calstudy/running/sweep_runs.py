@@ -47,7 +47,7 @@ def run_sweep(sweep: Sweep, workers: int = 1, scheduler: str | None = None, cons
     sweep
         From `calstudy.experiment.sweep.expand`.
     workers, scheduler, console
-        As for `calstudy.runs.run`.
+        As for `calstudy.running.runs.run`.
 
     Raises
     ------

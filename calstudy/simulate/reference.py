@@ -1,6 +1,7 @@
 """pyuvsim: the paper's simulator and the reference of the others.
 
-In a run that was started with ``mpiexec`` every rank computes its share of the visibilities; see `calstudy.ranks`.
+In a run that was started with ``mpiexec`` every rank computes its share of the visibilities; see
+`calstudy.running.ranks`.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ class Job:
     Attributes
     ----------
     settings
-        The part of the experiment that it reads, as in `calstudy.tasks.Task`.
+        The part of the experiment that it reads, as in `calstudy.graph.tasks.Task`.
     inputs
         Folders of the products it reads.
     output

@@ -24,26 +24,26 @@ SCALES = ("full", "small")
 class Must(Section):
     """What a measured number must be: one of the four."""
 
-    below: float | None = Field(None, description="At most this.")
-    above: float | None = Field(None, description="At least this.")
+    at_most: float | None = None
+    at_least: float | None = None
     within: Annotated[tuple[float, float], Field(strict=False)] | None = Field(None, description="Between these two.")
     equal: float | None = Field(None, description="This, within `sigmas` times the uncertainty.")
     sigmas: float = Field(3.0, gt=0)
 
     @model_validator(mode="after")
     def _one_condition(self) -> Must:
-        given = [name for name in ("below", "above", "within", "equal") if getattr(self, name) is not None]
+        given = [name for name in ("at_most", "at_least", "within", "equal") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise fault("", "must have exactly one of below, above, within, equal")
+            raise fault("", "must have exactly one of at_most, at_least, within, equal")
         return self
 
     @property
     def threshold(self) -> Threshold:
         """The condition, as the claims of the paper have them."""
-        if self.below is not None:
-            return Below(self.below)
-        if self.above is not None:
-            return Above(self.above)
+        if self.at_most is not None:
+            return Below(self.at_most)
+        if self.at_least is not None:
+            return Above(self.at_least)
         if self.within is not None:
             return Within(*self.within)
         return Consistent(self.equal, self.sigmas)

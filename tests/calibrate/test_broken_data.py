@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from command_line import run_command
 from pyuvdata import UVData
 from test_calamity import make_uvdata
-
-from calstudy import cli
 
 REFUSED, UNCONVERGED = 2, 3
 OPTIONS = ["--buffer", "50 ns", "--set", "basis.min_delay=50 ns", "--overwrite"]
@@ -25,20 +23,6 @@ def good(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("data") / "good.uvh5"
     make_uvdata(make_toy(scattered(6)), 1).write_uvh5(str(path))
     return path
-
-
-def calibrate(capsys, *arguments: object) -> tuple[int, str]:
-    """Run ``calstudy calibrate`` in this process; return its exit status and what it wrote to standard error."""
-    before = sys.argv
-    sys.argv = ["calstudy", "calibrate", *map(str, arguments)]
-    try:
-        cli.main()
-        status = 0
-    except SystemExit as end:
-        status = int(end.code or 0)
-    finally:
-        sys.argv = before
-    return status, capsys.readouterr().err
 
 
 def complaint(message: str) -> str:
@@ -111,7 +95,7 @@ def test_a_damaged_file_is_named(name, good, tmp_path, capsys):
     path = tmp_path / "data.uvh5"
     path.write_bytes(good.read_bytes())
     FILES[name](path)
-    status, message = calibrate(capsys, path, *OPTIONS, "--output", tmp_path / "out")
+    status, message = run_command(capsys, "calibrate", path, *OPTIONS, "--output", tmp_path / "out")
     assert status == REFUSED, message
     assert "data.uvh5" in complaint(message) or "frequencies" in complaint(message)
     assert not (tmp_path / "out" / "gains.calh5").exists()
@@ -124,7 +108,7 @@ def test_flipped_bytes_of_the_header_never_end_in_a_traceback(seed, good, tmp_pa
     path = tmp_path / "data.uvh5"
     path.write_bytes(good.read_bytes())
     flip(seed)(path)
-    status, message = calibrate(capsys, path, *OPTIONS, "--output", tmp_path / "out")
+    status, message = run_command(capsys, "calibrate", path, *OPTIONS, "--output", tmp_path / "out")
     assert status in (0, REFUSED, UNCONVERGED)
     assert "Traceback" not in message
 
@@ -233,7 +217,7 @@ def written(good: Path, change: Callable[[UVData], UVData], path: Path) -> Path:
 def test_data_that_cannot_be_calibrated_are_refused_with_the_reason(name, good, tmp_path, capsys):
     change, reason = REFUSALS[name]
     path = written(good, change, tmp_path / "data.uvh5")
-    status, message = calibrate(capsys, path, *OPTIONS, "--output", tmp_path / "out")
+    status, message = run_command(capsys, "calibrate", path, *OPTIONS, "--output", tmp_path / "out")
     assert status == REFUSED, message
     assert reason in complaint(message)
 
@@ -243,7 +227,7 @@ def test_data_that_cannot_be_calibrated_are_refused_with_the_reason(name, good, 
 def test_data_without_anything_in_them_are_not_said_to_be_calibrated(name, good, tmp_path, capsys):
     change, reason = SKIPPED[name]
     path = written(good, change, tmp_path / "data.uvh5")
-    status, message = calibrate(capsys, path, *OPTIONS, "--output", tmp_path / "out")
+    status, message = run_command(capsys, "calibrate", path, *OPTIONS, "--output", tmp_path / "out")
     assert status == UNCONVERGED
     assert reason in message
 
@@ -253,7 +237,7 @@ def test_data_without_anything_in_them_are_not_said_to_be_calibrated(name, good,
 @pytest.mark.filterwarnings("ignore")
 def test_odd_data_are_calibrated_or_refused_but_never_break(name, good, tmp_path, capsys):
     path = written(good, HARMLESS[name], tmp_path / "data.uvh5")
-    status, message = calibrate(capsys, path, *OPTIONS, "--output", tmp_path / "out")
+    status, message = run_command(capsys, "calibrate", path, *OPTIONS, "--output", tmp_path / "out")
     assert status in (0, REFUSED, UNCONVERGED)
     assert "Traceback" not in message
     if status == REFUSED:
@@ -270,6 +254,6 @@ def test_other_damaged_inputs_are_named(option, damage, good, tmp_path, capsys):
     else:
         content = {"text": b"not this\n", "cut": good.read_bytes()[:3000], "empty": b""}[damage]
         path.write_bytes(content)
-    status, message = calibrate(capsys, good, *OPTIONS, option, path, "--output", tmp_path / "out")
+    status, message = run_command(capsys, "calibrate", good, *OPTIONS, option, path, "--output", tmp_path / "out")
     assert status == REFUSED, message
     assert "other.h5" in complaint(message)

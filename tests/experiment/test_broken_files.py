@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
 from broken import Broken, all_broken, bad_layouts, bad_texts, missing_files
+from command_line import run_command
 from tiny import tiny
-
-from calstudy import cli
 
 REFUSED = 2
 HARMLESS = 40
 """Generated changes that are no mistakes, at most: the description may be anything."""
-
-
-def command(capsys, *arguments: str) -> tuple[int, str]:
-    """Run the command line in this process; return its exit status and what it wrote to standard error."""
-    before = sys.argv
-    sys.argv = ["calstudy", *arguments]
-    try:
-        cli.main()
-        status = 0
-    except SystemExit as end:
-        status = int(end.code or 0)
-    finally:
-        sys.argv = before
-    return status, capsys.readouterr().err
 
 
 def faulty(item: Broken, status: int, message: str) -> str:
@@ -50,7 +34,7 @@ def test_every_broken_file_is_refused_with_sentences_that_name_the_field(tmp_pat
     answers = []
     for item in items:
         Path("file.yaml").write_bytes(item.text)
-        answers.append((item, *command(capsys, "plan", "file.yaml")))
+        answers.append((item, *run_command(capsys, "plan", "file.yaml")))
     assert [fault for fault in (faulty(*answer) for answer in answers) if fault] == []
     refused = [item for item, status, _ in answers if status == REFUSED]
     assert len(refused) >= 200
@@ -64,7 +48,7 @@ def test_none_of_the_hand_written_ones_is_taken_for_good(make, tmp_path, capsys,
     monkeypatch.chdir(tmp_path)
     for item in make(tmp_path):
         Path("file.yaml").write_bytes(item.text)
-        assert command(capsys, "plan", "file.yaml")[0] == REFUSED, item.name
+        assert run_command(capsys, "plan", "file.yaml")[0] == REFUSED, item.name
 
 
 @pytest.mark.parametrize(
@@ -84,7 +68,7 @@ def test_none_of_the_hand_written_ones_is_taken_for_good(make, tmp_path, capsys,
 def test_broken_overrides_are_refused_in_a_sentence(option, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
-    status, message = command(capsys, "plan", "file.yaml", "--set", option)
+    status, message = run_command(capsys, "plan", "file.yaml", "--set", option)
     assert status == REFUSED
     assert message.startswith("calstudy: ")
     assert not Path("pwned").exists()
@@ -93,13 +77,13 @@ def test_broken_overrides_are_refused_in_a_sentence(option, tmp_path, capsys, mo
 def test_object_tags_are_refused_by_name(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("file.yaml").write_text("name: !!python/object/apply:os.system ['touch pwned']\n")
-    status, message = command(capsys, "plan", "file.yaml")
+    status, message = run_command(capsys, "plan", "file.yaml")
     assert status == REFUSED
     assert "python/object/apply:os.system is refused" in message
 
 
 @pytest.mark.parametrize("file", ["nowhere.yaml", ".", "/dev/null/x.yaml"])
 def test_an_experiment_that_cannot_be_read_is_named(file, capsys):
-    status, message = command(capsys, "plan", file)
+    status, message = run_command(capsys, "plan", file)
     assert status == REFUSED
     assert file in message

@@ -130,7 +130,7 @@ def test_a_broken_step_is_refused_in_a_sentence(change, sentence, tmp_path):
         "title": "x",
         "proves": "x",
         "rung": "engines",
-        "criteria": [{"measures": "x", "quantity": "x", "must": {"below": 1}, "why": "x"}],
+        "criteria": [{"measures": "x", "quantity": "x", "must": {"at_most": 1}, "why": "x"}],
     }
     path = tmp_path / "step.yaml"
     path.write_text(yaml.safe_dump({**good, **change}))

@@ -39,7 +39,7 @@ def ladder(tmp_path, monkeypatch) -> Path:
 
 
 def step(folder: Path, name: str, value: object) -> None:
-    criterion = {"measures": "number", "quantity": "a number", "must": {"below": 1}, "why": "because"}
+    criterion = {"measures": "number", "quantity": "a number", "must": {"at_most": 1}, "why": "because"}
     content = {"step": name, "title": "x", "proves": "y", "rung": "pretended", "parameters": {"value": value}}
     (folder / f"{name}.yaml").write_text(yaml.safe_dump({**content, "criteria": [criterion]}))
 
