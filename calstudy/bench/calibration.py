@@ -125,7 +125,7 @@ def measure(case: Case, integrations: int, adamax_steps: int, device: str = "cpu
             Row("peak memory of the process", f"{usage.peak_memory / 1e9:.1f} GB"),
         ]
         rows += _series(problems, solver, clock, unit)
-        return rows + _against_paper(problems[0], cold, cold_seconds, adamax_steps, clock)
+        return rows + _against_paper(problems[0], cold, adamax_steps, clock, unit)
 
 
 def _cold(problem: CalibrationProblem, solver: Solver, clock: Clock) -> tuple[Solution, float]:
@@ -136,6 +136,18 @@ def _cold(problem: CalibrationProblem, solver: Solver, clock: Clock) -> tuple[So
         solution = solve(problem, solver)
         seconds.append(clock() - start)
     return solution, min(seconds)
+
+
+def _close(problem: CalibrationProblem, loss: float, clock: Clock) -> tuple[float, int]:
+    """Return the best of three times in which the default solver, cold, has a loss this low, and its steps."""
+    solver, seconds = GaussNewton(FLOOR_TOLERANCE, 200), []
+    for _ in range(3):
+        start = clock()
+        state = solver.init(problem)
+        while solver.losses(state)[-1] > loss and solver.terminate(state) is None:
+            state = solver.step(state)
+        seconds.append(clock() - start)
+    return min(seconds), len(solver.losses(state)) - 1
 
 
 def _series(problems: list[CalibrationProblem], solver: Solver, clock: Clock, unit: str) -> list[Row]:
@@ -153,11 +165,15 @@ def _series(problems: list[CalibrationProblem], solver: Solver, clock: Clock, un
 
 
 def _against_paper(
-    problem: CalibrationProblem, cold: Solution, cold_seconds: float, adamax_steps: int, clock: Clock
+    problem: CalibrationProblem, cold: Solution, adamax_steps: int, clock: Clock, unit: str
 ) -> list[Row]:
     floor = min(solve(problem, GaussNewton(FLOOR_TOLERANCE, 200)).loss_history)
     above = cold.loss_history[-1] / floor - 1
-    rows = [Row("default solver, loss above the minimum", f"{100 * above:.3f} %")]
+    close_seconds, close_steps = _close(problem, ABOVE_FLOOR * floor, clock)
+    rows = [
+        Row("default solver, loss above the minimum", f"{100 * above:.3f} %"),
+        Row("the same solver, to 0.2 % above the minimum", f"{close_seconds:.2f} {unit}", f"{close_steps} steps"),
+    ]
     ours = adamax_step(problem, clock)
     rows.append(Row("Adamax step, ours", f"{1e3 * ours:.2f} ms"))
     if padded_memory(problem) > 0.8 * free_memory():
@@ -174,5 +190,5 @@ def _against_paper(
     bound = "" if steps else "at least "
     rows.append(Row("Adamax 0.01, steps to 0.2 % above the minimum", f"{steps}" if steps else f"not in {adamax_steps}"))
     rows.append(Row("Adamax 0.01, paper-style, to 0.2 %", f"{bound}{counted * paper:.0f} s"))
-    rows.append(Row("that over the default solver, cold", f"{bound}{counted * paper / cold_seconds:.0f}"))
+    rows.append(Row("that over the default solver, to 0.2 %", f"{bound}{counted * paper / close_seconds:.0f}"))
     return rows

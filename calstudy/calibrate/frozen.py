@@ -26,7 +26,7 @@ class FrozenForegrounds:
         pull = pairs.conjugate_multiply(model, weights * pairs.conjugate_multiply(products, residual))
         curvature = tf.cast(weights * pairs.squared_modulus(products), tf.float32)
         descent = self.tensors.sum_over_antenna(pull)
-        return Projection(loss, model, descent, curvature, tf.cast(model, tf.float32), (), ())
+        return Projection(loss, model, descent, curvature, tf.cast(model, tf.float32), ())
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the gains alone times eta, shape (2, Nants, Nfreqs), float32."""

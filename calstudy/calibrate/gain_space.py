@@ -68,10 +68,7 @@ class GainSpace:
             return values
         return self.reduce(pairs.multiply(gains, values) / pairs.squared_modulus(gains))
 
-    def reduce_blocks(self, blocks: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
-        """Return per-antenna matrices (Nants, Nfreqs, Nfreqs) on eta as matrices on coordinates, complex."""
-        if self.vectors is None:
-            return blocks
-        inverse = tf.complex(gains[0], -gains[1]) / tf.cast(pairs.squared_modulus(gains), blocks.dtype)
-        columns = inverse[:, :, None] * tf.cast(self.vectors, blocks.dtype)
-        return tf.matmul(columns, blocks @ columns, adjoint_a=True)
+    def columns(self, gains: tf.Tensor) -> tf.Tensor:
+        """Return eta of each antenna for a unit of each coefficient of a basis, (Nants, Nfreqs, Ngain), complex."""
+        inverse = 1 / tf.complex(gains[0], gains[1])
+        return inverse[:, :, None] * tf.cast(self.vectors, inverse.dtype)

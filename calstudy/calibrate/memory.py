@@ -76,19 +76,21 @@ def solve_memory(dimensions: Dimensions, settings: CalibrationSettings) -> float
     d = dimensions
     # The problem's complex visibilities and weights, and the solver's pairs of them.
     data = (2 + 1) * 2 * DOUBLE * d.samples
-    antenna_blocks = 2 * SINGLE * d.antennas * d.channels**2
+    by_channel = 8 * SINGLE * d.channels * d.antennas**2
+    # Smooth gains have coefficients in place of channels, hardly as many.
+    by_antenna = 0.0 if settings.gain_delay is None else 6 * SINGLE * d.antennas * d.channels**2
     if settings.calibrator == "sky-based":
-        return LIBRARIES + RETAINED * (data + 20 * SINGLE * d.samples + 3 * antenna_blocks)
-    # Model, curvature and model on the baselines; absorber; roots.
-    projection = 2 * DOUBLE * d.models * d.channels + 3 * SINGLE * d.samples
-    projection += SINGLE * (d.models * d.rank**2 + d.coefficients**2 / d.models)
+        return LIBRARIES + RETAINED * (data + 20 * SINGLE * d.samples + by_channel + by_antenna)
+    # Model, curvature and model on the baselines; roots.
+    projection = 2 * DOUBLE * d.models * d.channels + 3 * SINGLE * d.samples + SINGLE * d.models * d.widest * d.rank
     at_once = min(settings.models_at_once, d.models)
     pieces = 2 * DOUBLE * at_once * d.widest * d.channels
-    while_projecting = 2 * projection + 7 * SINGLE * d.samples + 2 * antenna_blocks
-    while_preparing = projection + 2 * SINGLE * d.coefficients * d.rank + 4 * antenna_blocks
-    by_channel = projection + 8 * SINGLE * d.channels * d.antennas**2
-    result = projection + 8 * DOUBLE * d.samples + antenna_blocks
-    peak = data + max(while_projecting, while_preparing, by_channel, result)
+    # The roots of a stretch of models seen through their foregrounds, and the blocks that they add up to.
+    by_antenna += (12 * SINGLE * at_once + 6 * DOUBLE * d.antennas) * d.rank**2
+    while_projecting = 2 * projection + 7 * SINGLE * d.samples
+    while_preparing = projection + 2 * SINGLE * d.samples + max(by_antenna, by_channel)
+    result = projection + 8 * DOUBLE * d.samples
+    peak = data + max(while_projecting, while_preparing, result)
     return LIBRARIES + pieces + RETAINED * (peak + _unknowns(d, settings))
 
 

@@ -10,12 +10,7 @@ from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
 from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.gauss_newton import DAMPING_BOUNDS, PRECONDITIONER_DAMPING, Kernels, compiled
-from calstudy.calibrate.solvers.preconditioners import (
-    antenna_degrees,
-    channel_factors,
-    solve_antennas,
-    solve_channels,
-)
+from calstudy.calibrate.solvers.preconditioners import Inverse, antenna_degrees, channel_inverse
 from calstudy.calibrate.tangent import DelayModes, Tangent
 
 CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
@@ -41,10 +36,9 @@ class Follower:
         self._damping = tf.constant(DAMPING_BOUNDS[0], tf.float32)
         stronger = tf.constant(PRECONDITIONER_DAMPING, tf.float32)
         if self.kernels.by_channel:
-            self._factors = channel_factors(self.kernels.tensors, self._projection, stronger)
+            self._inverse: Inverse = channel_inverse(self.kernels.tensors, self._projection, stronger)
         else:
-            blocks, degrees = self.kernels.blocks(self._projection)
-            self._factors = self.kernels.factors(blocks, degrees, stronger, reduced.gains)
+            self._inverse = self.kernels.inverse(self.kernels.blocks(self._projection), stronger, reduced.gains)
         self._solve = tf.function(self._follow)
 
     def follow(self, change: np.ndarray) -> np.ndarray:
@@ -67,10 +61,9 @@ class Follower:
             image = kernels.projector.hessian_product(eta, projection) + diagonal * eta
             return kernels.space.reduce_relative(image, gains)
 
-        solve = solve_channels if kernels.by_channel else solve_antennas
         coordinates, _ = conjugate_gradients(
             operator,
-            lambda values: solve(self._factors, values),
+            self._inverse.apply,
             kernels.space.reduce_relative(descent, gains),
             tf.constant(CG_TOLERANCE),
             tf.constant(CG_ITERATIONS),

@@ -43,13 +43,10 @@ class Projection(NamedTuple):
         D of each baseline, shape (Nbls, Nfreqs), float32.
     baseline_model
         F on the baselines, shape (2, Nbls, Nfreqs), float32.
-    absorber
-        W of the models of each stretch, shape (Nmembers, Q, Q), float32: foregrounds answer a weighted change y of the
-        visibilities of their group with ``Q W Q^T y``, where Q is the common basis. For a joint piece the root S of
-        ``W = S^T S`` instead, shape (1, Nvec, Nmembers * Q), W being that of all members together.
     roots
-        For each piece roots R of the inverse of N, shape (Nmembers, Nvec, Nvec), float32; the same kernel without the
-        common basis is ``Q W Q^T = (R A^T)^T (R A^T)``. The members of a joint piece have one R together.
+        S of the models of each stretch, shape (Nmodels, Nvec, rank), float32, padded with rows of zeros: foregrounds
+        answer a weighted change y of the visibilities of their group with ``Q S^T S Q^T y``, where Q is the common
+        basis. Of a joint piece that of all members together, shape (1, Nvec, Nmembers * rank).
     """
 
     loss: tf.Tensor
@@ -57,7 +54,6 @@ class Projection(NamedTuple):
     descent: tf.Tensor
     curvature: tf.Tensor
     baseline_model: tf.Tensor
-    absorber: tuple[tf.Tensor, ...]
     roots: tuple[tf.Tensor, ...]
 
 
@@ -69,7 +65,6 @@ class _Piece(NamedTuple):
     pull: tf.Tensor
     curvature: tf.Tensor
     baseline_model: tf.Tensor
-    absorber: tf.Tensor
     root: tf.Tensor
 
 
@@ -120,37 +115,20 @@ class Projector:
         again = tf.linalg.cholesky(identity + ridge * tf.matmul(root, root, transpose_b=True))
         return tf.linalg.cholesky(normal), tf.matmul(again, root, transpose_a=True)
 
-    def spread(self, index: int, root: tf.Tensor, by_member: bool = False) -> tf.Tensor:
-        """Return R A^T Q of one piece: for every model (Nvec, rank), for a joint piece (Nvec, Nmembers * rank).
-
-        Parameters
-        ----------
-        index, root
-            The piece, and its R.
-        by_member
-            Return the rows of all members, one after the other, (Nmembers * Nvec, rank), also of a joint piece.
-        """
-        overlap = self.overlaps[index]
-        n_vectors = overlap.shape[0]
-        rows = tf.reshape(root, [-1, n_vectors]) @ overlap
-        if not by_member:
-            return tf.reshape(rows, [-1, n_vectors, overlap.shape[1]])
-        if self._joint[index]:
-            rows = tf.transpose(tf.reshape(rows, [n_vectors, -1, self.rank]), [1, 0, 2])
-        return tf.reshape(rows, [-1, self.rank])
-
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
         pieces: list[_Piece] = []
         descent: list[tf.Tensor] = []
-        absorbers: list[tf.Tensor] = []
+        roots: list[tf.Tensor] = []
         for stretch in self._stretches:
             # Without this, all stretches would be worked on at once, and their temporaries add up.
-            with tf.control_dependencies([descent[-1], absorbers[-1]] if descent else []):
+            with tf.control_dependencies([descent[-1], roots[-1]] if descent else []):
                 members = [self._project_piece(index, gains, visibilities, weights) for index in stretch]
                 pull = tf.concat([member.pull for member in members], axis=1)
                 before = descent[-1] if descent else 0.0
                 descent.append(before + self.tensors.sum_over_antenna(pull, self.tensors.baselines_of(stretch)))
-                absorbers.append(tf.concat([member.absorber for member in members], axis=0))
+                widest = max(member.root.shape[1] for member in members)
+                padded = [tf.pad(part.root, [[0, 0], [0, widest - part.root.shape[1]], [0, 0]]) for part in members]
+                roots.append(tf.concat(padded, axis=0))
             pieces += members
         return Projection(
             tf.add_n([piece.loss for piece in pieces]),
@@ -158,8 +136,7 @@ class Projector:
             descent[-1],
             tf.concat([piece.curvature for piece in pieces], axis=0),
             tf.concat([piece.baseline_model for piece in pieces], axis=1),
-            tuple(absorbers),
-            tuple(piece.root for piece in pieces),
+            tuple(roots),
         )
 
     def _project_piece(self, index: int, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> _Piece:
@@ -183,8 +160,8 @@ class Projector:
         coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
         coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
         model = tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, tensors.n_frequencies])
-        root = tf.cast(root, tf.float32)
-        spread = self.spread(index, root)
+        overlap = self.overlaps[index]
+        spread = tf.reshape(tf.cast(root, tf.float32), [-1, n_vectors]) @ overlap
         baseline_model = model if owner is None else tf.gather(model, owner, axis=1)
         residual = visibilities - pairs.multiply(products, baseline_model)
         return _Piece(
@@ -193,41 +170,43 @@ class Projector:
             pairs.conjugate_multiply(baseline_model, weights * pairs.conjugate_multiply(products, residual)),
             tf.cast(curvature, tf.float32),
             tf.cast(baseline_model, tf.float32),
-            spread if self._joint[index] else tf.matmul(spread, spread, transpose_a=True),
-            root,
+            tf.reshape(spread, [-1, n_vectors, overlap.shape[1]]),
         )
 
-    def absorb(self, values: tf.Tensor, absorber: tuple[tf.Tensor, ...]) -> tf.Tensor:
-        """Return ``Q W Q^T values`` for each model; values and result (2, Nmodels, Nfreqs)."""
+    def absorb(self, values: tf.Tensor, roots: tuple[tf.Tensor, ...]) -> tf.Tensor:
+        """Return ``Q S^T S Q^T values`` for each model; values and result (2, Nmodels, Nfreqs).
+
+        The product S^T S itself would not do in float32: where flags leave a foreground nearly undetermined it is
+        large, and its rounding would be large for the others.
+        """
         answers = []
-        for stretch, matrices in zip(self._stretches, absorber, strict=True):
+        n_frequencies, rank = self.common.shape
+        for stretch, root in zip(self._stretches, roots, strict=True):
             first, last = self.tensors.models_of(stretch)
-            absorb = self._absorb_joint if self._joint[stretch[0]] else self._absorb_stretch
-            answers.append(absorb(values[:, first:last], matrices))
+            inner = tf.reshape(values[:, first:last], [-1, n_frequencies]) @ self.common
+            # Real and imaginary part share one batched product.
+            inner = tf.transpose(tf.reshape(inner, [2, -1, root.shape[2]]), [1, 0, 2])
+            inner = tf.matmul(inner, root, transpose_b=True) @ root
+            inner = tf.reshape(tf.transpose(inner, [1, 0, 2]), [-1, rank])
+            outer = tf.matmul(inner, self.common, transpose_b=True)
+            answers.append(tf.reshape(outer, [2, -1, n_frequencies]))
         return answers[0] if len(answers) == 1 else tf.concat(answers, axis=1)
 
-    def _absorb_stretch(self, values: tf.Tensor, absorber: tf.Tensor) -> tf.Tensor:
-        n_frequencies, rank = self.common.shape
-        inner = tf.reshape(tf.reshape(values, [-1, n_frequencies]) @ self.common, [2, -1, rank])
-        # W is symmetric, so that models can share one batched product for real and imaginary parts.
-        inner = tf.transpose(tf.transpose(inner, [1, 0, 2]) @ absorber, [1, 0, 2])
-        outer = tf.matmul(tf.reshape(inner, [-1, rank]), self.common, transpose_b=True)
-        return tf.reshape(outer, tf.shape(values))
-
-    def _absorb_joint(self, values: tf.Tensor, root: tf.Tensor) -> tf.Tensor:
-        """Return the answer of a joint piece, whose members respond to each other's changes."""
-        n_frequencies, rank = self.common.shape
-        inner = tf.reshape(tf.reshape(values, [-1, n_frequencies]) @ self.common, [2, -1])
-        inner = tf.matmul(inner, root[0], transpose_b=True) @ root[0]
-        outer = tf.matmul(tf.reshape(inner, [-1, rank]), self.common, transpose_b=True)
-        return tf.reshape(outer, tf.shape(values))
+    def baseline_roots(self, stretch: range, root: tf.Tensor) -> tf.Tensor:
+        """Return S of each baseline of a stretch by itself, (Nbls, Nvec, rank)."""
+        if self._joint[stretch[0]]:
+            root = tf.transpose(tf.reshape(root, [root.shape[1], -1, self.rank]), [1, 0, 2])
+        if self.tensors.model_index is None:
+            return root
+        start, end = self.tensors.baselines_of(stretch)
+        return tf.gather(root, self.tensors.model_index[start:end] - self.tensors.models_of(stretch)[0])
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs), float32."""
         tensors = self.tensors
         curvature, model = projection.curvature, projection.baseline_model
         change = curvature * pairs.multiply(model, tensors.relative_change(eta))
-        absorbed = tensors.to_baselines(self.absorb(tensors.sum_pairs_over_group(change), projection.absorber))
+        absorbed = tensors.to_baselines(self.absorb(tensors.sum_pairs_over_group(change), projection.roots))
         return tensors.sum_over_antenna(pairs.conjugate_multiply(model, change - curvature * absorbed))
 
 

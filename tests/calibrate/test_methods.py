@@ -181,7 +181,7 @@ def test_pieces_of_any_size_give_the_same_projection(toy):
         projector = Projector(tensors)
         results.append(projector.project(gains, data.visibilities, data.weights))
         images.append(projector.hessian_product(eta, results[-1]))
-    assert len(results[0].absorber) > len(results[2].absorber) == 1
+    assert len(results[0].roots) > len(results[2].roots) == 1
     for image in images[:2]:
         assert np.abs(image - images[2]).max() < 1e-5 * np.abs(images[2]).max()
     for other in results[:2]:
@@ -241,4 +241,4 @@ def test_a_partly_flagged_baseline_does_not_slow_the_default_solver(toy):
     flags[11, 50:] = True
     solution = solve(toy.problem(weights=flag_weights(flags)), GaussNewton())
     assert solution.status == "converged", solution.message
-    assert solution.n_steps < 70
+    assert solution.n_steps < 30

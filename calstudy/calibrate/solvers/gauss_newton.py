@@ -23,24 +23,24 @@ from calstudy.calibrate.frozen import FrozenForegrounds
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.projection import Projection, Projector
-from calstudy.calibrate.solvers.conjugate_gradients import Operator, conjugate_gradients
+from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.solvers.preconditioners import (
+    AntennaBlocks,
+    Inverse,
     antenna_blocks,
     antenna_degrees,
-    channel_factors,
-    solve_antennas,
-    solve_channels,
+    antenna_inverse,
+    channel_inverse,
+    coordinate_inverse,
 )
 from calstudy.calibrate.tensors import FitTensors
 
 # Damping, relative to the diagonal, is this times the loss relative to the data, within the two bounds.
 DAMPING_PER_LOSS = 10.0
 DAMPING_BOUNDS = (1e-6, 1e-2)
-# In float32 the preconditioner cannot be factored with less.
+# The blocks of float32 numbers cannot be inverted with less.
 PRECONDITIONER_DAMPING = 1e-5
-# The factors are kept while the damping stays within this ratio of theirs.
-DAMPING_RATIO = 3.0
 CHANNEL_STEPS = 2
 CG_TOLERANCE = 1e-3
 CG_CHANNEL_ITERATIONS = 300
@@ -48,7 +48,7 @@ CG_ANTENNA_ITERATIONS = 60
 # With more than this on the damping, no step is small enough to lower the loss.
 MAX_BOOST = 1e6
 # Antenna blocks that need more iterations than this are out of date.
-CG_REFRESH = 30
+CG_REFRESH = 15
 # Loss relative to the data below which a residual is rounding: 3e-8 of the visibilities, float32's resolution.
 ROUNDING_LOSS = 1e-15
 
@@ -96,7 +96,7 @@ class Kernels:
         self.channel_step = tf.function(self._channel_step)
         self.antenna_step = tf.function(self._antenna_step)
         self.blocks = tf.function(self._blocks)
-        self.factors = tf.function(self._factors)
+        self.inverse = tf.function(self._inverse)
         self.predicted_decrease = tf.function(self._predicted_decrease)
 
     def reduce(self, problem: CalibrationProblem, gains: np.ndarray) -> Reduced:
@@ -113,22 +113,18 @@ class Kernels:
         self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor
     ) -> tuple[tf.Tensor, tf.Tensor]:
         """Return eta, and the decrease of the loss that its quadratic model promises."""
-        factors = channel_factors(self.tensors, projection, damping)
-        eta, _ = self._solve(
-            projection, gains, damping, lambda values: solve_channels(factors, values), CG_CHANNEL_ITERATIONS
-        )
+        inverse = channel_inverse(self.tensors, projection, damping)
+        eta, _ = self._solve(projection, gains, damping, inverse, CG_CHANNEL_ITERATIONS)
         return eta, pairs.inner_product(tf.cast(projection.descent, tf.float32), eta)
 
     def _antenna_step(
-        self, projection: Projection, gains: tf.Tensor, factors: tf.Tensor, damping: tf.Tensor
+        self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
     ) -> tuple[tf.Tensor, tf.Tensor]:
         """Return eta, and the iterations it took."""
-        return self._solve(
-            projection, gains, damping, lambda values: solve_antennas(factors, values), CG_ANTENNA_ITERATIONS
-        )
+        return self._solve(projection, gains, damping, inverse, CG_ANTENNA_ITERATIONS)
 
     def _solve(
-        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor, preconditioner: Operator, iterations: int
+        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor, inverse: Inverse, iterations: int
     ) -> tuple[tf.Tensor, tf.Tensor]:
         diagonal = damping * antenna_degrees(self.tensors, projection)
         gains = tf.cast(gains, tf.float32)
@@ -140,26 +136,26 @@ class Kernels:
 
         coordinates, count = conjugate_gradients(
             operator,
-            preconditioner,
+            inverse.apply,
             self.space.reduce_relative(tf.cast(projection.descent, tf.float32), gains),
             tf.constant(CG_TOLERANCE),
             tf.constant(iterations),
         )
         return self.space.expand_relative(coordinates, gains), count
 
-    def _blocks(self, projection: Projection) -> tuple[tf.Tensor, tf.Tensor]:
-        degrees = antenna_degrees(self.tensors, projection)
+    def _blocks(self, projection: Projection) -> AntennaBlocks:
         if self.frozen:
-            return tf.cast(tf.linalg.diag(degrees), tf.complex64), degrees
-        return antenna_blocks(self.projector, projection), degrees
+            return AntennaBlocks(antenna_degrees(self.tensors, projection))
+        return antenna_blocks(self.projector, projection)
 
-    def _factors(self, blocks: tf.Tensor, degrees: tf.Tensor, damping: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
-        damped = blocks + tf.cast(tf.linalg.diag(damping * degrees), blocks.dtype)
-        return tf.linalg.cholesky(self.space.reduce_blocks(damped, tf.cast(gains, tf.float32)))
+    def _inverse(self, blocks: AntennaBlocks, damping: tf.Tensor, gains: tf.Tensor) -> Inverse:
+        if self.space.vectors is None:
+            return antenna_inverse(blocks, damping)
+        return coordinate_inverse(blocks, self.space.columns(tf.cast(gains, tf.float32)), damping)
 
-    def _predicted_decrease(self, projection: Projection, gains: tf.Tensor, factors: tf.Tensor) -> tf.Tensor:
+    def _predicted_decrease(self, projection: Projection, gains: tf.Tensor, inverse: Inverse) -> tf.Tensor:
         descent = self.space.reduce_relative(tf.cast(projection.descent, tf.float32), tf.cast(gains, tf.float32))
-        return pairs.inner_product(descent, solve_antennas(factors, descent))
+        return pairs.inner_product(descent, inverse.apply(descent))
 
 
 @lru_cache(maxsize=4)
@@ -169,12 +165,11 @@ def compiled(structure: FitStructure, frozen: bool = False) -> Kernels:
 
 
 class AntennaPreconditioner(NamedTuple):
-    """The channel blocks of each antenna, with factors at one damping."""
+    """The channel blocks of each antenna, and their inverse at one damping."""
 
-    blocks: tf.Tensor
-    degrees: tf.Tensor
+    blocks: AntennaBlocks
     damping: float
-    factors: tf.Tensor
+    inverse: Inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +186,8 @@ class GaussNewtonState:
         Factor on the damping; grows tenfold whenever a step did not lower the loss.
     preconditioner
         The antenna blocks, once they are in use.
-    stale
-        Whether the antenna blocks are out of date, and were kept only because they say that this is the minimum.
+    gained
+        Decrease of the loss by the last step that lowered it; infinite before the first.
     predicted
         Decrease of the loss that is predicted for the next step; infinite while unknown.
     """
@@ -207,7 +202,7 @@ class GaussNewtonState:
     n_accepted: int = 0
     boost: float = 1.0
     preconditioner: AntennaPreconditioner | None = None
-    stale: bool = False
+    gained: float = math.inf
     predicted: float = math.inf
 
     @property
@@ -215,6 +210,15 @@ class GaussNewtonState:
         """Damping of the next step, relative to the diagonal of the Gauss-Newton matrix."""
         low, high = DAMPING_BOUNDS
         return min(max(DAMPING_PER_LOSS * self.history[-1], low), high) * self.boost
+
+    @property
+    def outlook(self) -> float:
+        """Decrease of the loss by all steps to come, over the loss, if each brings as much less as the next one does.
+
+        A fit that crawls has far to go, however little it does at each step.
+        """
+        shrinking = self.predicted / self.gained if math.isfinite(self.gained) else 0.0
+        return self.predicted / (1 - shrinking) / self.history[-1] if shrinking < 1 else math.inf
 
 
 @dataclass(frozen=True)
@@ -224,7 +228,8 @@ class GaussNewton:
     Parameters
     ----------
     tolerance
-        Converged when the predicted decrease of the loss, relative to the loss, is smaller.
+        Converged when the predicted decrease of the loss, relative to the loss, is smaller: that of the next step, and
+        that of all to come, unless the last step has brought less.
     max_steps
         Gauss-Newton steps at most.
     """
@@ -253,17 +258,18 @@ class GaussNewton:
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
         """Try one damped step, and keep it if it lowers the loss."""
         kernels, preconditioner = state.kernels, state.preconditioner
-        damping, stale = tf.constant(state.damping, tf.float32), False
+        damping = tf.constant(state.damping, tf.float32)
         if preconditioner is None:
             eta, promised = kernels.channel_step(state.projection, state.gains, damping)
         else:
-            eta, iterations = kernels.antenna_step(state.projection, state.gains, preconditioner.factors, damping)
-            stale = int(iterations) > CG_REFRESH
+            eta, iterations = kernels.antenna_step(state.projection, state.gains, preconditioner.inverse, damping)
+            if iterations > CG_REFRESH:
+                preconditioner = None
         gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))
         trial = kernels.project(gains, *state.measured)
         loss = float(trial.loss)
-        # Written so that a loss that is not a number is refused as well.
-        if not loss <= state.history[-1]:
+        # Refused as well: a loss that is not a number, and no step at all, from blocks that are singular to float32.
+        if not loss < state.history[-1]:
             return self._prepared(replace(state, history=(*state.history, state.history[-1]), boost=10 * state.boost))
         state = replace(
             state,
@@ -272,10 +278,11 @@ class GaussNewton:
             history=(*state.history, loss),
             n_accepted=state.n_accepted + 1,
             boost=1.0,
-            stale=stale,
+            preconditioner=preconditioner,
+            gained=state.history[-1] - loss,
         )
         # Without slow directions, the next step will bring less than this one did.
-        return replace(state, predicted=float(promised)) if kernels.by_channel else self._renewed(state)
+        return replace(state, predicted=float(promised)) if kernels.by_channel else self._prepared(state)
 
     def terminate(self, state: GaussNewtonState) -> Verdict | None:
         """Judge convergence by the decrease of the loss that the next step is predicted to bring."""
@@ -285,7 +292,7 @@ class GaussNewton:
         if loss < ROUNDING_LOSS:
             return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
-        if fall < self.tolerance:
+        if fall < self.tolerance and min(state.outlook, state.gained / loss) < self.tolerance:
             return Verdict("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.boost > MAX_BOOST:
             return Verdict("stalled", f"no step lowers the loss, though {fall:.1e} of itself is predicted")
@@ -313,24 +320,10 @@ class GaussNewton:
 
     def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
         """Return the antenna blocks, which hardly change from one integration to the next."""
-        return (
-            self._prepared(replace(state, preconditioner=None)).preconditioner if state.stale else state.preconditioner
-        )
-
-    def _renewed(self, state: GaussNewtonState) -> GaussNewtonState:
-        """Prepare the next step with new antenna blocks if they are stale, unless there need not be a next step."""
-        late = state.n_accepted >= CHANNEL_STEPS or state.kernels.space.vectors is not None
-        if not state.stale:
-            return self._prepared(state)
-        if late:
-            # Old blocks promise more than new ones do.
-            fall = float(state.kernels.predicted_decrease(state.projection, state.gains, state.preconditioner.factors))
-            if fall < self.tolerance * state.history[-1]:
-                return replace(state, predicted=fall)
-        return self._prepared(replace(state, preconditioner=None, stale=False))
+        return state.preconditioner
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
-        """Bring the antenna blocks up to date with the state, and let them predict the decrease of the next step."""
+        """Bring the antenna blocks to the damping of the state, or make them, and let them predict the next step."""
         preconditioner = state.preconditioner
         kernels = state.kernels
         # Smooth gains couple all channels from the start.
@@ -338,16 +331,15 @@ class GaussNewton:
         if kernels.by_channel or (preconditioner is None and early):
             return state
         damping = max(state.damping, PRECONDITIONER_DAMPING)
-        ratio = preconditioner.damping / damping if preconditioner else math.inf
-        if not 1 / DAMPING_RATIO < ratio < DAMPING_RATIO:
-            blocks, degrees = preconditioner[:2] if preconditioner else kernels.blocks(state.projection)
-            factors = kernels.factors(blocks, degrees, tf.constant(damping, tf.float32), state.gains)
-            preconditioner = AntennaPreconditioner(blocks, degrees, damping, factors)
+        if preconditioner is None or preconditioner.damping != damping:
+            blocks = kernels.blocks(state.projection) if preconditioner is None else preconditioner.blocks
+            inverse = kernels.inverse(blocks, tf.constant(damping, tf.float32), state.gains)
+            preconditioner = AntennaPreconditioner(blocks, damping, inverse)
         state = replace(state, preconditioner=preconditioner)
         # A boosted damping shrinks the prediction without bringing the minimum any closer.
         if state.boost > 1:
             return state
-        fall = kernels.predicted_decrease(state.projection, state.gains, preconditioner.factors)
+        fall = kernels.predicted_decrease(state.projection, state.gains, preconditioner.inverse)
         return replace(state, predicted=float(fall))
 
 

@@ -1,14 +1,23 @@
-"""Two block-diagonal approximations of the Gauss-Newton matrix of the gains.
+"""Two block-diagonal approximations of the Gauss-Newton matrix of the gains, and their inverses.
 
 Far from the minimum the couplings between antennas within a channel matter most; close to it, those between channels
 within an antenna, which the eliminated foregrounds bring in.
+
+The block of one antenna is K - C: K is diagonal, its degrees, and C what the foregrounds of its baselines absorb, sum_b
+(D F)^* Q S^T S Q^T (D F). Foregrounds of few vectors absorb only what is smooth, so that C matters on the span of their
+common basis Q and next to nowhere else. The preconditioner M has the values of the block on that span, and is K on its
+complement in the metric of K:
+
+    M = K - L (Q^T C Q) L^T, L = K Q (Q^T K Q)^-1
+    M^-1 = K^-1 + Q [ (Q^T (K - C) Q)^-1 - (Q^T K Q)^-1 ] Q^T
+
+With a damping relative to the diagonal, K stands for (1 + damping) K everywhere but in L.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
@@ -19,6 +28,13 @@ from calstudy.calibrate.tensors import FitTensors
 DEGREE_FLOOR = 1e-4
 
 
+class Inverse(Protocol):
+    """What a preconditioner is to the iteration."""
+
+    def apply(self, values: tf.Tensor) -> tf.Tensor:
+        """Return the inverse times real and imaginary parts of the gains, or of their coordinates, (2, Nants, N)."""
+
+
 def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
     """Return sum_b D |F|^2 of each antenna and channel, floored, shape (Nants, Nfreqs), float32."""
     power = projection.curvature * pairs.squared_modulus(projection.baseline_model)
@@ -27,8 +43,19 @@ def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
     return tf.maximum(degree, DEGREE_FLOOR * tf.reduce_mean(degree))
 
 
-def channel_factors(tensors: FitTensors, projection: Projection, damping: tf.Tensor) -> tf.Tensor:
-    """Return Cholesky factors of the damped antenna blocks of each channel, shape (2, Nfreqs, Nants, Nants).
+class ChannelInverse(NamedTuple):
+    """Inverse of the antenna blocks of each channel; `factors` are theirs, (2, Nfreqs, Nants, Nants)."""
+
+    factors: tf.Tensor
+
+    def apply(self, values: tf.Tensor) -> tf.Tensor:
+        """Return the inverse times (2, Nants, Nfreqs)."""
+        columns = tf.transpose(values, [0, 2, 1])[..., None]
+        return tf.transpose(tf.linalg.cholesky_solve(self.factors, columns)[..., 0], [0, 2, 1])
+
+
+def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Tensor) -> ChannelInverse:
+    """Return the inverse of the damped antenna blocks of each channel.
 
     Foregrounds are held fixed in these blocks, so that real and imaginary parts of eta decouple: the blocks are the
     degree plus and minus the coupling matrix.
@@ -43,97 +70,126 @@ def channel_factors(tensors: FitTensors, projection: Projection, damping: tf.Ten
     diagonal = tf.linalg.diag(degree * (1 + damping))
     # The common phase of a channel is an exact null of the second block; a constant matrix lifts it.
     lift = tf.reduce_mean(degree, -1)[:, None, None] / tensors.n_antennas
-    return tf.stack([tf.linalg.cholesky(diagonal + coupling), tf.linalg.cholesky(diagonal - coupling + lift)])
+    return ChannelInverse(
+        tf.stack([tf.linalg.cholesky(diagonal + coupling), tf.linalg.cholesky(diagonal - coupling + lift)])
+    )
 
 
-def solve_channels(factors: tf.Tensor, values: tf.Tensor) -> tf.Tensor:
-    """Apply the inverse of the channel blocks to (2, Nants, Nfreqs)."""
-    columns = tf.transpose(values, [0, 2, 1])[..., None]
-    return tf.transpose(tf.linalg.cholesky_solve(factors, columns)[..., 0], [0, 2, 1])
-
-
-class AntennaRows(NamedTuple):
-    """Which rows of all the sequences an antenna needs; (Nants, Nrows), padded with rows of sign and mask zero.
+class AntennaBlocks(NamedTuple):
+    """The channel blocks of each antenna, undamped.
 
     Attributes
     ----------
-    row, baseline
-        The row, and the baseline that brings it in.
-    sign
-        -1 where the antenna is the first of the baseline, 1 where it is the second.
+    degrees
+        K, (Nants, Nfreqs).
+    common
+        Q, (Nfreqs, rank); None, like all that follows, if there are no foregrounds to absorb anything.
+    gram
+        Q^T K Q, (Nants, rank, rank).
+    absorbed
+        Q^T C Q, real and imaginary part, (2, Nants, rank, rank).
     """
 
-    row: np.ndarray
-    baseline: np.ndarray
-    sign: np.ndarray
+    degrees: tf.Tensor
+    common: tf.Tensor | None = None
+    gram: tf.Tensor | None = None
+    absorbed: tf.Tensor | None = None
 
 
-def antenna_rows(tensors: FitTensors) -> AntennaRows:
-    """Return the rows of each antenna, for sequences stacked model after model."""
-    sizes = np.concatenate(
-        [np.full(e - s, b.shape[-1]) for (s, e), b in zip(tensors.slices, tensors.bases, strict=True)]
-    )
-    starts = np.cumsum(sizes) - sizes
-    model = np.arange(tensors.n_baselines) if tensors.model_index is None else tensors.model_index.numpy()
-    columns: list[list[np.ndarray]] = []
-    for antenna in range(tensors.n_antennas):
-        parts = [
-            (np.arange(starts[model[p]], starts[model[p]] + sizes[model[p]]), p, sign)
-            for index, sign in ((tensors.first, -1), (tensors.second, 1))
-            for p in np.flatnonzero(index.numpy() == antenna)
-        ]
-        rows = [part[0] for part in parts]
-        columns.append(
-            [
-                np.concatenate([*rows, np.empty(0, int)]),
-                np.concatenate([*(np.full(r.size, p) for r, p, _ in parts), np.empty(0, int)]),
-                np.concatenate([*(np.full(r.size, sign) for r, _, sign in parts), np.empty(0, int)]),
-            ]
-        )
-    longest = max(column[0].size for column in columns)
-    padded = [
-        np.stack([np.pad(part, (0, longest - part.size)) for part in parts]) for parts in zip(*columns, strict=True)
-    ]
-    return AntennaRows(*padded)
+def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlocks:
+    """Return the channel blocks of each antenna.
 
-
-def antenna_blocks(projector: Projector, projection: Projection) -> tf.Tensor:
-    """Return the channel blocks of each antenna, Hermitian, shape (Nants, Nfreqs, Nfreqs), complex64, undamped.
-
-    Each baseline adds diag(K) - (D F) Q W Q^T (D F)^* to both its antennas, conjugated for the first. With the kernel
-    as a sum of squares, the second terms of an antenna are one product of a long thin matrix with itself. Couplings
-    between baselines that share a foreground model are left out; the blocks stay positive.
+    Couplings between baselines that share a foreground model are left out; the blocks stay positive.
     """
     tensors, common = projector.tensors, projector.common
-    # In the common basis, for all the sequences at once would be the largest array of a solve.
-    rows = tf.concat(
-        [projector.spread(index, root, by_member=True) for index, root in enumerate(projection.roots)],
-        axis=0,
-    )
+    n_frequencies, rank = common.shape
+    products = tf.reshape(common[:, :, None] * common[:, None, :], [n_frequencies, -1])
+    degrees = antenna_degrees(tensors, projection)
+    gram = tf.reshape(degrees @ products, [-1, rank, rank])
     weighted = projection.curvature * projection.baseline_model
-    table = antenna_rows(tensors)
-
-    def block(inputs: tuple[tf.Tensor, ...]) -> tf.Tensor:
-        row, baseline, sign, degree = inputs
-        row_sequences = tf.matmul(tf.gather(rows, row), common, transpose_b=True)
-        real = tf.abs(sign)[:, None] * row_sequences * tf.gather(weighted[0], baseline)
-        imaginary = sign[:, None] * row_sequences * tf.gather(weighted[1], baseline)
-        both = tf.concat([real, imaginary], axis=0)
-        crossed = tf.matmul(imaginary, real, transpose_a=True)
-        square = tf.matmul(both, both, transpose_a=True)
-        return tf.complex(tf.linalg.diag(degree) - square, tf.transpose(crossed) - crossed)
-
-    inputs = (
-        tf.constant(table.row, tf.int32),
-        tf.constant(table.baseline, tf.int32),
-        tf.constant(table.sign, tf.float32),
-        antenna_degrees(tensors, projection),
-    )
-    # One antenna at a time: the temporaries of several would be large.
-    return tf.map_fn(block, inputs, fn_output_signature=tf.complex64, parallel_iterations=1)
+    absorbed: list[tf.Tensor] = []
+    for stretch, root in zip(tensors.stretches, projection.roots, strict=True):
+        # Temporaries of several stretches would add up.
+        with tf.control_dependencies(absorbed[-1:]):
+            start, end = baselines = tensors.baselines_of(stretch)
+            mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies]) @ products
+            real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, rank, rank]))
+            roots = projector.baseline_roots(stretch, root)
+            real, imaginary = roots @ real, roots @ imaginary
+            square = tf.matmul(real, real, transpose_a=True) + tf.matmul(imaginary, imaginary, transpose_a=True)
+            crossed = tf.matmul(real, imaginary, transpose_a=True)
+            both = tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)])
+            absorbed.append(tensors.sum_over_antenna(both, baselines))
+    return AntennaBlocks(degrees, common, gram, tf.add_n(absorbed))
 
 
-def solve_antennas(factors: tf.Tensor, values: tf.Tensor) -> tf.Tensor:
-    """Apply the inverse of the antennas' blocks to (2, Nants, Nfreqs)."""
-    solved = tf.linalg.cholesky_solve(factors, tf.complex(values[0], values[1])[..., None])[..., 0]
-    return tf.stack([tf.math.real(solved), tf.math.imag(solved)])
+class AntennaInverse(NamedTuple):
+    """Inverse of the channel blocks of each antenna, ``diagonal + Q correction Q^T``.
+
+    Attributes
+    ----------
+    common
+        Q, (Nfreqs, rank).
+    diagonal
+        1 / K, (Nants, Nfreqs).
+    correction
+        Hermitian, real and imaginary part, (2, Nants, rank, rank).
+    """
+
+    common: tf.Tensor
+    diagonal: tf.Tensor
+    correction: tf.Tensor
+
+    def apply(self, values: tf.Tensor) -> tf.Tensor:
+        """Return the inverse times (2, Nants, Nfreqs)."""
+        n_frequencies, rank = self.common.shape
+        inner = tf.reshape(tf.reshape(values, [-1, n_frequencies]) @ self.common, [2, -1, rank, 1])
+        real, imaginary = tf.unstack(self.correction)
+        inner = tf.stack([real @ inner[0] - imaginary @ inner[1], real @ inner[1] + imaginary @ inner[0]])
+        outer = tf.matmul(tf.reshape(inner, [-1, rank]), self.common, transpose_b=True)
+        return self.diagonal * values + tf.reshape(outer, tf.shape(values))
+
+
+def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse:
+    """Return the inverse of the damped blocks, for gains of any value in any channel."""
+    # The inverse of a small difference of large numbers: what float32 has lost of it is below the damping.
+    gram = tf.cast(1 + damping, tf.float64) * tf.cast(blocks.gram, tf.float64)
+    real, imaginary = tf.unstack(tf.cast(blocks.absorbed, tf.float64))
+    correction = _inverse(tf.complex(gram - real, -imaginary)) - tf.cast(_inverse(gram), tf.complex128)
+    correction = tf.cast(tf.stack([tf.math.real(correction), tf.math.imag(correction)]), tf.float32)
+    return AntennaInverse(blocks.common, 1 / ((1 + damping) * blocks.degrees), correction)
+
+
+class CoordinateInverse(NamedTuple):
+    """Inverse of the blocks of each antenna for coordinates; `factors` are theirs, (Nants, Ngain, Ngain), complex64."""
+
+    factors: tf.Tensor
+
+    def apply(self, values: tf.Tensor) -> tf.Tensor:
+        """Return the inverse times (2, Nants, Ngain)."""
+        solved = tf.linalg.cholesky_solve(self.factors, tf.complex(values[0], values[1])[..., None])[..., 0]
+        return tf.stack([tf.math.real(solved), tf.math.imag(solved)])
+
+
+def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Tensor) -> CoordinateInverse:
+    """Return the inverse of the damped blocks for gains in a space of smooth ones.
+
+    Parameters
+    ----------
+    columns
+        Relative change of each antenna's gain for a unit of each coordinate, (Nants, Nfreqs, Ngain), complex64.
+    """
+    diagonal = tf.cast((1 + damping) * blocks.degrees, columns.dtype)
+    matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
+    if blocks.absorbed is not None:
+        gram = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), tf.float32)
+        lift = tf.cast(blocks.degrees[:, :, None] * (blocks.common @ gram), columns.dtype)
+        inner = tf.matmul(columns, lift, adjoint_a=True)
+        matrix -= inner @ tf.matmul(tf.complex(blocks.absorbed[0], blocks.absorbed[1]), inner, adjoint_b=True)
+    return CoordinateInverse(tf.linalg.cholesky(matrix))
+
+
+def _inverse(matrices: tf.Tensor) -> tf.Tensor:
+    """Return the inverses of positive definite matrices, (..., N, N)."""
+    identity = tf.eye(tf.shape(matrices)[-1], batch_shape=tf.shape(matrices)[:-2], dtype=matrices.dtype)
+    return tf.linalg.cholesky_solve(tf.linalg.cholesky(matrices), identity)

@@ -1,0 +1,160 @@
+"""Blocks and inverses of the preconditioners against the Gauss-Newton matrix itself, in NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tensorflow as tf
+from test_calibration_loss import redundant_structure
+from test_joint_basis import block_diagonal
+from toy import FREQUENCIES, complex_normal
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.gain_space import GainSpace, gain_vectors
+from calstudy.calibrate.problem import flag_weights
+from calstudy.calibrate.projection import Projector
+from calstudy.calibrate.solvers.preconditioners import (
+    antenna_blocks,
+    antenna_inverse,
+    channel_inverse,
+    coordinate_inverse,
+)
+from calstudy.calibrate.tensors import FitTensors
+
+DAMPING = 1e-4
+
+
+def at_random_gains(problem, seed=9):
+    """The projector, the projection at gains with errors, and those gains."""
+    tensors = FitTensors(problem.structure)
+    data = tensors.load(problem, tf.float64)
+    projector = Projector(tensors)
+    gains = 1 + 0.2 * complex_normal(np.random.default_rng(seed), problem.initial_gains.shape)
+    return projector, projector.project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights), gains
+
+
+def hessian_block(projector, projection, antenna):
+    """The block of one antenna, (Nfreqs, Nfreqs), column by column."""
+    tensors = projector.tensors
+    product = tf.function(projector.hessian_product)
+    block = np.empty((tensors.n_frequencies, tensors.n_frequencies), complex)
+    for channel in range(tensors.n_frequencies):
+        eta = np.zeros((tensors.n_antennas, tensors.n_frequencies), complex)
+        eta[antenna, channel] = 1
+        block[:, channel] = pairs.to_complex(product(pairs.to_pair(eta, tf.float32), projection))[antenna]
+    return block
+
+
+def dense_preconditioner(blocks, antenna):
+    """M of one antenna as a matrix, in the form with L (see the module)."""
+    common, degrees = blocks.common.numpy().astype(float), blocks.degrees[antenna].numpy().astype(float)
+    absorbed = blocks.absorbed[0, antenna].numpy() + 1j * blocks.absorbed[1, antenna].numpy()
+    lift = degrees[:, None] * common @ np.linalg.inv(common.T @ (degrees[:, None] * common))
+    return np.diag((1 + DAMPING) * degrees) - lift @ absorbed @ lift.T
+
+
+@pytest.fixture(scope="module", params=["per-baseline", "joint", "few-at-once", "flagged"])
+def blocks(request, toy):
+    problem = toy.problem()
+    if request.param == "joint":
+        problem = toy.problem(block_diagonal(toy.structure))
+    if request.param == "few-at-once":
+        problem = toy.problem(replace(toy.structure, models_at_once=5))
+    if request.param == "flagged":
+        rng = np.random.default_rng(3)
+        flags = rng.random(toy.foregrounds.shape) < 0.1
+        flags[:, 20:29] = True
+        problem = toy.problem(weights=flag_weights(flags))
+    projector, projection, gains = at_random_gains(problem)
+    return projector, projection, gains, antenna_blocks(projector, projection)
+
+
+@pytest.mark.parametrize("antenna", [0, 7])
+def test_blocks_are_those_of_the_hessian_on_the_common_basis(blocks, antenna):
+    projector, projection, _, found = blocks
+    common = found.common.numpy()
+    expected = common.T @ hessian_block(projector, projection, antenna) @ common
+    absorbed = found.absorbed[0, antenna].numpy() + 1j * found.absorbed[1, antenna].numpy()
+    # Degrees are floored where the Gauss-Newton matrix is not, by 1e-4 of their mean.
+    floored = np.abs(found.degrees.numpy() - found.degrees.numpy().min()) < 1e-12
+    tolerance = 2e-4 if np.count_nonzero(floored) > 1 else 2e-6
+    assert np.abs(found.gram[antenna].numpy() - absorbed - expected).max() < tolerance * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("antenna", [0, 7])
+def test_inverse_is_that_of_the_dense_preconditioner(blocks, antenna):
+    _, _, gains, found = blocks
+    values = complex_normal(np.random.default_rng(4), gains.shape)
+    solved = pairs.to_complex(antenna_inverse(found, tf.constant(DAMPING)).apply(pairs.to_pair(values, tf.float32)))
+    matrix, result = dense_preconditioner(found, antenna), solved[antenna]
+    # Of the size that float32 leaves in the product, not in the values: M is far from the identity.
+    rounding = np.linalg.norm(matrix) * np.linalg.norm(result)
+    assert np.linalg.norm(matrix @ result - values[antenna]) < 1e-6 * rounding
+
+
+def test_preconditioned_blocks_are_nearly_one(blocks):
+    projector, projection, _, found = blocks
+    block, degrees = hessian_block(projector, projection, 3), found.degrees[3].numpy()
+    # Where there are no data the floor of the degrees is all there is.
+    block += np.diag(DAMPING * degrees + np.where(np.diag(block) == 0, degrees, 0))
+    eigenvalues = np.linalg.eigvals(np.linalg.solve(dense_preconditioner(found, 3), block)).real
+    plain = np.linalg.eigvals(block / ((1 + DAMPING) * degrees[:, None])).real
+    assert eigenvalues.min() > 0.2
+    assert eigenvalues.max() < 3
+    assert plain.min() < 0.01
+
+
+def test_inverse_for_smooth_gains_is_that_of_the_reduced_matrix(blocks):
+    _, _, gains, found = blocks
+    space = GainSpace(gain_vectors(FREQUENCIES, 100e-9, 1e-9), tf.float32)
+    columns = space.columns(pairs.to_pair(gains, tf.float32))
+    values = complex_normal(np.random.default_rng(5), (gains.shape[0], columns.shape[-1]))
+    inverse = coordinate_inverse(found, columns, tf.constant(DAMPING))
+    solved = pairs.to_complex(inverse.apply(pairs.to_pair(values, tf.float32)))
+    for antenna in (0, 7):
+        relative = space.vectors.numpy() / gains[antenna][:, None]
+        reduced = relative.conj().T @ dense_preconditioner(found, antenna) @ relative
+        assert np.abs(reduced @ solved[antenna] - values[antenna]).max() < 1e-3 * np.abs(values[antenna]).max()
+
+
+def test_models_in_common_count_as_models_of_their_own(hexagon):
+    structure = redundant_structure(hexagon)
+    _, projection, gains = at_random_gains(hexagon.problem(structure))
+    projector = Projector(FitTensors(structure))
+    found = antenna_blocks(projector, projection)
+    model, curvature = pairs.to_complex(projection.baseline_model), projection.curvature.numpy()
+    tensors, common = projector.tensors, projector.common.numpy()
+    expected = np.zeros((gains.shape[0], projector.rank, projector.rank), complex)
+    roots = tf.concat(projection.roots, axis=0).numpy()[tensors.model_index.numpy()]
+    for p, (a, b) in enumerate(zip(tensors.first.numpy(), tensors.second.numpy(), strict=True)):
+        mixed = common.T @ ((curvature[p] * model[p])[:, None] * common)
+        part = mixed.conj() @ roots[p].T @ roots[p] @ mixed
+        expected[a] += part
+        expected[b] += part.conj()
+    absorbed = pairs.to_complex(found.absorbed)
+    assert np.abs(absorbed - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_channel_inverse_solves_for_gains_under_fixed_foregrounds(toy):
+    projector, projection, gains = at_random_gains(toy.problem())
+    eta = complex_normal(np.random.default_rng(6), gains.shape)
+    inverse = channel_inverse(projector.tensors, projection, tf.constant(DAMPING))
+    solved = pairs.to_complex(inverse.apply(pairs.to_pair(eta, tf.float32)))
+    power = projection.curvature.numpy() * np.abs(pairs.to_complex(projection.baseline_model)) ** 2
+    change = power * gain_changes(projector.tensors, solved)
+    image = np.zeros(gains.shape, complex)
+    np.add.at(image, projector.tensors.first.numpy(), change)
+    np.add.at(image, projector.tensors.second.numpy(), change.conj())
+    degrees = np.zeros(gains.shape)
+    for index in (projector.tensors.first.numpy(), projector.tensors.second.numpy()):
+        np.add.at(degrees, index, power)
+    image += DAMPING * degrees * solved
+    # The common phase of each channel is lifted: it is compared without.
+    image, wanted = (values - 1j * values.imag.mean(axis=0) for values in (image, eta))
+    assert np.abs(image - wanted).max() < 2e-3 * np.abs(eta).max()
+
+
+def gain_changes(tensors, eta):
+    return eta[tensors.first.numpy()] + eta[tensors.second.numpy()].conj()
