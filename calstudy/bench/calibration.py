@@ -23,7 +23,7 @@ from calstudy.resources import Usage, free_memory
 
 ABOVE_FLOOR = 1.002
 FLOOR_TOLERANCE = 1e-5
-PAPER_STEPS = 10
+PAPER_STEPS = 30
 HEADINGS = ("what", "measured", "note")
 
 
