@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from calstudy.bench.allocator import keep_freed_memory
 from calstudy.bench.calibration import Clock, clock_of, use_device
 from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.bench.paper_step import PaperStep
@@ -162,7 +161,6 @@ def _answer(request: Mapping[str, Any]) -> dict[str, Any]:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    keep_freed_memory()
     try:
         print(json.dumps(_answer(json.loads(sys.argv[1]))))
     except InputError as error:

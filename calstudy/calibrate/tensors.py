@@ -57,8 +57,6 @@ class FitTensors:
         baselines, or one that has more or is joint.
     bases
         Basis of each piece, shape (Nfreqs, Nvec), or (Nmodels, Nfreqs, Nvec) if it is joint, float64 arrays.
-    gain_vectors
-        As in the structure.
     orientation
         1, or -1 for baselines that were turned around, shape (Nbls, 1); None if there are none.
     """
@@ -96,7 +94,6 @@ class FitTensors:
         joint = [basis.ndim == 3 for basis in self.bases]
         self.coupled = self.shared or any(joint)
         self.stretches = _stretches(self.baseline_slices, piece, joint)
-        self.gain_vectors = structure.gain_vectors
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
 
     def load(self, problem: CalibrationProblem, dtype: tf.DType) -> Measurements:
@@ -144,12 +141,12 @@ class FitTensors:
         return tf.stack([first[0] + second[0], first[1] - second[1]])
 
     def sum_over_antenna(self, values: tf.Tensor, baselines: tuple[int, int] | None = None) -> tf.Tensor:
-        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`; (2, Nants, Nfreqs).
+        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`; (2, Nants, ...).
 
         Parameters
         ----------
         values
-            Of all baselines, or of the range `baselines`, (2, Nbls, Nfreqs).
+            Of all baselines, or of the range `baselines`, (2, Nbls, ...).
         """
         start, end = baselines or (0, self.n_baselines)
         first, second = self.first[start:end], self.second[start:end]

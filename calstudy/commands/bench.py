@@ -76,11 +76,9 @@ def calibrate(
     if output is not None:
         require_writable(output)
     load_tensorflow(threads)
-    from calstudy.bench.allocator import keep_freed_memory
     from calstudy.bench.calibration import HEADINGS, measure
     from calstudy.bench.calibration_case import Case
 
-    keep_freed_memory()
     rows = measure(Case(antennas=antennas, channels=channels), integrations, adamax_steps, device)
     table = [(row.name, row.value, row.note) for row in rows]
     show("calibrator", HEADINGS, table, Console(highlight=False))

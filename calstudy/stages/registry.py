@@ -66,7 +66,7 @@ STAGES: Mapping[str, Stage] = {
     "agreement": Stage("agreement", "measure", 1),
     "claims": Stage("claims", "evaluate", 3),
     "combined-claims": Stage("claims", "evaluate_combined", 3),
-    "step-times": Stage("runtime", "time_steps", 2),
+    "step-times": Stage("runtime", "time_steps", 3),
     "descent": Stage("runtime", "count_steps", 1),
     "runtime": Stage("runtime", "summarize", 1),
     "runtime-figure": Stage("runtime", "draw", 1),

@@ -121,8 +121,7 @@ def test_inverse_for_smooth_gains_is_that_of_the_reduced_matrix(blocks):
 
 def test_models_in_common_count_as_models_of_their_own(hexagon):
     structure = redundant_structure(hexagon)
-    _, projection, gains = at_random_gains(hexagon.problem(structure))
-    projector = Projector(FitTensors(structure))
+    projector, projection, gains = at_random_gains(hexagon.problem(structure))
     found = antenna_blocks(projector, projection)
     model, curvature = pairs.to_complex(projection.baseline_model), projection.curvature.numpy()
     tensors, common = projector.tensors, projector.common.numpy()

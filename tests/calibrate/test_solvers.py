@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -224,3 +227,23 @@ def test_bad_problems_are_refused_in_one_sentence(toy):
         toy.problem(prior="sky")
     with pytest.raises(ValueError, match="groups"):
         FitStructure(toy.antennas, 8, toy.basis, np.zeros(28, int), np.zeros(28, bool))
+
+
+@pytest.mark.parametrize(
+    ("gained", "predicted", "converged"),
+    [
+        (math.inf, 9e-4, True),
+        (math.inf, 1.1e-3, False),
+        (1e-1, 9e-4, True),
+        (2e-3, 9e-4, False),
+        (2e-3, 5e-4, True),
+        (9e-4, 9.5e-4, True),
+        (1e-1, 2e-3, False),
+    ],
+)
+def test_a_plateau_is_not_taken_for_the_minimum(toy, gained, predicted, converged):
+    """A geometric series from the last step to the next must end within the tolerance, unless both are below it."""
+    solver = GaussNewton(tolerance=1e-3)
+    state = replace(solver.init(toy.problem()), history=(2.0, 1.0), gained=gained, predicted=predicted)
+    verdict = solver.terminate(state)
+    assert (verdict is not None and verdict.status == "converged") == converged

@@ -213,9 +213,9 @@ class GaussNewtonState:
 
     @property
     def outlook(self) -> float:
-        """Decrease of the loss by all steps to come, over the loss, if each brings as much less as the next one does.
+        """Decrease of the loss by all steps to come, over the loss: a geometric series, from the last step to the next.
 
-        A fit that crawls has far to go, however little it does at each step.
+        Before the first step it is that of the next step alone.
         """
         shrinking = self.predicted / self.gained if math.isfinite(self.gained) else 0.0
         return self.predicted / (1 - shrinking) / self.history[-1] if shrinking < 1 else math.inf
@@ -228,8 +228,9 @@ class GaussNewton:
     Parameters
     ----------
     tolerance
-        Converged when the predicted decrease of the loss, relative to the loss, is smaller: that of the next step, and
-        that of all to come, unless the last step has brought less.
+        Converged when the next step is predicted to lower the loss by less than this of itself, and either the last
+        step did no more, or all steps to come together will not, if they go on shrinking at the same rate. A fit that
+        crawls by less than this at each step counts as converged.
     max_steps
         Gauss-Newton steps at most.
     """
@@ -270,7 +271,11 @@ class GaussNewton:
         loss = float(trial.loss)
         # Refused as well: a loss that is not a number, and no step at all, from blocks that are singular to float32.
         if not loss < state.history[-1]:
+            # At the minimum itself no step brings anything.
+            if kernels.by_channel and state.boost == 1 and promised > 0:
+                state = replace(state, predicted=float(promised))
             return self._prepared(replace(state, history=(*state.history, state.history[-1]), boost=10 * state.boost))
+        boosted = state.boost > 1
         state = replace(
             state,
             gains=gains,
@@ -280,9 +285,13 @@ class GaussNewton:
             boost=1.0,
             preconditioner=preconditioner,
             gained=state.history[-1] - loss,
+            predicted=math.inf,
         )
-        # Without slow directions, the next step will bring less than this one did.
-        return replace(state, predicted=float(promised)) if kernels.by_channel else self._prepared(state)
+        if not kernels.by_channel:
+            return self._prepared(state)
+        # Without slow directions, the next step will bring less than this one did. One that a boosted damping kept
+        # small says nothing of the next.
+        return state if boosted else replace(state, predicted=float(promised))
 
     def terminate(self, state: GaussNewtonState) -> Verdict | None:
         """Judge convergence by the decrease of the loss that the next step is predicted to bring."""
@@ -295,7 +304,8 @@ class GaussNewton:
         if fall < self.tolerance and min(state.outlook, state.gained / loss) < self.tolerance:
             return Verdict("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.boost > MAX_BOOST:
-            return Verdict("stalled", f"no step lowers the loss, though {fall:.1e} of itself is predicted")
+            hint = f", though {fall:.1e} of itself is predicted" if math.isfinite(fall) else ""
+            return Verdict("stalled", f"no step lowers the loss{hint}")
         if n_steps >= self.max_steps:
             hint = f": {fall:.1e} of the loss is predicted to go" if math.isfinite(fall) else ""
             return Verdict("max-steps", f"not converged after {n_steps} steps{hint}")

@@ -3,15 +3,18 @@
 Far from the minimum the couplings between antennas within a channel matter most; close to it, those between channels
 within an antenna, which the eliminated foregrounds bring in.
 
-The block of one antenna is K - C: K is diagonal, its degrees, and C what the foregrounds of its baselines absorb, sum_b
-(D F)^* Q S^T S Q^T (D F). Foregrounds of few vectors absorb only what is smooth, so that C matters on the span of their
-common basis Q and next to nowhere else. The preconditioner M has the values of the block on that span, and is K on its
-complement in the metric of K:
+In the notation of `calstudy.calibrate.projection`, the block of one antenna is K - C. K is diagonal, the sum of D |F|^2
+over the antenna's baselines: its degrees. C is what the foregrounds of these baselines absorb, the sum of
+(D F)^* Q S^T S Q^T (D F), conjugated where the antenna is the second of its baseline. Foregrounds of few vectors follow
+only what is smooth, so that K - C is close to zero for some gains in the span of their common basis Q only, and not
+much below K for others. The preconditioner M has the values of the block on that span, and is K on its complement in
+the metric of K:
 
     M = K - L (Q^T C Q) L^T, L = K Q (Q^T K Q)^-1
     M^-1 = K^-1 + Q [ (Q^T (K - C) Q)^-1 - (Q^T K Q)^-1 ] Q^T
 
-With a damping relative to the diagonal, K stands for (1 + damping) K everywhere but in L.
+M is positive definite, because C nowhere exceeds K. With a damping relative to the diagonal, K stands for
+(1 + damping) K, which leaves L as it is.
 """
 
 from __future__ import annotations
@@ -44,7 +47,10 @@ def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
 
 
 class ChannelInverse(NamedTuple):
-    """Inverse of the antenna blocks of each channel; `factors` are theirs, (2, Nfreqs, Nants, Nants)."""
+    """Inverse of the antenna blocks of each channel.
+
+    `factors` are Cholesky factors, for real and for imaginary parts of eta, (2, Nfreqs, Nants, Nants).
+    """
 
     factors: tf.Tensor
 
@@ -119,8 +125,10 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
             square = tf.matmul(real, real, transpose_a=True) + tf.matmul(imaginary, imaginary, transpose_a=True)
             crossed = tf.matmul(real, imaginary, transpose_a=True)
             both = tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)])
-            absorbed.append(tensors.sum_over_antenna(both, baselines))
-    return AntennaBlocks(degrees, common, gram, tf.add_n(absorbed))
+            # Added up on the way: the sums of all stretches at once would be large.
+            before = absorbed[-1] if absorbed else 0.0
+            absorbed.append(before + tensors.sum_over_antenna(both, baselines))
+    return AntennaBlocks(degrees, common, gram, absorbed[-1])
 
 
 class AntennaInverse(NamedTuple):
@@ -131,7 +139,7 @@ class AntennaInverse(NamedTuple):
     common
         Q, (Nfreqs, rank).
     diagonal
-        1 / K, (Nants, Nfreqs).
+        1 / ((1 + damping) K), (Nants, Nfreqs).
     correction
         Hermitian, real and imaginary part, (2, Nants, rank, rank).
     """
@@ -161,7 +169,10 @@ def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse
 
 
 class CoordinateInverse(NamedTuple):
-    """Inverse of the blocks of each antenna for coordinates; `factors` are theirs, (Nants, Ngain, Ngain), complex64."""
+    """Inverse of the blocks of each antenna for coordinates.
+
+    `factors` are Cholesky factors, (Nants, Ngain, Ngain), complex64.
+    """
 
     factors: tf.Tensor
 
@@ -182,8 +193,9 @@ def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Te
     diagonal = tf.cast((1 + damping) * blocks.degrees, columns.dtype)
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
     if blocks.absorbed is not None:
-        gram = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), tf.float32)
-        lift = tf.cast(blocks.degrees[:, :, None] * (blocks.common @ gram), columns.dtype)
+        # L of the module's M.
+        inverse = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), tf.float32)
+        lift = tf.cast(blocks.degrees[:, :, None] * (blocks.common @ inverse), columns.dtype)
         inner = tf.matmul(columns, lift, adjoint_a=True)
         matrix -= inner @ tf.matmul(tf.complex(blocks.absorbed[0], blocks.absorbed[1]), inner, adjoint_b=True)
     return CoordinateInverse(tf.linalg.cholesky(matrix))
