@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from calstudy.claims.computation import COMPUTATION
 from calstudy.claims.statement import Claim
 from calstudy.regression.tolerances import ROUNDING, Arrays, Drawn, Fixed, Measured, tolerance
 
@@ -158,6 +159,7 @@ def compare_claims(reference: Sequence[Claim], made: Sequence[Claim]) -> list[Cl
 
     Another verdict is beyond if the number moved by more than three of its uncertainties, or has none; nearer than
     that another draw of the noise changes it as well. So is a claim that is missing, or is no longer evaluated.
+    Claims on run time and memory are about a machine, and never beyond for their numbers.
     """
     old, new = ({claim.name: claim for claim in claims} for claims in (reference, made))
     return [_compare_claim(name, old.get(name), new.get(name)) for name in dict.fromkeys([*old, *new])]
@@ -169,13 +171,15 @@ def _compare_claim(name: str, old: Claim | None, new: Claim | None) -> ClaimComp
         verdicts = (old.verdict if old else "new", new.verdict if new else "missing")
         return ClaimComparison(name, status, *verdicts, None, None, None)
     numbers = (old.measured, new.measured)
+    machines = old.section == COMPUTATION.section
     if None in numbers:
-        status = "same" if old.verdict == new.verdict else "beyond"
+        evaluated = "moved" if machines and new.measured is not None else "beyond"
+        status = "same" if old.verdict == new.verdict else evaluated
         return ClaimComparison(name, status, old.verdict, new.verdict, *numbers, None)
     difference = abs(new.measured - old.measured)
     sigmas = difference / old.uncertainty if old.uncertainty else None
     if old.verdict != new.verdict:
-        status = "beyond" if sigmas is None or sigmas > CLAIM_SIGMAS else "moved"
+        status = "moved" if machines or (sigmas is not None and sigmas <= CLAIM_SIGMAS) else "beyond"
     else:
         status = "same" if difference <= ROUNDING * max(abs(old.measured), abs(new.measured)) else "moved"
     return ClaimComparison(name, status, old.verdict, new.verdict, *numbers, sigmas)

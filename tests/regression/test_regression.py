@@ -157,6 +157,18 @@ def test_a_verdict_may_change_with_a_number_that_moved_within_its_error(uncertai
     assert [item.status for item in compare_claims([], [new])] == ["moved"]
 
 
+def test_verdicts_on_run_time_may_be_others_on_another_machine():
+    texts = dict.fromkeys(("sentence", "quantity", "threshold", "why", "reason"), "")
+    old = Claim(
+        name="claim", section="Computational Runtime", measured=1.0, uncertainty=0.0, verdict="PASS", runs=(), **texts
+    )
+    slower = dataclasses.replace(old, measured=2.0, verdict="FAIL")
+    gone = dataclasses.replace(old, measured=None, verdict="not evaluated")
+    assert [item.status for item in compare_claims([old], [slower])] == ["moved"]
+    assert [item.status for item in compare_claims([gone], [slower])] == ["moved"]
+    assert [item.status for item in compare_claims([old], [gone])] == ["beyond"]
+
+
 def test_the_command_answers_with_its_exit_status_and_overwrites_only_if_told(tmp_path, finished):
     command, kept = CliRunner(), tmp_path / "kept"
     new = command.invoke(app, ["regress", str(kept), "--against", str(finished), "--update"])
