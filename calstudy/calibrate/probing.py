@@ -8,9 +8,14 @@ import tensorflow as tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
-from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
-from calstudy.calibrate.solvers.gauss_newton import DAMPING_BOUNDS, PRECONDITIONER_DAMPING, Kernels, compiled
-from calstudy.calibrate.solvers.preconditioners import Inverse, antenna_degrees, channel_inverse
+from calstudy.calibrate.solvers.gauss_newton import (
+    DAMPING_BOUNDS,
+    PRECONDITIONER_DAMPING,
+    Kernels,
+    NormalEquations,
+    compiled,
+)
+from calstudy.calibrate.solvers.preconditioners import Inverse, channel_inverse
 from calstudy.calibrate.tangent import DelayModes, Tangent
 
 CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
@@ -31,14 +36,14 @@ class Follower:
         self.kernels: Kernels = compiled(problem.structure, problem.frozen)
         reduced = self.kernels.reduce(problem, gains)
         self._unit = reduced.loss_unit
-        self._projection: Projection = self.kernels.project(reduced.gains, *reduced.measured)
-        self._gains = tf.cast(reduced.gains, tf.float32)
-        self._damping = tf.constant(DAMPING_BOUNDS[0], tf.float32)
+        projection: Projection = self.kernels.project(reduced.gains, *reduced.measured)
         stronger = tf.constant(PRECONDITIONER_DAMPING, tf.float32)
         if self.kernels.by_channel:
-            self._inverse: Inverse = channel_inverse(self.kernels.tensors, self._projection, stronger)
+            inverse: Inverse = channel_inverse(self.kernels.tensors, projection, stronger)
         else:
-            self._inverse = self.kernels.inverse(self.kernels.blocks(self._projection), stronger, reduced.gains)
+            inverse = self.kernels.inverse(self.kernels.blocks(projection), stronger, reduced.gains)
+        damping = tf.constant(DAMPING_BOUNDS[0], tf.float32)
+        self._equations = NormalEquations(projection, reduced.gains, damping, inverse)
         self._solve = tf.function(self._follow)
 
     def follow(self, change: np.ndarray) -> np.ndarray:
@@ -53,22 +58,8 @@ class Follower:
         return pairs.to_complex(self._solve(pairs.to_pair(change / self._unit, tf.float32)))
 
     def _follow(self, descent: tf.Tensor) -> tf.Tensor:
-        kernels, projection, gains = self.kernels, self._projection, self._gains
-        diagonal = self._damping * antenna_degrees(kernels.tensors, projection)
-
-        def operator(coordinates: tf.Tensor) -> tf.Tensor:
-            eta = kernels.space.expand_relative(coordinates, gains)
-            image = kernels.projector.hessian_product(eta, projection) + diagonal * eta
-            return kernels.space.reduce_relative(image, gains)
-
-        coordinates, _ = conjugate_gradients(
-            operator,
-            self._inverse.apply,
-            kernels.space.reduce_relative(descent, gains),
-            tf.constant(CG_TOLERANCE),
-            tf.constant(CG_ITERATIONS),
-        )
-        return kernels.space.expand_relative(coordinates, gains)
+        eta, _ = self.kernels.solve(self._equations, descent, CG_TOLERANCE, CG_ITERATIONS)
+        return eta
 
 
 def probe(

@@ -74,6 +74,27 @@ class Reduced(NamedTuple):
     loss_unit: float
 
 
+class NormalEquations(NamedTuple):
+    """The damped Gauss-Newton equations at one point, and what preconditions them.
+
+    Attributes
+    ----------
+    projection
+        The reduced problem there.
+    gains
+        (2, Nants, Nfreqs), float32 or float64.
+    damping
+        Relative to the diagonal, scalar, float32.
+    inverse
+        Preconditioner.
+    """
+
+    projection: Projection
+    gains: tf.Tensor
+    damping: tf.Tensor
+    inverse: Inverse
+
+
 class Kernels:
     """The compiled pieces of the solver for one fit structure.
 
@@ -114,20 +135,36 @@ class Kernels:
     ) -> tuple[tf.Tensor, tf.Tensor]:
         """Return eta, and the decrease of the loss that its quadratic model promises."""
         inverse = channel_inverse(self.tensors, projection, damping)
-        eta, _ = self._solve(projection, gains, damping, inverse, CG_CHANNEL_ITERATIONS)
-        return eta, pairs.inner_product(tf.cast(projection.descent, tf.float32), eta)
+        descent = tf.cast(projection.descent, tf.float32)
+        equations = NormalEquations(projection, gains, damping, inverse)
+        eta, _ = self.solve(equations, descent, CG_TOLERANCE, CG_CHANNEL_ITERATIONS)
+        return eta, pairs.inner_product(descent, eta)
 
     def _antenna_step(
         self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
     ) -> tuple[tf.Tensor, tf.Tensor]:
         """Return eta, and the iterations it took."""
-        return self._solve(projection, gains, damping, inverse, CG_ANTENNA_ITERATIONS)
+        descent = tf.cast(projection.descent, tf.float32)
+        equations = NormalEquations(projection, gains, damping, inverse)
+        return self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)
 
-    def _solve(
-        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor, inverse: Inverse, iterations: int
+    def solve(
+        self, equations: NormalEquations, descent: tf.Tensor, tolerance: float, iterations: int
     ) -> tuple[tf.Tensor, tf.Tensor]:
-        diagonal = damping * antenna_degrees(self.tensors, projection)
-        gains = tf.cast(gains, tf.float32)
+        """Return eta for a descent direction, both (2, Nants, Nfreqs), float32, and the iterations it took.
+
+        Parameters
+        ----------
+        equations
+            What is solved.
+        descent
+            Minus half the gradient in eta.
+        tolerance, iterations
+            See `calstudy.calibrate.solvers.conjugate_gradients.conjugate_gradients`.
+        """
+        projection = equations.projection
+        diagonal = equations.damping * antenna_degrees(self.tensors, projection)
+        gains = tf.cast(equations.gains, tf.float32)
 
         def operator(coordinates: tf.Tensor) -> tf.Tensor:
             eta = self.space.expand_relative(coordinates, gains)
@@ -136,9 +173,9 @@ class Kernels:
 
         coordinates, count = conjugate_gradients(
             operator,
-            inverse.apply,
-            self.space.reduce_relative(tf.cast(projection.descent, tf.float32), gains),
-            tf.constant(CG_TOLERANCE),
+            equations.inverse.apply,
+            self.space.reduce_relative(descent, gains),
+            tf.constant(tolerance),
             tf.constant(iterations),
         )
         return self.space.expand_relative(coordinates, gains), count
