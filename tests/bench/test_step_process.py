@@ -27,7 +27,8 @@ def test_every_solver_is_timed_as_often_as_asked():
     assert steps > 2
     assert min(min(samples) for samples in found.seconds.values()) > 0
     assert sum(found.seconds["default-solve"]) > sum(found.seconds["default-step"])
-    assert np.median(found.seconds["paper-step"]) > np.median(found.seconds["paper-sum"])
+    # A step holds the sum and its gradient. The shortest of all samples is that with the least of the machine in it.
+    assert min(found.seconds["paper-step"]) > min(found.seconds["paper-sum"])
     assert (found.antennas, found.baselines) == (6, 15)
     assert found.longest == pytest.approx(100.0)
     # 384 ns on either side over 60 MHz, and some more until the sequences leave the band.
