@@ -121,4 +121,5 @@ def test_a_run_on_two_ranks_has_the_visibilities_of_a_serial_one(tmp_path):
             for store in (parallel, serial)
         ]
         assert np.abs(cubes[1]).min() > 0
-        np.testing.assert_array_equal(*cubes)
+        # The ranks may add up the sources in another order: the same to rounding, as between chunks.
+        assert np.abs(cubes[0] - cubes[1]).max() < 1e-12 * np.sqrt(np.mean(np.abs(cubes[1]) ** 2))

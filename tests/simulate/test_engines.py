@@ -159,9 +159,8 @@ def test_auto_takes_the_fastest_that_can(sky, template, tile_beam):
     assert auto.choose(sky, tile_beam, template).name == "dense"
     polarized = point_sky(sky.skycoord[:2], [1.0, 1.0], stokes_q=0.3)
     assert auto.choose(polarized, tile_beam, template).name == "pyuvsim"
-    np.testing.assert_array_equal(
-        auto.simulate(polarized, tile_beam, template), PyuvsimEngine().simulate(polarized, tile_beam, template)
-    )
+    expected = PyuvsimEngine().simulate(polarized, tile_beam, template)
+    assert relative_error(auto.simulate(polarized, tile_beam, template), expected) < 1e-12
     with pytest.raises(ValueError, match="polarized sky"):
         DenseEngine().simulate(polarized, tile_beam, template)
 
