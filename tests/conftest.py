@@ -8,10 +8,15 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 from observations import small_instrument
 from pyuvdata import UVData
 
 from calstudy.instrument.telescope import make_template
+
+# How long an example takes is the machine's affair: a busy one fails hypothesis' deadline of 0.2 s, and no property.
+settings.register_profile("any-machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any-machine")
 
 
 @pytest.fixture

@@ -150,7 +150,7 @@ def test_a_killed_run_resumes_and_ends_as_if_it_had_not_been(finished, tmp_path)
     process = subprocess.Popen(
         command(path, "--workers", "1"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 600
     while not list((tmp_path / "store" / "simulate-chunk").glob("[0-9a-f]*")) and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
