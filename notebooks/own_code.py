@@ -11,8 +11,8 @@ from calstudy.gains import make_uvcal
 def sky_based(data, sky_model, rounds=30, fault=0.0):
     """Solve each channel for gains that turn the sky model into the data (StefCal, Salvini & Wijnholds 2014).
 
-    `fault` spoils the sky model first: each baseline gets that part of it once more, at the edge of its wedge, as a
-    catalogue that lacks sources near the horizon would do.
+    `fault` makes the sky model imperfect: this fraction of the model of each baseline is added to it again at the edge
+    of the wedge, like the error of a catalogue that lacks sources near the horizon.
     """
     lengths = np.linalg.norm(data.uvw_array, axis=1)
     late = np.exp(2j * np.pi * np.outer(lengths / 299792458.0, data.freq_array))
