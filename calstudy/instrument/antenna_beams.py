@@ -1,4 +1,4 @@
-"""Arrays whose antennas do not all have the same beam."""
+"""Arrays with different beams on different antennas."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Source = TypeVar("Source")
 
 @dataclass(frozen=True)
 class AntennaBeams:
-    """The beams of an array, and which antenna has which.
+    """The distinct beams of an array, and the beam of each antenna.
 
     Attributes
     ----------
     beams
-        Distinct ones, the array's own first.
+        Distinct beams; the first is `instrument.beam`.
     index
-        Which of `beams` each antenna of the layout has, in its order, (Nants,) int.
+        Index into `beams` for each antenna, in the order of the layout, (Nants,) int.
     """
 
     beams: tuple[Beam, ...]
@@ -34,7 +34,7 @@ class AntennaBeams:
 
     @property
     def stand_in(self) -> str | None:
-        """What stands in for the beam of the paper: the array's own beam's sentence, and that there are others."""
+        """The stand-in for the paper's beam: that of `instrument.beam`, and the number of antennas with other beams."""
         others = f"antennas with another: {int((self.index > 0).sum())}"
         return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
 
@@ -45,7 +45,7 @@ def make_beams(settings: InstrumentSettings, n_antennas: int) -> Beam | AntennaB
     Parameters
     ----------
     settings
-        The `instrument` section. Sets of antennas with the array's own beam, or with one another's, share it.
+        The `instrument` section. Sets of antennas with equal beams share one.
     n_antennas
         Antennas of the layout.
 

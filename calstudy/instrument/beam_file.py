@@ -1,4 +1,4 @@
-"""The file of the MWA's full embedded element beam: where it is, and fetching it."""
+"""The file of the MWA full embedded element beam: location and download."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from calstudy.errors import InputError
 FILE = "mwa_full_embedded_element_pattern.h5"
 URL = f"http://ws.mwatelescope.org/static/{FILE}"
 SHA256 = "a7649c6e03b8128a1de4614c2f363af5fa44f3890ae27bf893d56ca337bc48ee"
-"""Of the file that the mwa_pb package 1.1 carries, which was downloaded from the same address when it was built."""
+"""SHA-256 of the file in mwa_pb 1.1, which was downloaded from the same address when the package was built."""
 
 
 def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
-    """Download the embedded element beam (Sokolowski et al. 2017, 133 MB), or check the copy that is there.
+    """Download the embedded element beam (Sokolowski et al. 2017, 133 MB), or verify an existing copy.
 
     Parameters
     ----------
@@ -30,13 +30,13 @@ def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
         If the download fails or is not the file.
     """
     path = (default_directory() if directory is None else directory) / FILE
-    instead = "give a copy of yours under instrument.beam.path, or use the one in the mwa_pb package (the default)"
+    instead = "set instrument.beam.path to your own copy, or use the file of the mwa_pb package (the default)"
     download(URL, path, instead, known_hash=SHA256, progress=progress)
     return path
 
 
 def find_beam() -> Path:
-    """Return the beam file of the mwa_pb package, or where that has none, the one that was fetched.
+    """Return the path of the beam file in the mwa_pb package or, if that has none, of the downloaded file.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def find_beam() -> Path:
     found = next((path for path in places if path.is_file()), None)
     if found is None:
         raise InputError(
-            "instrument.beam: the mwa_pb package was installed without its beam file; get it with "
-            "'calstudy data fetch beam', or give a file under instrument.beam.path"
+            "instrument.beam: the mwa_pb package was installed without its beam file; download it with "
+            "'calstudy data fetch beam', or set instrument.beam.path to a file"
         )
     return found

@@ -29,14 +29,14 @@ TILE_HEIGHT = 0.278
 
 
 class Beam(Protocol):
-    """What an antenna sees of the sky, the same for all antennas.
+    """The primary beam of an antenna.
 
     Attributes
     ----------
     name
-        Which beam it is.
+        Name of the beam.
     stand_in
-        A sentence if it is not the beam of the paper, otherwise None.
+        A note if it is not the beam of the paper, otherwise None.
     """
 
     name: str
@@ -84,7 +84,7 @@ def _row_factor(wavenumber: np.ndarray) -> np.ndarray:
 
 
 class ExactBeam:
-    """A beam with a formula, evaluated where it is asked for (`Beam`)."""
+    """An analytic beam, evaluated at the requested directions and frequencies (`Beam`)."""
 
     def __init__(self, analytic: AnalyticBeam, name: str, stand_in: str) -> None:
         self.name = name
@@ -109,7 +109,7 @@ class ExactBeam:
 
 
 class GriddedBeam:
-    """A beam known on a grid of directions and frequencies (`Beam`).
+    """A beam tabulated on a grid of directions and frequencies (`Beam`).
 
     Attributes
     ----------
@@ -171,8 +171,8 @@ def make_beam(settings: section.Beam, channels: section.Channels | None = None) 
     settings
         Any kind of beam section.
     channels
-        The channels to be observed, the paper's by default: tabulated beams are read and fitted over a band a bit
-        wider than theirs, and refuse frequencies outside it.
+        The channels of the observation, by default those of the paper. Tabulated beams are read and fitted over a
+        slightly wider band, and do not accept frequencies outside it.
 
     Raises
     ------

@@ -19,7 +19,7 @@ from scipy.spatial.distance import pdist, squareform
 from calstudy.errors import InputError
 from calstudy.instrument import settings as section
 
-# The array centre of the observatory's own metafits files, given here because astropy looks sites up online.
+# The array centre in the metafits files of the observatory; given here because astropy looks up sites online.
 MWA_LOCATION = EarthLocation.from_geodetic(
     lon=116.67081524 * units.deg, lat=-26.70331941 * units.deg, height=377.827 * units.m
 )
@@ -66,15 +66,15 @@ ROW_LENGTH = 8
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the antennas of an array stand.
+    """Positions of the antennas of an array.
 
     Attributes
     ----------
     name
         Name of the layout.
     numbers
-        Antenna numbers, unique, int array of shape (Nants,). Tiles of the MWA keep their place in the 128-tile compact
-        configuration whichever part of it is used.
+        Antenna numbers, unique, int array of shape (Nants,). The number of an MWA tile is its place in the 128-tile
+        compact configuration, also in layouts that use a part of it.
     names
         Antenna names, unique.
     enu
@@ -92,15 +92,15 @@ class Layout:
 
 @dataclass(frozen=True)
 class RedundantGroups:
-    """Which baselines measure the same thing.
+    """Redundant groups of baselines.
 
     Attributes
     ----------
     index
         Group of each baseline, int array of shape (Nbls,); groups are numbered by their first baseline.
     conjugated
-        Whether a baseline points against the first baseline of its group, so that its visibility is the complex
-        conjugate of the group's, bool array of shape (Nbls,).
+        Whether a baseline has the opposite direction of the first baseline of its group, so that its visibility is the
+        complex conjugate of that of the group, bool array of shape (Nbls,).
     """
 
     index: np.ndarray
@@ -108,7 +108,7 @@ class RedundantGroups:
 
 
 def make_layout(settings: section.Layout) -> Layout:
-    """Return the antennas that the `instrument.layout` section asks for.
+    """Return the antennas of the `instrument.layout` section.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def make_layout(settings: section.Layout) -> Layout:
 
 
 def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
-    """Sort baselines into redundant groups, a baseline and its reverse into the same one.
+    """Sort baselines into redundant groups. A baseline and its reverse are in the same group.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _from_csv(path: Path) -> Layout:
     first, second = np.unravel_index(distances.argmin(), distances.shape)
     if distances[first, second] == 0:
         raise InputError(
-            f"instrument.layout.path: antennas {names[first]!r} and {names[second]!r} in {path} are in one place: a "
-            "baseline of length zero"
+            f"instrument.layout.path: antennas {names[first]!r} and {names[second]!r} in {path} are in the same place: "
+            "a baseline of length zero"
         )
     return Layout(path.stem, numbers, names, enu, MWA_LOCATION)

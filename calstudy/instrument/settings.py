@@ -32,7 +32,7 @@ class HexLayout(Section):
     """A filled regular hexagon, flat, at the MWA site."""
 
     kind: Literal["hex"]
-    side: int = Field(4, ge=2, description="Antennas along one side; `side` = 4 gives 37.")
+    side: int = Field(4, ge=2, description="Antennas along one side; 4 gives 37 antennas.")
     spacing: Length = Field(14.0, gt=0, description="Distance between neighbours.")
 
 
@@ -48,7 +48,7 @@ class RectangularLayout(Section):
     """Rows of eight antennas, spread so that the longest baseline is `max_baseline` (paper Fig. ANTPOS_RUNTIME)."""
 
     kind: Literal["rectangular"]
-    count: int = Field(16, ge=9, description="Antennas; nine at least, for there to be two rows.")
+    count: int = Field(16, ge=9, description="Number of antennas; at least nine, so that there are two rows.")
     spacing: Length = Field(2.0, gt=0, description="Distance between neighbours in a row.")
     max_baseline: Length = Field(100.0, gt=0)
 
@@ -66,7 +66,7 @@ class GolombLayout(Section):
     """An east-west line at the marks of an optimal Golomb ruler: every baseline is unique."""
 
     kind: Literal["golomb"]
-    count: int = Field(8, ge=2, le=12, description="Antennas, i.e. marks of the ruler.")
+    count: int = Field(8, ge=2, le=12, description="Number of antennas (marks of the ruler).")
     spacing: Length = Field(4.0, gt=0, description="Length of one unit of the ruler.")
 
 
@@ -88,12 +88,11 @@ class MwaEmbeddedBeam(Section):
     """The MWA full embedded element beam (Sokolowski et al. 2017), pointed at zenith."""
 
     kind: Literal["mwa-embedded-element"] = "mwa-embedded-element"
-    path: Path | None = Field(
-        None, strict=False, description="Beam file; by default the one that the mwa_pb package carries."
-    )
+    path: Path | None = Field(None, strict=False, description="Beam file; default: the file of the mwa_pb package.")
     interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = Field(
         "chebyshev",
-        description="Between tabulated frequencies, 1.28 MHz apart: a smooth fit, or point to point as in the paper.",
+        description="Interpolation between tabulated frequencies, 1.28 MHz apart: `chebyshev` is a smooth fit, the "
+        "others go from point to point, as in the paper.",
     )
 
 
@@ -108,11 +107,11 @@ class GaussianBeam(Section):
 
     kind: Literal["gaussian"]
     fwhm_deg: float = Field(22.0, gt=0, lt=180, description="Full width at half maximum of the power beam, in degrees.")
-    reference_frequency: Frequency = Field(182.0e6, gt=0, description="Where the width is `fwhm_deg`.")
+    reference_frequency: Frequency = Field(182.0e6, gt=0, description="Frequency at which the width is `fwhm_deg`.")
 
 
 class AiryBeam(Section):
-    """The beam of a uniformly lit circular aperture."""
+    """The beam of a uniformly illuminated circular aperture."""
 
     kind: Literal["airy"]
     diameter: Length = Field(4.0, gt=0)
@@ -125,7 +124,7 @@ class DipoleBeam(Section):
 
 
 class FileBeam(Section):
-    """Any beam that pyuvdata reads from a beamfits file."""
+    """An E-field beam from a beamfits file, on a grid of azimuth and zenith angle."""
 
     kind: Literal["beamfits"]
     path: Path = Field(strict=False)
@@ -140,12 +139,12 @@ Beam = Annotated[
 
 
 class AntennaBeam(Section):
-    """Antennas whose beam is not the array's own."""
+    """Antennas with a beam other than `instrument.beam`."""
 
     antennas: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, min_length=1)] = Field(
-        description="Which antennas of the layout, counted from 0."
+        description="Antennas, counted from 0 in the order of the layout."
     )
-    beam: Beam = Field(description="Their beam, any of the kinds of `instrument.beam`.")
+    beam: Beam = Field(description="Their beam; the kinds are those of `instrument.beam`.")
 
 
 class Channels(Section):
@@ -159,13 +158,15 @@ class Channels(Section):
 class Times(Section):
     """Equally spaced integrations; the default is the paper's (56 x 2 s from LST 1.8 h)."""
 
-    start_lst: HourAngle = Field(1.8, ge=0, lt=24, description="Local sidereal time at the centre of the first one.")
+    start_lst: HourAngle = Field(
+        1.8, ge=0, lt=24, description="Local sidereal time at the centre of the first integration."
+    )
     integration: Time = Field(2.0, gt=0)
     count: int = Field(56, ge=1)
 
 
 class InstrumentSettings(Section):
-    """Where the antennas are, what they see, and when and at which frequencies they observe."""
+    """Positions and beams of the antennas, and times and frequencies of the observation."""
 
     layout: Layout = MwaLayout()
     beam: Beam = MwaEmbeddedBeam()
@@ -173,12 +174,12 @@ class InstrumentSettings(Section):
     antenna_beams: dict[str, AntennaBeam] = Field(
         default_factory=dict,
         exclude_if=lambda value: not value,
-        description="Sets of antennas with another beam, by any name. Power spectra are normalized by `beam`.",
+        description="Sets of antennas with another beam, with any names. Power spectra are normalized with `beam`.",
     )
     channels: Channels = Channels()
     times: Times = Times()
     polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(strict=False, min_length=1, max_length=2)] = Field(
-        ("xx",), description="Linear polarizations, each calibrated on its own: xx (east-west dipoles), yy, or both."
+        ("xx",), description="Linear polarizations, calibrated independently: xx (east-west dipoles), yy, or both."
     )
 
     @model_validator(mode="after")
@@ -193,6 +194,6 @@ class InstrumentSettings(Section):
         for name, group in self.antenna_beams.items():
             twice = seen.intersection(group.antennas)
             if twice or len(set(group.antennas)) != len(group.antennas):
-                raise fault(f"antenna_beams.{name}.antennas", "names an antenna that is named already")
+                raise fault(f"antenna_beams.{name}.antennas", "contains an antenna that is already in a set")
             seen.update(group.antennas)
         return self

@@ -1,4 +1,4 @@
-"""Beams known at tabulated frequencies, made available at any frequency of a band."""
+"""Interpolation of tabulated beams in frequency."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _read_mwa(path: Path, low: float, high: float) -> UVBeam:
 
 
 def read_beamfits(path: Path) -> UVBeam:
-    """Read an efield beam on a grid of azimuth and zenith angle from a beamfits file.
+    """Read an E-field beam on a grid of azimuth and zenith angle from a beamfits file.
 
     Raises
     ------
@@ -71,8 +71,8 @@ def read_beamfits(path: Path) -> UVBeam:
     usable = beam.beam_type == "efield" and beam.pixel_coordinate_system == "az_za"
     if not usable or list(beam.feed_array) not in (["x", "y"], ["x"]) or beam.axis2_array[0] != 0:
         raise InputError(
-            f"instrument.beam.path: {path} must hold an efield beam of feeds x and y on a grid of azimuth and zenith "
-            f"angle from the zenith; it holds a {beam.beam_type} beam of feeds {beam.feed_array} on "
+            f"instrument.beam.path: {path} must contain an efield beam of feeds x and y on a grid of azimuth and "
+            f"zenith angle from the zenith; it contains a {beam.beam_type} beam of feeds {beam.feed_array} on "
             f"{beam.pixel_coordinate_system}"
         )
     return beam
@@ -85,14 +85,14 @@ def _fit_range(band: tuple[float, float]) -> tuple[float, float]:
 
 
 class TabulatedBeam:
-    """Jones components on a grid of directions, continuous in frequency.
+    """Jones components on a grid of directions, as continuous functions of frequency.
 
-    Interpolation "chebyshev" fits one smooth polynomial in frequency to all tabulated ones, per direction, feed and
-    component; it is a polynomial in frequency to rounding, and so adds nothing at large delays. "cubic", "linear" and
-    "nearest" go from point to point, as in the paper, and follow the table's scatter.
+    Interpolation "chebyshev" fits one smooth polynomial in frequency to the table, for each direction, feed and
+    component. Its power at large delays is at the level of rounding. "cubic", "linear" and "nearest" interpolate from
+    point to point, as in the paper, and reproduce the scatter of the table.
 
-    The result is divided by its own zenith value, feed by feed. That is a smooth function of frequency, where the
-    largest tabulated value (the maximum over pixels and feeds) need not be, and for these beams it is the peak.
+    The result is divided by its zenith value, for each feed. For these beams the zenith value is the peak. It is a
+    smooth function of frequency; the largest tabulated value (the maximum over pixels and feeds) need not be.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The observation without its data: a UVData that holds antennas, baselines, times, channels and polarizations."""
+"""The metadata of an observation: a UVData with antennas, baselines, times, channels and polarizations, no data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POLARIZATION_NUMBERS = {"xx": -5, "yy": -6}
 
 
 def use_bundled_earth_orientation() -> None:
-    """Keep astropy from downloading Earth-orientation tables: the bundled ones cover the simulated date.
+    """Prevent astropy from downloading Earth orientation tables. The installed tables cover the simulated date.
 
     Call it in every process that computes sidereal times or source positions.
     """
@@ -67,7 +67,7 @@ def make_template(settings: InstrumentSettings, autos: bool = False) -> UVData:
 
 
 def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndarray) -> UVData:
-    """Return the template's observation at other times and frequencies, such as interpolation nodes.
+    """Return the observation of the template at other times and frequencies, such as interpolation nodes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The power spectrum that an EoR sky is drawn from, in the units of the estimates."""
+"""The input power spectrum of an EoR sky, in the units of the estimates."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ Baseline = tuple[int, int]
 
 
 class PowerBeam(Protocol):
-    """What the estimator needs of a beam (`calstudy.instrument.beams`)."""
+    """The part of the beam interface that the estimator uses (`calstudy.instrument.beams`)."""
 
     def solid_angles(self, frequencies: np.ndarray, pol: str) -> tuple[np.ndarray, np.ndarray]:
         """Integrals over the sky in sr of the power beam and of its square, (Nfreqs,) each, for "xx" or "yy"."""
@@ -54,16 +54,16 @@ class Pairs:
 
 
 def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
-    """Choose which baselines to cross (paper §Reduction of Simulation Products and Power Spectra).
+    """Choose the pairs of baselines of the cross spectra (paper §Reduction of Simulation Products and Power Spectra).
 
-    Either each baseline with itself (ab = cd), or each with every *other* of its redundant group, in both orders
-    (ab != cd), reversed where the group needs it. With ``pairs="auto"`` groups are used if at least half of the
+    Either each baseline with itself (ab = cd), or each with every *other* one of its redundant group, in both orders
+    (ab != cd), reversed if necessary to match the group. With ``pairs="auto"`` groups are used if at least half of the
     baselines have a redundant partner.
 
     Raises
     ------
     ValueError
-        If groups are asked for and no two baselines are redundant, or an antenna number is too large for hera_pspec.
+        If groups are requested and no two baselines are redundant, or an antenna number is too large for hera_pspec.
     """
     baselines = [(int(a), int(b)) for a, b in antenna_pairs(uvd)]
     if antenna_pairs(uvd).max() > LARGEST_ANTENNA_NUMBER:
@@ -117,7 +117,7 @@ def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_conventi
 
 
 def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings) -> UVPSpec:
-    """Cross the delay spectra of two data sets that share the sky but not the noise.
+    """Compute the cross power of the delay spectra of two data sets that share the sky but not the noise.
 
     P = X^2 Y / (Omega_pp B_pp) V~ V~* (paper Eq. of Parsons et al. 2012) by hera_pspec's quadratic estimator with
     identity weighting. The beam is divided out channel by channel (Omega_p to temperature, Omega_pp / Omega_p^2 in the
@@ -142,7 +142,7 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     ------
     ValueError
         If the data sets differ in anything but data, have more than one integration, are not in Jy, or leave no
-        unflagged pair. Baselines flagged altogether are left out.
+        unflagged pair. Baselines that are completely flagged are left out.
     """
     _require_match(even, odd)
     pairs = _unflagged(make_pairs(even, settings), even, odd)

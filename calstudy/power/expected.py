@@ -1,4 +1,4 @@
-"""The transfer function that a fit is expected to have, in the bins in which injected signals are measured."""
+"""The expected transfer function of a fit, in the bins in which injected signals are measured."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def bin_expected(modes: BaselineModes, edges: Sequence[float], buffer: float, le
     Parameters
     ----------
     modes
-        What is expected of each.
+        Expected transfer function of each mode.
     edges
         Bin edges of |k|, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
     buffer

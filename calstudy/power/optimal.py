@@ -1,8 +1,8 @@
-"""hera_pspec's estimator without its bottlenecks, for diagonal weighting.
+"""A faster implementation of the hera_pspec estimator, for diagonal weighting.
 
-Weighting visibilities by flags and a taper is a diagonal matrix. Then the normalization matrices of the quadratic
-estimator are circulant with a closed form, where hera_pspec sums over four channel indices (80 s and 3.2 GB at 384
-channels), and depend on the flags only, where hera_pspec keeps dense matrices for every baseline (7 GB for 630).
+Weighting visibilities by flags and a taper is a diagonal matrix. The normalization matrices of the quadratic estimator
+are then circulant with a closed form; hera_pspec sums over four channel indices (80 s and 3.2 GB at 384 channels). They
+depend on the flags only; hera_pspec keeps dense matrices for every baseline (7 GB for 630).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class DiagonalPSpecData(PSpecData):
     """
 
     def clear_cache(self, keys: list | None = None) -> None:
-        """Forget all matrices."""
+        """Delete all matrices."""
         super().clear_cache(keys)
         self._by_flags: dict[tuple, np.ndarray] = {}
         self._weights: dict[tuple, np.ndarray] = {}
@@ -114,6 +114,6 @@ class DiagonalPSpecData(PSpecData):
 
     def _require_diagonal(self, exact_norm: bool = False) -> None:
         if self.data_weighting != "identity" or exact_norm or any(self.filter_extension):
-            raise NotImplementedError("DiagonalPSpecData knows identity weighting and the usual normalization only")
+            raise NotImplementedError("DiagonalPSpecData supports identity weighting and the usual normalization only")
         if self.spw_Ndlys != self.spw_Nfreqs:
             raise NotImplementedError(f"{self.spw_Ndlys} delays for {self.spw_Nfreqs} channels: they must be as many")

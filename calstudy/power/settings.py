@@ -25,18 +25,21 @@ class KBins(Section):
 
 
 class PowerSettings(Section):
-    """From calibrated visibilities to wedge and spherical power spectra."""
+    """Cylindrical and spherical power spectra of calibrated visibilities."""
 
     taper: Literal["blackman-harris", "hann", "tukey", "none"] = "blackman-harris"
     pairs: Literal["same-baseline", "redundant-group", "auto"] = Field(
         "auto",
-        description="Cross each baseline with itself, or with the others of its redundant group; auto: groups if at "
-        "least half of the baselines have a redundant partner.",
+        description="Cross spectra of each baseline with itself, or with the others of its redundant group; auto: "
+        "groups if at least half of the baselines have a redundant partner.",
     )
-    redundancy_tolerance: Length = Field(1.0, gt=0, description="Baselines closer than this are one group.")
-    wedge_buffer: Delay = Field(100e-9, ge=0, description="Modes with |delay| <= |b|/c + buffer count as wedge.")
+    redundancy_tolerance: Length = Field(
+        1.0, gt=0, description="Baselines whose vectors differ by less than this are in one group."
+    )
+    wedge_buffer: Delay = Field(100e-9, ge=0, description="Modes with |delay| <= |b|/c + buffer are in the wedge.")
     length_bin: Length = Field(4.0, gt=0, description="Width of the cylindrical (wedge) bins in baseline length.")
     bins: KBins = KBins()
     cosmology: Literal["Planck15", "Planck18", "WMAP9"] = Field(
-        "Planck15", description="Of the whole study: also turns the EoR's P(k) into brightness."
+        "Planck15",
+        description="Cosmology of the complete study, also used to convert the P(k) of the EoR to brightness.",
     )

@@ -1,7 +1,7 @@
-"""Delay spectra as plain arrays: what the cylindrical and spherical averages work on.
+"""Delay spectra as plain arrays, the input of the cylindrical and spherical averages.
 
-A *unit* is what samples the sky once: a baseline crossed with itself, or a redundant group whose baselines are crossed
-with each other. The pairs of a unit share the signal; their noise products are independent.
+A *unit* is one sample of the sky: a baseline crossed with itself, or a redundant group whose baselines are crossed with
+each other. The pairs of a unit share the signal; their noise products are independent.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
 
 
 def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool) -> SphericalSpectrum:
-    """Average over all modes of equal |k|, each pair of baselines counting the same.
+    """Average over all modes in bins of |k|, with equal weights for all pairs of baselines.
 
     Parameters
     ----------

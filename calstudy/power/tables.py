@@ -1,4 +1,4 @@
-"""Averaged power spectra on disk: HDF5 with units for programs, CSV for people."""
+"""Files of averaged power spectra: HDF5 with units, and CSV."""
 
 from __future__ import annotations
 

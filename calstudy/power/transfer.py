@@ -1,38 +1,38 @@
-r"""Signal loss: how much of the EoR power survives a calibration (paper §Conclusion: loss must be accounted for).
+r"""Signal loss: the part of the EoR power that remains after calibration (paper §Conclusion: account for the loss).
 
-The same foregrounds, noise and gains are calibrated twice, with the EoR S in the data and without, which leaves the
-residuals R_with = R_0 + D and R_without = R_0. Their difference D is the response of the residual to the signal: what
-the foreground model and the gains have not absorbed of S. The power of the residual is then
+The same foregrounds, noise and gains are calibrated twice, with the EoR S in the data and without. The residuals are
+R_with = R_0 + D and R_without = R_0. Their difference D is the response of the residual to the signal: the part of S
+that the foreground model and the gains have not absorbed. The power of the residual is then
 
     <R_with* R_with> = <R_0* R_0> + <D* D> + 2 Re <R_0* D>,
 
-and the last term has no mean, for S is independent of noise and foregrounds. So P^D is the unbiased part of P^R that
-the signal is responsible for, and
+and the last term has zero mean, because S is independent of noise and foregrounds. P^D is therefore the part of P^R
+that is due to the signal, without bias, and
 
     T(k) = P^D / P^S
 
-is the transfer function P^R / P^S without what is in P^R even when there is no signal. It beats the difference of the
-two powers, P^{R_with} - P^{R_without}, by the whole of that last term, in which noise and foreground residuals scatter:
-in D they cancel, up to the change of the gains (S / F, 1e-4) times the noise. T is still made of even times odd, so
-that what is left of the noise in D gives no bias.
+is the transfer function: P^R / P^S without the part of P^R that is present without signal. The difference of the two
+powers, P^{R_with} - P^{R_without}, has the same mean, but also the scatter of the last term from noise and foreground
+residuals. These cancel in D, up to the change of the gains (S / F, 1e-4) times the noise. T is computed from cross
+powers of even and odd data, so that the remaining noise in D gives no bias.
 
-The *coherence* is the cross power with the signal, C(k) = Re <S* D> / P^S. If a calibration projects (D = M S with
-M = M* = M^2) and S is white, <D* D> = <S* M* M S> = <S* M S>: both are equal, and are the fraction of the mode outside
-of what the fit can absorb.
+The normalized cross power with the signal is C(k) = Re <S* D> / P^S (`coherence` in code and tables). If a calibration
+projects (D = M S with M = M* = M^2) and S is white, <D* D> = <S* M* M S> = <S* M S>: C and T are equal, and are the
+fraction of the mode that the fit cannot absorb.
 
-A calibration also has a scale of its own: gains times sqrt(s) and a model divided by s fit as well, and whatever
-chooses s (the paper's prior on the summed model) errs by some percent. It multiplies the residual by 1/s, hence C by
-1/s and T by 1/s^2, and so is a part of P^R / P^S that is no loss. Their combination
+The flux scale of a calibration is not determined by the fit: gains times sqrt(s) and a model divided by s fit as well.
+The prior that fixes s (in the paper, on the summed model) has an error of some per cent. It multiplies the residual by
+1/s, hence C by 1/s and T by 1/s^2, which is a part of P^R / P^S but not a loss. The combination
 
     retained = C^2 / T = <S* D>^2 / (<S* S> <D* D>),
 
-the squared coherence of residual and signal, is free of it: 1 if nothing but the scale was changed, and for a
-projection of white S the fraction that it leaves. (Between different baselines of a redundant group C^2 / T is free of
-the scale as well, but not such a fraction.)
+the squared coherence of residual and signal, does not depend on it: it is 1 if only the scale was changed, and for a
+projection of white S the fraction that remains. (Between different baselines of a redundant group C^2 / T does not
+depend on the scale either, but is not such a fraction.)
 
-Numerator and denominator hold the same sky, so that most of the sample variance cancels. What remains is estimated
-from the scatter of independent samples within a bin, taking each baseline or redundant group as one sample (it is one
-patch of the uv plane, whose delays share the taper): for sums x_i of P^D and y_i of P^S over n samples,
+Numerator and denominator contain the same sky, so that most of the sample variance cancels. The rest is estimated from
+the scatter of independent samples within a bin, where each baseline or redundant group is one sample (one patch of the
+uv plane, whose delays share the taper): for sums x_i of P^D and y_i of P^S over n samples,
 
     T = sum x_i / sum y_i,   var T = n / (n - 1) sum (x_i - T y_i)^2 / (sum y_i)^2
 

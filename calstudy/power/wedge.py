@@ -1,4 +1,4 @@
-"""Cylindrical averages of delay spectra: the wedge (paper Fig. WEDGE)."""
+"""Cylindrical averages of delay spectra (paper Fig. WEDGE)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WedgeSpectrum:
-    """A power spectrum in Nb bins of baseline length and Nd delays.
+    """A cylindrical power spectrum in Nb bins of baseline length and Nd delays.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class WedgeSpectrum:
 
 
 def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: bool = True) -> WedgeSpectrum:
-    """Average over baselines of like length, each pair counting the same.
+    """Average over baselines of similar length, with equal weights for all pairs.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What matvis and fftvis are called with alike."""
+"""Common arguments of matvis and fftvis."""
 
 from __future__ import annotations
 

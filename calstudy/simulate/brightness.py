@@ -1,4 +1,4 @@
-"""Flux density of every component of a sky model at every frequency, whatever its spectral type and unit."""
+"""Flux density of every component of a sky model at every frequency, for all spectral types and units."""
 
 from __future__ import annotations
 

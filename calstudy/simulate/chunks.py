@@ -1,7 +1,7 @@
-"""A simulation in independent pieces: nodes in time and frequency, sources that rise or set, and the check of both.
+"""Simulation in chunks: nodes in time and frequency, sources that rise or set, and the check of the interpolation.
 
-A chunk is a block of consecutive frequency nodes at all integrations. Each is simulated on its own, stored if one
-likes, and the chunks of a simulation assemble to its visibilities. The result does not depend on how many there are.
+A chunk is a block of consecutive frequency nodes at all integrations. Chunks are simulated independently, can be
+stored, and are assembled to the visibilities. The result does not depend on the number of chunks.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class InterpolationCheck:
-    """Interpolated against directly simulated visibilities where they should differ most.
+    """Comparison of interpolated with directly simulated visibilities where the error should be largest.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class InterpolationCheck:
 
 
 def plan_chunks(template: UVData, settings: SimulationSettings, smooth_in_frequency: bool) -> list[Chunk]:
-    """Split a simulation into chunks of as nearly as possible equal numbers of frequency nodes.
+    """Split a simulation into chunks with nearly equal numbers of frequency nodes.
 
     Parameters
     ----------
@@ -105,8 +105,8 @@ def simulate_chunk(
 ) -> np.ndarray:
     """Simulate a chunk at all integrations.
 
-    Sources above the horizon throughout are simulated at the time nodes and interpolated; those that rise or set are
-    steps in time, which no polynomial follows, and are simulated at every integration.
+    Sources that stay above the horizon are simulated at the time nodes and interpolated. Sources that rise or set are
+    discontinuous in time, and are simulated at every integration.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def simulate_visibilities(
     settings: SimulationSettings,
     smooth_in_frequency: bool,
 ) -> np.ndarray:
-    """Simulate a whole observation here and now; see `plan_chunks`, `simulate_chunk` and `assemble`.
+    """Simulate a complete observation in this process; see `plan_chunks`, `simulate_chunk` and `assemble`.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Our own engine: matrix products over sources, for any three-dimensional array of like antennas.
+"""The dense engine: matrix products over sources, for any three-dimensional array.
 
 V_ab = sum_s w_s conj(E_as) E_bs with E = exp(2 pi i nu x.s / c) and w = A I / 2: the factorization of matvis
 (Kittiwisit et al. 2025). The visibilities of all pairs are Hermitian and have as many real numbers as one real matrix.
@@ -57,7 +57,7 @@ class DenseEngine:
         self._dtype = {"double": np.float64, "single": np.float32}[precision]
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
-        """Return why this engine cannot do what is asked, or None if it can."""
+        """Return the reason why this engine does not support a simulation, or None if it does."""
         if is_polarized(sky):
             return "the dense engine does not handle a polarized sky"
         try:

@@ -1,4 +1,4 @@
-"""Where the components of a sky model are as the Earth turns, and which of them rise or set."""
+"""Directions of the components of a sky model against time, and which of them rise or set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The interface of visibility simulators, and their choice by name."""
+"""The interface of visibility simulators, and their selection by name."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class BeamSource(Protocol):
 
 
 class Engine(Protocol):
-    """Anything that turns a sky and a beam into visibilities."""
+    """A simulator: computes visibilities from a sky and a beam."""
 
     name: str
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
-        """Return in one sentence why this engine cannot do what is asked, or None if it can."""
+        """Return the reason why this engine does not support a simulation, or None if it does."""
 
     def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
         """Simulate every time, baseline, frequency and polarization of the template; change none of the arguments.
@@ -55,7 +55,7 @@ class Engine(Protocol):
 
 
 class FastestEngine:
-    """The first of several engines, fastest first, that handles what is asked."""
+    """The first of several engines, fastest first, that supports a simulation."""
 
     name = "auto"
 
@@ -63,7 +63,7 @@ class FastestEngine:
         self._engines = engines
 
     def choose(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> Engine:
-        """Return the engine that will be used; raises InputError with every engine's reason if none can."""
+        """Return the engine that will be used; raises InputError with the reasons of all engines if there is none."""
         reasons = []
         for engine in self._engines:
             reason = engine.refusal(sky, beam, template)
@@ -75,7 +75,7 @@ class FastestEngine:
         raise InputError("no engine handles this simulation; " + "; ".join(reasons))
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
-        """Return why none of the engines can do what is asked, or None if one can."""
+        """Return the reasons why no engine supports a simulation, or None if one does."""
         try:
             self.choose(sky, beam, template)
         except InputError as error:
@@ -83,12 +83,12 @@ class FastestEngine:
         return None
 
     def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
-        """Return the visibilities of the fastest engine that handles them; see `Engine.simulate`."""
+        """Return the visibilities of the fastest engine that supports the simulation; see `Engine.simulate`."""
         return self.choose(sky, beam, template).simulate(sky, beam, template)
 
 
 def make_engine(settings: SimulationSettings) -> Engine:
-    """Return the engine named in the settings; `auto` takes the fastest that handles each request."""
+    """Return the engine named in the settings; `auto` selects the fastest that supports each simulation."""
     from calstudy.simulate.dense import DenseEngine
     from calstudy.simulate.matvis_engine import MatvisEngine
     from calstudy.simulate.nufft import FftvisEngine

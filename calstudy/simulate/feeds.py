@@ -1,4 +1,4 @@
-"""Linear feeds: which matrix elements a polarization is, for engines that return both feeds."""
+"""Polarizations as elements of the matrices of linear feeds, for engines that return both feeds."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ FEED_PAIRS = {-5: (0, 0), -6: (1, 1), -7: (0, 1), -8: (1, 0)}
 
 
 def refusal(engine: str, sky: SkyModel, beam, template: UVData) -> str | None:
-    """Return why an engine for unpolarized skies and feeds x and y cannot do what is asked, or None if it can."""
+    """Return why an engine for unpolarized skies and feeds x and y does not support a simulation, or None."""
     if is_polarized(sky):
-        return f"the {engine} engine is given unpolarized skies only"
+        return f"the {engine} engine supports unpolarized skies only"
     unknown = [int(number) for number in template.polarization_array if int(number) not in FEED_PAIRS]
     if unknown:
         return f"polarization number {unknown[0]} is not linear"

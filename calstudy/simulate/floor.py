@@ -1,8 +1,8 @@
-"""The delay floor: how much of a foreground simulation's power lies at delays where foregrounds cannot be.
+"""The delay floor: the power of simulated foregrounds at delays beyond the horizon, where real foregrounds have none.
 
-What is found beyond the horizon is made by the simulation (a beam that is not smooth in frequency, rounding,
-interpolation) or by the sidelobes of the taper. Levels are in amplitude decibel, 10 log10 of a brightness ratio, in
-which the paper puts its beam-interpolation artefacts at -45 dB and the 21 cm signal at -40 dB.
+Its causes are the simulation (a beam that is not smooth in frequency, rounding, interpolation) and the sidelobes of the
+taper. Levels are in amplitude decibel, 10 log10 of a brightness ratio, as in the paper (beam interpolation artefacts at
+-45 dB, 21 cm signal at -40 dB).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Taper = Literal["blackman-harris", "dolph-chebyshev"]
 MAIN_LOBES: dict[Taper, int] = {"blackman-harris": 4, "dolph-chebyshev": 8}
-"""Half width of each taper's main lobe, in units of 1 / bandwidth: what a floor must start beyond."""
+"""Half width of the main lobe of each taper, in units of 1 / bandwidth; the floor is measured beyond it."""
 
 SIDELOBES = 200
 """Sidelobes of the Dolph-Chebyshev taper below its peak, in dB of power."""
@@ -107,11 +107,11 @@ def delay_floor(
     foregrounds
         Visibilities of foregrounds alone, equally spaced channels.
     buffer
-        Delay beyond the horizon at which to start, s. Before 4 / bandwidth (130 ns for 30.72 MHz) for Blackman-Harris,
-        8 / bandwidth (250 ns) for Dolph-Chebyshev, one still sees the taper's main lobe.
+        Delay beyond the horizon at which to start, s. The main lobe of the taper extends to 4 / bandwidth (130 ns for
+        30.72 MHz) for Blackman-Harris, and to 8 / bandwidth (250 ns) for Dolph-Chebyshev.
     taper
-        `blackman-harris` has sidelobes of -46 dB here and shows what a power spectrum sees; `dolph-chebyshev` (-100 dB)
-        shows the simulation's own floor under them.
+        `blackman-harris` has sidelobes of -46 dB here and gives the floor of a power spectrum; `dolph-chebyshev`
+        (-100 dB) gives the floor of the simulation below these sidelobes.
     n_bins
         Number of equal bins in baseline length.
     peaks

@@ -34,7 +34,7 @@ class MatvisEngine:
         self._precision = {"single": 1, "double": 2}[precision]
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
-        """Return why this engine cannot do what is asked, or None if it can."""
+        """Return the reason why this engine does not support a simulation, or None if it does."""
         return refusal(self.name, sky, beam, template)
 
     def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:

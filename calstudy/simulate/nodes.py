@@ -1,9 +1,9 @@
-"""Chebyshev nodes: where a visibility must be simulated so that interpolation gives it everywhere, to a tolerance.
+"""Chebyshev nodes: times and frequencies from which visibilities can be interpolated to a tolerance.
 
 Over an observation a visibility is band-limited, in time by its fringe rate and in frequency by its horizon delay. The
 component of a source is a phasor exp(i c x) on the scaled interval x in [-1, 1], whose Chebyshev coefficients 2 J_k(c)
-fall faster than exponentially once k > c. So the number of nodes follows from the longest baseline, the span and the
-tolerance. Nothing here knows about engines.
+fall faster than exponentially once k > c. The number of nodes therefore follows from the longest baseline, the span and
+the tolerance. It does not depend on the engine.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""fftvis: non-uniform fast Fourier transforms (Cox et al. 2025); polarized skies, fast for flat and regular arrays."""
+"""fftvis: non-uniform fast Fourier transforms (Cox et al. 2025); fast for flat and regular arrays."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class FftvisEngine:
         self._accuracy = {"double": 1e-12, "single": 1e-6}[precision]
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
-        """Return why this engine cannot do what is asked, or None if it can."""
+        """Return the reason why this engine does not support a simulation, or None if it does."""
         if isinstance(beam, AntennaBeams) and (template.polarization_array < CROSS_HANDS).any():
-            return "fftvis mixes up the feeds of cross-hand polarizations where antennas have different beams"
+            return "fftvis confuses the feeds of cross-hand polarizations if antennas have different beams"
         return refusal(self.name, sky, beam, template)
 
     def simulate(self, sky: SkyModel, beam, template: UVData) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Patterns of feeds towards many directions at many frequencies: the part of a simulation that is not fringes."""
+"""Beam patterns of feeds at many directions and frequencies: the factors of a simulation other than the fringes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AZIMUTH_EXTENSION = 3
 
 
 class Pattern(Protocol):
-    """What sources of unit flux density weigh, as so many real numbers for each frequency and direction."""
+    """Weights of sources of unit flux density: `n_weights` real numbers for each frequency and direction."""
 
     n_weights: int
 

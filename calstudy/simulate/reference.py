@@ -1,4 +1,4 @@
-"""pyuvsim: the paper's simulator and the reference of the others.
+"""pyuvsim: the paper's simulator, and the reference for the other engines.
 
 In a run that was started with ``mpiexec`` every rank computes its share of the visibilities; see
 `calstudy.running.ranks`.
@@ -24,12 +24,12 @@ from calstudy.visibilities import require_rectangular
 
 
 class PyuvsimEngine:
-    """Every sky, beam and geometry that pyuvsim handles, one visibility after the other."""
+    """All skies, beams and geometries that pyuvsim supports, one visibility at a time."""
 
     name = "pyuvsim"
 
     def refusal(self, sky: SkyModel, beam, template: UVData) -> str | None:
-        """Return why this engine cannot do what is asked, or None if it can."""
+        """Return the reason why this engine does not support a simulation, or None if it does."""
         beams, _ = split_beams(beam, template)
         for item in beams:
             available = _products(item.at(template.freq_array[:1]))

@@ -13,17 +13,17 @@ from calstudy.units import Length
 class Nodes(Section):
     """Simulate at Chebyshev nodes and interpolate, or at every integration and channel."""
 
-    enabled: bool = Field(True, description="false: every integration and channel is simulated.")
+    enabled: bool = Field(True, description="false: simulate every integration and channel.")
     tolerance: float = Field(
         1e-9,
         gt=0,
         lt=1e-2,
-        description="Largest interpolation error of any source's fringe, relative to its amplitude.",
+        description="Largest interpolation error of the fringe of any source, relative to its amplitude.",
     )
     beam_extent: Length = Field(
         20.0,
         ge=0,
-        description="The beam's own structure counts like this much more baseline, in fringe rate and in delay.",
+        description="Length added to the longest baseline, for the structure of the beam in fringe rate and delay.",
     )
 
 
@@ -31,10 +31,10 @@ class SimulationSettings(Section):
     """How the visibilities are computed."""
 
     engine: Literal["auto", "dense", "matvis", "fftvis", "pyuvsim"] = Field(
-        "auto", description="auto: the fastest that can do what is asked."
+        "auto", description="auto: the fastest engine that supports the experiment."
     )
-    precision: Literal["single", "double"] = Field("double", description="Precision of the engine's inner products.")
+    precision: Literal["single", "double"] = Field("double", description="Precision of the sums over sources.")
     nodes: Nodes = Nodes()
     chunks: int = Field(
-        16, ge=1, description="Independent pieces per simulation; the unit of resuming and of work sharing."
+        16, ge=1, description="Independent parts of a simulation, for resuming and for parallel workers."
     )

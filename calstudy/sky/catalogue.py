@@ -1,4 +1,4 @@
-"""Tables of point sources: reading them, choosing from them, and turning them into sky models."""
+"""Catalogues of point sources: reading, selection, and conversion to sky models."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from calstudy.sky.settings import PointSources
 
 LOG = logging.getLogger(__name__)
 
-# The names that the GLEAM catalogue's columns have in VizieR's files and in the collaboration's own.
+# Column names of the GLEAM catalogue in the files of VizieR and of the collaboration.
 GLEAM_COLUMNS = {
     "name": ("GLEAM", "Name"),
     "right_ascension": ("RAJ2000",),
@@ -55,7 +55,7 @@ class Catalogue:
         return len(self.flux)
 
     def select(self, chosen: np.ndarray) -> Catalogue:
-        """Return the sources that a boolean or index array chooses."""
+        """Return the sources selected by a boolean or index array."""
         return Catalogue(
             self.names[chosen],
             self.right_ascension[chosen],
@@ -103,7 +103,7 @@ def read_gleam_table(path: Path) -> Catalogue:
         raise InputError(f"sky.foregrounds.path: there is no file {path}")
     try:
         with warnings.catch_warnings():
-            # Published tables stretch the standards (units, VOTable versions); the columns read here are plain numbers.
+            # Published tables deviate from the standards (units, VOTable versions). The columns read here are numbers.
             warnings.simplefilter("ignore")
             table = Table.read(path)
     except (OSError, ValueError, TypeError, IndexError) as error:
@@ -128,7 +128,7 @@ def read_gleam_table(path: Path) -> Catalogue:
 
 
 def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:
-    """Return the sources as point components, with the spectra that the settings ask for."""
+    """Return the sources as point components, with spectra according to the settings."""
     stokes = np.zeros((4, 1, len(catalogue))) * units.Jy
     stokes[0, 0] = catalogue.flux * units.Jy
     spectrum = {"spectral_type": "flat"}

@@ -1,4 +1,4 @@
-"""A synthetic population of extragalactic radio sources that follows measured source counts."""
+"""Synthetic extragalactic radio sources that follow measured source counts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def differential_counts(flux: np.ndarray) -> np.ndarray:
 def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray, np.random.Generator]]:
     """Draw the fluxes of an all-sky population, in bins of flux.
 
-    Every bin has its own random stream: a population with another faint limit has the same bright sources.
+    Every bin has its own random stream, so that the bright sources do not depend on the faint limit.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray
     Returns
     -------
     list of tuple
-        For each bin the fluxes in Jy, and the random generator for whatever else the bin's sources need.
+        For each bin the fluxes in Jy, and the random generator for other properties of its sources.
     """
     lowest, highest = (int(np.floor(np.log10(flux) * BINS_PER_DECADE)) for flux in (faint, bright))
     population = []

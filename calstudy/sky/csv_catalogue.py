@@ -1,4 +1,4 @@
-"""Catalogues of point sources in CSV files, by the names of their columns."""
+"""Catalogues of point sources in CSV files with a header line."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from calstudy.sky.settings import CsvColumns
 
 
 def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
-    """Return the sources of a CSV file with a line of column names.
+    """Return the sources of a CSV file with a header line.
 
     Parameters
     ----------
     path
         The file. Rows without a position or flux density are left out.
     columns
-        Which columns hold what: right ascension and declination (ICRS, degrees), flux density (Jy), spectral index.
+        Names of the columns: right ascension and declination (ICRS, degrees), flux density (Jy), spectral index.
 
     Raises
     ------
     ValueError
-        If a column is missing or not of numbers, or a kept source has no spectral index.
+        If a column is missing or not numeric, or a selected source has no spectral index.
     """
     table = Table.read(path, format="ascii.csv")
     wanted = {key: getattr(columns, key) for key in ("right_ascension", "declination", "flux", "spectral_index")}

@@ -22,16 +22,15 @@ ROOT_NODES = 64
 
 
 class EorField:
-    """A Gaussian random sky of known P(k), any channels of it at a time.
+    """A Gaussian random sky of known P(k), computed for any subset of the channels.
 
-    The flat spectrum is one independent normal number per pixel and channel, of variance σ²(ν) = P / V(ν), V being
-    the channel's own comoving voxel (paper §Simulations; Mpc without h). A power law is correlated between
-    channels; see `channel_covariance`.
+    The flat spectrum is one independent normal number per pixel and channel with variance σ²(ν) = P / V(ν), where V is
+    the comoving volume of the voxel (paper §Simulations; Mpc without h). A power law is correlated between channels;
+    see `channel_covariance`.
 
-    The field is not smoothed: neither by the channel (P is white up to the channel spacing's own Nyquist wavenumber,
-    and then ends) nor by the pixel (maps are samples at pixel centres, band-limited at ℓ = 3 nside − 1 for the power
-    law). So a delay spectrum recovers P itself. In the flat case a pixel stands for the constant brightness within
-    it.
+    The field is not smoothed over the channel (P is white up to the Nyquist wavenumber of the channel spacing) nor over
+    the pixel (maps are samples at pixel centres, band-limited at ℓ = 3 nside − 1 for the power law). A delay spectrum
+    therefore recovers P itself. In the flat case the brightness is constant within a pixel.
 
     Parameters
     ----------
@@ -40,7 +39,7 @@ class EorField:
     frequencies
         All channel centres of the study in Hz, equally spaced, shape (Nfreqs,).
     cosmology
-        Turns P(k) into brightness; the power spectrum estimator must use the same.
+        Converts P(k) to brightness; the power spectrum estimator must use the same cosmology.
 
     Raises
     ------
@@ -70,7 +69,7 @@ class EorField:
     def maps(self, channels: slice | np.ndarray) -> np.ndarray:
         """Return brightness temperatures in K, float64, shape (Nchannels, Npixels), RING order, ICRS.
 
-        The maps of a channel do not depend on which others are asked for.
+        The map of a channel does not depend on which other channels are requested.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The foreground sky: point sources from GLEAM, from a stand-in that needs no download, or from any catalogue."""
+"""The foreground sky: point sources from GLEAM, from G4Jy and source counts, from a file, or from a user's function."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Foregrounds:
     Attributes
     ----------
     sky
-        Point components, brightest first; without foregrounds a single one of 0 Jy, for sky models cannot be empty.
+        Point components, brightest first. Without foregrounds a single one of 0 Jy, because sky models cannot be empty.
     stand_in
         A sentence if the sky is not the paper's GLEAM catalogue, otherwise None.
     """
@@ -78,8 +78,8 @@ def _gleam(settings: section.GleamSources) -> Foregrounds:
     path = gleam.default_path() if settings.path is None else settings.path
     if not path.is_file():
         raise InputError(
-            f"sky.foregrounds: the GLEAM catalogue is not at {path}: fetch it with `calstudy data fetch gleam`, "
-            "give its path, or use kind: g4jy-and-counts"
+            f"sky.foregrounds: the GLEAM catalogue is not at {path}: download it with `calstudy data fetch gleam`, "
+            "set its path, or use kind: g4jy-and-counts"
         )
     gleam.verify(path)
     catalogue = read_gleam_table(path)
@@ -90,12 +90,12 @@ def _gleam(settings: section.GleamSources) -> Foregrounds:
 
 
 def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
-    """Real G4Jy components and, where they are not complete, a population drawn from source counts.
+    """G4Jy components and, where G4Jy is not complete, synthetic sources drawn from source counts.
 
-    All real components are used. The population has the whole sky below 4 Jy (at 200 MHz), and north of +30° and
-    within 10° of the Galactic plane, where G4Jy has no sources, all fluxes. G4Jy is selected at 151 MHz and so
-    reaches below 4 Jy at 200 MHz: there each real component takes the place of the synthetic source next to it in
-    flux, which leaves the counts as measured. As in GLEAM itself, the brightest few radio sources (Cygnus A, Cassiopeia
+    All G4Jy components are used. Synthetic sources cover the whole sky below 4 Jy (at 200 MHz), and all fluxes north
+    of +30° and within 10° of the Galactic plane, where G4Jy has no sources. G4Jy is selected at 151 MHz and so
+    extends below 4 Jy at 200 MHz: there each G4Jy component replaces the synthetic source with the nearest flux, so
+    that the counts stay as measured. As in GLEAM itself, the brightest few radio sources (Cygnus A, Cassiopeia
     A, Centaurus A, ...) and the Galaxy are missing.
     """
     real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))

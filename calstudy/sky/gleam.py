@@ -1,4 +1,4 @@
-"""The GLEAM extragalactic catalogue: where it is kept, fetching it, and proving that it is what it should be."""
+"""The GLEAM extragalactic catalogue: location, download, and verification."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ SOURCES = 307_455
 
 
 def default_path() -> Path:
-    """Return where `fetch_gleam` puts the catalogue unless told otherwise."""
+    """Return the default path of the catalogue that `fetch_gleam` downloads."""
     return default_directory() / FILE
 
 
 def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
-    """Download the GLEAM extragalactic catalogue from VizieR, or check the copy that is there.
+    """Download the GLEAM extragalactic catalogue from VizieR, or verify an existing copy.
 
-    VizieR writes the table anew for every request and publishes no hash of it. So the first download is accepted if it
-    has the columns needed and the 307,455 sources published; its SHA-256 is then kept beside it, and the copy must
-    have that hash ever after.
+    VizieR generates the table for every request and publishes no hash of it. The first download is accepted if it has
+    the required columns and the published number of sources, 307,455. Its SHA-256 is then saved next to it, and
+    compared in all later uses.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
     if path.is_file() and hash_file(path).is_file():
         verify(path)
         return path
-    instead = "give a copy of yours under sky.foregrounds.path, or use 'g4jy-and-counts', which needs no download"
+    instead = "set sky.foregrounds.path to your own copy, or use 'g4jy-and-counts', which needs no download"
     download(URL, path, instead, progress=progress)
     try:
         found = len(read_gleam_table(path))
@@ -64,7 +64,7 @@ def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
 
 
 def verify(path: Path) -> None:
-    """Raise InputError if a fetched catalogue has changed since; a user's own file, without a hash, is not checked."""
+    """Raise InputError if a downloaded catalogue has changed; a user's own file has no hash and is not checked."""
     if hash_file(path).is_file() and hash_file(path).read_text().split()[:1] != [sha256(path)]:
         raise InputError(
             f"{path} has changed since it was downloaded: remove it and {hash_file(path).name}, "
@@ -73,5 +73,5 @@ def verify(path: Path) -> None:
 
 
 def hash_file(path: Path) -> Path:
-    """Return the file beside a fetched catalogue that holds its SHA-256."""
+    """Return the path of the file with the SHA-256 of a downloaded catalogue, next to it."""
     return path.with_name(path.name + ".sha256")

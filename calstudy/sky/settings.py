@@ -15,11 +15,11 @@ VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
 
 
 class PointSources(Section):
-    """What every catalogue of point sources shares."""
+    """Fields that all catalogues of point sources have."""
 
     flux_limit: FluxDensity = Field(0.05, ge=0, description="Keep sources brighter than this.")
     spectrum: Literal["flat", "catalogue"] = Field(
-        "flat", description="One flux for all channels as in the paper, or the catalogue's own spectral indices."
+        "flat", description="The same flux in all channels, as in the paper, or the spectral indices of the catalogue."
     )
     count: int | None = Field(None, ge=1, description="Keep only the brightest `count` sources (all by default).")
 
@@ -29,69 +29,75 @@ class GleamSources(PointSources):
 
     kind: Literal["gleam"]
     path: Path | None = Field(
-        None, strict=False, description="Catalogue file; by default the one that `calstudy data fetch gleam` stores."
+        None, strict=False, description="Catalogue file; default: the file stored by `calstudy data fetch gleam`."
     )
 
 
 class SyntheticSources(PointSources):
-    """Real bright G4Jy components (White et al. 2020) plus a faint population from counts (Franzen et al. 2019)."""
+    """Bright G4Jy components (White et al. 2020), and faint sources drawn from counts (Franzen et al. 2019)."""
 
     kind: Literal["g4jy-and-counts"] = "g4jy-and-counts"
     flux_limit: FluxDensity = Field(
         0.05, ge=0.001, description="Keep sources brighter than this; the counts are measured down to 1 mJy."
     )
-    seed: int = Field(1, ge=0, description="Seed of the synthetic population's positions and fluxes.")
+    seed: int = Field(1, ge=0, description="Seed of the positions and fluxes of the synthetic sources.")
 
 
 class VotableColumns(Section):
-    """Where a VOTable keeps what; part of a name will do if no other has that part. Units are those in the file."""
+    """Columns of a VOTable. An unambiguous part of a name is sufficient. Units are taken from the file."""
 
     table: str = Field(description="Name of the table.")
     id: str = Field(description="Column of source names.")
     right_ascension: str
     declination: str
     flux: str = Field(description="Column of flux densities.")
-    frequency: Frequency | None = Field(None, gt=0, description="At which the fluxes are; needed for spectral indices.")
+    frequency: Frequency | None = Field(
+        None, gt=0, description="Frequency of the fluxes; required for spectral indices."
+    )
     spectral_index: str | None = None
 
 
 class CsvColumns(Section):
-    """Where a CSV file with a line of column names keeps what."""
+    """Columns of a CSV file with a header line."""
 
     right_ascension: str = Field(description="Column of right ascensions, ICRS, degrees.")
     declination: str = Field(description="Column of declinations, ICRS, degrees.")
     flux: str = Field(description="Column of flux densities, Jy.")
-    frequency: Frequency = Field(gt=0, description="At which the fluxes are.")
-    spectral_index: str | None = Field(None, description="Column of spectral indices; flat spectra without.")
+    frequency: Frequency = Field(gt=0, description="Frequency of the fluxes.")
+    spectral_index: str | None = Field(None, description="Column of spectral indices; default: flat spectra.")
 
 
 class FileSources(PointSources):
-    """Any catalogue that pyradiosky reads: SkyH5, VOTable (with `votable`), FHD .sav, text; or a CSV (with `csv`)."""
+    """A catalogue in a format that pyradiosky reads: SkyH5, VOTable (`votable`), FHD .sav, text; or a CSV (`csv`)."""
 
     kind: Literal["file"]
     path: Path = Field(strict=False)
-    votable: VotableColumns | None = Field(None, description="Needed for a VOTable (.vot, .votable, .xml), ICRS.")
+    votable: VotableColumns | None = Field(None, description="Required for a VOTable (.vot, .votable, .xml), ICRS.")
 
     # Left out where it is not used, so that catalogues of other kinds are identified as before.
-    csv: CsvColumns | None = Field(None, exclude_if=lambda value: value is None, description="Needed for a CSV (.csv).")
+    csv: CsvColumns | None = Field(
+        None, exclude_if=lambda value: value is None, description="Required for a CSV (.csv)."
+    )
 
     @model_validator(mode="after")
     def _csv_has_columns(self) -> FileSources:
         if (self.path.suffix.lower() == ".csv") != (self.csv is not None):
-            raise fault("csv", "goes with CSV files (.csv), and they need it")
+            raise fault("csv", "is required for CSV files (.csv), and not allowed for other files")
         return self
 
     @model_validator(mode="after")
     def _votables_have_columns(self) -> FileSources:
         if (self.path.suffix.lower() in VOTABLE_SUFFIXES) != (self.votable is not None):
-            raise fault("votable", f"goes with VOTables ({', '.join(VOTABLE_SUFFIXES)}), and they need it")
+            suffixes = ", ".join(VOTABLE_SUFFIXES)
+            raise fault("votable", f"is required for VOTables ({suffixes}), and not allowed for other files")
         return self
 
 
 class CodeSources(Plugin):
-    """Sources from a function of your own, called with the channels' frequencies in Hz, (Nfreqs,), and the options.
+    """Sources from a user's function.
 
-    It returns a pyradiosky SkyModel of points.
+    It is called with the channel frequencies in Hz, (Nfreqs,), and the options, and returns a pyradiosky SkyModel of
+    points.
     """
 
     kind: Literal["code"]
@@ -111,7 +117,7 @@ Foregrounds = Annotated[
 
 
 class Eor(Section):
-    """A Gaussian random 21 cm brightness with a known power spectrum, as a HEALPix map per channel."""
+    """Gaussian random 21 cm brightness with a known power spectrum, as one HEALPix map per channel."""
 
     spectrum: Literal["flat", "power-law"] = "flat"
     amplitude: PowerDensity = Field(

@@ -228,12 +228,12 @@ def test_a_csv_is_read_by_the_columns_named(tmp_path):
     assert flux(at_300) == pytest.approx([0.75, 3 * np.sqrt(2)])
     with pytest.raises(InputError, match="no column flux, only dec, s, ra, alpha"):
         make_foregrounds(section.FileSources(kind="file", path=path, csv={**CSV, "flux": "flux"}), FREQUENCIES)
-    with pytest.raises(ValidationError, match="goes with CSV files"):
+    with pytest.raises(ValidationError, match="required for CSV files"):
         section.FileSources(kind="file", path=path)
 
 
 def test_a_votable_needs_its_columns_named(tmp_path):
-    with pytest.raises(ValidationError, match="goes with VOTables"):
+    with pytest.raises(ValidationError, match="required for VOTables"):
         section.FileSources(kind="file", path=tmp_path / "mine.vot")
 
 
