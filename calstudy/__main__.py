@@ -1,6 +1,6 @@
 """``python -m calstudy``."""
 
-from calstudy.cli import main
+from calstudy.cli.main import main
 
 if __name__ == "__main__":
     main()

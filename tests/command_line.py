@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from calstudy import cli
+from calstudy.cli import main as cli
 
 
 def run_command(capsys, *arguments: object) -> tuple[int, str]:

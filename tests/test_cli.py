@@ -1,5 +1,6 @@
 """The command line: quick, and clear about mistakes."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,11 @@ import pytest
 import yaml
 from tiny import tiny
 
-from calstudy.experiment.reference import field_reference
+from calstudy.experiment.files import override, validate
+from calstudy.experiment.model import FIGURES
+from calstudy.studies.reference import field_reference
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
 
 def calstudy(*arguments: str, cwd: Path) -> subprocess.CompletedProcess:
@@ -23,12 +28,59 @@ def refused(result: subprocess.CompletedProcess) -> str:
     return result.stderr
 
 
+def imported_by(code: str, names: tuple[str, ...], cwd: Path) -> list[str]:
+    """Return which of some packages a program imports, in a process of its own."""
+    told = f"import sys\n{code}\nprint([name for name in {names} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, cwd=cwd, check=False)
+    assert result.returncode == 0, result.stderr
+    return ast.literal_eval(result.stdout.splitlines()[-1])
+
+
 def test_help_imports_nothing_heavy(tmp_path):
+    heavy = ("numpy", "scipy", "tensorflow", "pyuvdata", "dask", "matplotlib", "pydantic")
+    assert imported_by("import calstudy.cli.main", heavy, tmp_path) == []
+
+
+# Seconds each; a plan reads and estimates, and makes no product.
+SLOW_TO_IMPORT = (
+    "tensorflow",
+    "hera_pspec",
+    "hera_cal",
+    "pyuvsim",
+    "pyradiosky",
+    "fftvis",
+    "matvis",
+    "healpy",
+    "distributed",
+)
+
+
+@pytest.mark.parametrize("name", ["minredundant", "signalloss", "paper", "runtime", "quickstart"])
+def test_a_plan_imports_no_library_that_only_stages_need(name, tmp_path):
+    places = f"'--set', 'outputs.store={tmp_path}/store', '--set', 'outputs.runs={tmp_path}/runs'"
     code = (
-        "import sys, calstudy.cli; print([m for m in ('numpy', 'tensorflow', 'pyuvdata', 'dask') if m in sys.modules])"
+        f"sys.argv = ['calstudy', 'plan', '{EXPERIMENTS / name}.yaml', {places}]\n"
+        "from calstudy.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True)
-    assert result.stdout.strip() == "[]"
+    assert imported_by(code, SLOW_TO_IMPORT, tmp_path) == []
+
+
+def test_a_plan_with_every_figure_imports_no_library_that_only_stages_need(tmp_path):
+    drawn = [
+        name
+        for name in FIGURES.built_in()
+        if FIGURES.find(name).refusal(FIGURES.make(name), validate(tiny(tmp_path), tmp_path)) is None
+    ]
+    assert len(drawn) >= 10
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(override(tiny(tmp_path), "outputs.figures", drawn)))
+    code = (
+        "sys.argv = ['calstudy', 'plan', 'tiny.yaml']\n"
+        "from calstudy.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code"
+    )
+    # The tiles of the MWA alone are placed by pyuvdata.
+    assert imported_by(code, (*SLOW_TO_IMPORT, "pyuvdata", "numba"), tmp_path) == []
 
 
 def test_all_faults_of_a_file_are_told_on_standard_error(tmp_path):
@@ -55,6 +107,10 @@ def test_all_faults_of_a_file_are_told_on_standard_error(tmp_path):
         (["run", "tiny.yaml", "--set", "outputs.runs=/proc/no"], "outputs.runs = '/proc/no': cannot be written"),
         (["run", "tiny.yaml", "--scheduler", "tcp://127.0.0.1:1"], "tcp://127.0.0.1:1: cannot connect"),
         (["run", "tiny.yaml", "--set", "instrument.layout.spacing=250 m"], "the longest baseline has 500 m"),
+        (
+            ["plan", "tiny.yaml", "--set", "calibration.basis.buffer=10 us"],
+            "calibration.basis: a delay half-width",
+        ),
         (["data", "fetch", "gleem"], "nothing that can be fetched (allowed: gleam, beam)"),
     ],
 )
@@ -79,22 +135,25 @@ def products_by_stage(plan: str) -> dict[str, str]:
 
 def test_a_plan_of_a_sweep_counts_what_its_points_share_once(tmp_path):
     sweep = {"calibration.basis.buffer": ["50 ns", "100 ns", "200 ns"]}
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "sweep": sweep}))
+    data = override({**tiny(tmp_path), "sweep": sweep}, "outputs.figures", ["layout"])
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(data))
     result = calstudy("plan", "tiny.yaml", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     counts = products_by_stage(result.stdout)
-    assert (counts["simulate"], counts["transfer"], counts["sweep"]) == ("2", "3", "1")
+    # The figures are one layout for all points, and that of the sweep.
+    assert (counts["simulate"], counts["transfer"], counts["figure"]) == ("2", "3", "2")
+    assert result.stdout.count("run folder: ") == 4
 
 
 def test_a_plan_of_a_collection_counts_what_its_members_share_once(tmp_path):
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "papers": ["calamity2022"]}))
     members = ["tiny.yaml", {"file": "tiny.yaml", "name": "louder", "overrides": {"corruption.noise.factor": 5}}]
     (tmp_path / "both.yaml").write_text(yaml.safe_dump({"name": "both", "experiments": members}))
     result = calstudy("plan", "both.yaml", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     counts = products_by_stage(result.stdout)
-    assert (counts["simulate"], counts["gains"], counts["claims"]) == ("2", "1", "2")
-    assert counts["combined-claims"] == "1"
+    # Claims of each, and of both together.
+    assert (counts["simulate"], counts["gains"], counts["claims"]) == ("2", "1", "3")
     assert result.stdout.count("run folder: ") == 3
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calstudy import downloads
-from calstudy.cli import app
-from calstudy.downloads import download, sha256
-from calstudy.errors import InputError
+from calstudy.base import downloads
+from calstudy.base.downloads import download, sha256
+from calstudy.base.errors import InputError
+from calstudy.cli.main import app
 from calstudy.instrument import beam_file
 
 
@@ -61,7 +61,7 @@ def test_a_fetched_beam_is_the_file_and_is_fetched_once(served, tmp_path):
 
 def test_another_file_is_not_kept(served, tmp_path):
     served.write_bytes(b"something else")
-    with pytest.raises(InputError, match=r"its SHA-256 is another; give a copy of yours under instrument\.beam\.path"):
+    with pytest.raises(InputError, match=r"its SHA-256 is another; set instrument\.beam\.path to your own copy"):
         beam_file.fetch_beam(tmp_path / "kept", progress=False)
     assert list((tmp_path / "kept").iterdir()) == []
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from calstudy.units import Decibel, Delay, Frequency, HourAngle, Length, PowerDensity, Wavenumber
+from calstudy.base.units import Decibel, Delay, Frequency, HourAngle, Length, PowerDensity, Wavenumber
 
 
 @pytest.mark.parametrize(

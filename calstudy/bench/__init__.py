@@ -1,1 +1,1 @@
-"""bench"""
+"""Timings of engines, calibrators and solvers, and the scaling laws that are fitted to them."""

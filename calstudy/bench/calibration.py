@@ -7,11 +7,13 @@ import statistics
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import tensorflow as tf
 
+from calstudy.base.errors import InputError
+from calstudy.base.resources import Usage, free_memory
 from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.bench.paper_step import PaperStep, padded_memory
 from calstudy.calibrate.problem import CalibrationProblem
@@ -19,8 +21,6 @@ from calstudy.calibrate.solution import Solution
 from calstudy.calibrate.solvers.first_order import STEPS_PER_CALL, FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solver, solve, solve_warm
-from calstudy.errors import InputError
-from calstudy.resources import Usage, free_memory
 
 ABOVE_FLOOR = 1.002
 FLOOR_TOLERANCE = 1e-5
@@ -28,9 +28,8 @@ PAPER_STEPS, ADAMAX_CALLS = 30, 10
 HEADINGS = ("what", "measured", "note")
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of the bench's table: what was measured, its value, and what it is held against."""
+class Row(NamedTuple):
+    """One line of the table: what was measured, its value, and what it is held against."""
 
     name: str
     value: str
@@ -75,7 +74,17 @@ def unit_of(device: str) -> str:
 
 
 def mean_seconds(call: Callable[[], object], count: int, clock: Clock) -> float:
-    """Return the mean time of a call after one that is not counted."""
+    """Return the mean time of a call after one that is not counted.
+
+    Parameters
+    ----------
+    call
+        Without arguments.
+    count
+        Calls that are averaged over.
+    clock
+        Returns seconds.
+    """
     call()
     start = clock()
     for _ in range(count):
@@ -91,14 +100,28 @@ def adamax_step(problem: CalibrationProblem, clock: Clock) -> float:
 
 
 def steps_to(problem: CalibrationProblem, loss: float, max_steps: int) -> int | None:
-    """Return after how many steps the paper's Adamax, fixed rate and single precision, first has a loss this low."""
+    """Return after how many steps the paper's Adamax, fixed rate and single precision, first has a loss this low.
+
+    Parameters
+    ----------
+    problem
+        What is solved.
+    loss
+        That is to be reached, in the unit of the solver's loss history.
+    max_steps
+        After which it gives up.
+
+    Returns
+    -------
+    None if the loss is not reached.
+    """
     history = solve(problem, FirstOrder(Optimizer(max_steps=max_steps), tolerance=0.0)).loss_history
     reached = np.flatnonzero(history <= loss)
     return int(reached[0]) if reached.size else None
 
 
-def measure(case: Case, integrations: int, adamax_steps: int, device: str = "cpu") -> list[Row]:
-    """Measure steps and solves.
+def time_calibrator(case: Case, integrations: int, adamax_steps: int, device: str = "cpu") -> list[Row]:
+    """Time steps and solves.
 
     Parameters
     ----------

@@ -112,7 +112,17 @@ class Simulation:
         return self.case.eor * self._rms * _complex_normal(rng, (len(self.antennas), self.case.channels))
 
     def problem(self, integration: int, structure: FitStructure, realization: int = 0) -> CalibrationProblem:
-        """Return the problem of one integration, from unity gains; realizations differ in their noise."""
+        """Return the problem of one integration, from unity gains; realizations differ in their noise.
+
+        Parameters
+        ----------
+        integration
+            Its index, from which foregrounds, signal and noise are drawn.
+        structure
+            Of the fit.
+        realization
+            Of the noise.
+        """
         rng = np.random.default_rng([self.case.seed, 3, integration, realization])
         shape = (len(self.antennas), self.case.channels)
         sky = self.foregrounds(integration) + self.signal(integration)

@@ -1,4 +1,4 @@
-"""One Adamax step as the paper's own code takes it: the yardstick of the calibrator's bench.
+"""One Adamax step as the paper's own code takes it: what the calibrator is timed against.
 
 All baselines share one basis tensor padded with zeros to the widest (Nvec, Nbls, 1, Nfreqs); the model is a broadcast
 product summed over the first axis; real and imaginary parts are separate; the optimizer is Keras' Adamax; the step is

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 QUANTILES = (0.025, 0.5, 0.975)
 """Of run times: the ends of the central 95 %, and the median."""
@@ -73,7 +74,7 @@ class RuntimeSeries:
     fit: PowerLaw
 
 
-def summarize_runtime(label: str, size: Sequence[float], seconds: Sequence[Sequence[float]]) -> RuntimeSeries:
+def summarize_runtime(label: str, size: ArrayLike, seconds: Sequence[Sequence[float]]) -> RuntimeSeries:
     """Reduce measured run times to medians, 95 % bands and a power law.
 
     Parameters
@@ -90,14 +91,14 @@ def summarize_runtime(label: str, size: Sequence[float], seconds: Sequence[Seque
     ValueError
         If there are fewer than three sizes, the lengths do not match or a time is not positive.
     """
-    size, samples = np.asarray(size, dtype=float), [np.asarray(item, dtype=float) for item in seconds]
-    usable = len(samples) == size.size >= 3 and all(
+    sizes, samples = np.asarray(size, dtype=float), [np.asarray(item, dtype=float) for item in seconds]
+    usable = len(samples) == sizes.size >= 3 and all(
         item.ndim == 1 and item.size and (item > 0).all() for item in samples
     )
     if not usable:
         raise ValueError(
             f"run times '{label}': expected positive times at three sizes or more, got {len(samples)} sets of times "
-            f"for {size.size} sizes"
+            f"for {sizes.size} sizes"
         )
     low, median, high = np.array([np.quantile(item, QUANTILES) for item in samples]).T
-    return RuntimeSeries(label, size, median, low, high, fit_power_law(size, median))
+    return RuntimeSeries(label, sizes, median, low, high, fit_power_law(sizes, median))

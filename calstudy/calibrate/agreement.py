@@ -1,4 +1,4 @@
-"""How far gains, foreground models and their products agree with the truth of a simulation (paper §Simulation Results).
+"""How far gains, foreground models and what they make of the data agree with the truth (paper §Simulation Results).
 
 Every number has the scatter over the antennas, baselines or integrations that it was measured on.
 """
@@ -11,10 +11,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.constants import speed_of_light
 
-from calstudy.calibrate.alignment import align
-from calstudy.power.delay import channel_width, delay_transform, delays
+from calstudy.calibrate.degeneracy import align
+from calstudy.power.delay import channel_width, delay_transform, delays, horizon_delay
 
 TAPER = "blackman-harris"
 MAIN_LOBE = 4
@@ -22,7 +21,7 @@ MAIN_LOBE = 4
 
 
 @dataclass(frozen=True)
-class Measurement:
+class Statistic:
     """A number and how much it scatters.
 
     Attributes
@@ -43,7 +42,7 @@ class Measurement:
     over: str
 
     @classmethod
-    def of(cls, values: np.ndarray, over: str) -> Measurement:
+    def of(cls, values: np.ndarray, over: str) -> Statistic:
         """Return the median and the scatter of finite values of any shape."""
         low, median, high = np.quantile(np.ravel(values), [0.16, 0.5, 0.84])
         return cls(float(median), float(high - low) / 2, int(np.size(values)), over)
@@ -115,15 +114,15 @@ class Baselines:
     @property
     def inside(self) -> np.ndarray:
         """Which delays lie within the horizon, (Nbls, Ndelays)."""
-        return np.abs(self.delay) <= self.lengths[:, None] / speed_of_light
+        return np.abs(self.delay) <= horizon_delay(self.lengths[:, None])
 
     @property
     def outside(self) -> np.ndarray:
         """Which delays lie beyond horizon and buffer, or the main lobe of the taper if that is wider."""
         lobe = MAIN_LOBE / (channel_width(self.frequency) * self.frequency.size)
-        return np.abs(self.delay) > self.lengths[:, None] / speed_of_light + max(self.buffer, lobe)
+        return np.abs(self.delay) > horizon_delay(self.lengths[:, None]) + max(self.buffer, lobe)
 
-    def products(self, gains: np.ndarray) -> np.ndarray:
+    def gain_products(self, gains: np.ndarray) -> np.ndarray:
         """Return g_a g_b* of every baseline for gains (..., Nants, Nfreqs)."""
         first, second = self.antennas.T
         return gains[..., first, :] * gains[..., second, :].conj()
@@ -136,16 +135,25 @@ class Baselines:
         return power / len(spectra)
 
 
-def measure_agreement(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
-    """Measure a fit against the truth.
+def compare_with_truth(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
+    """Compare a fit with the truth.
+
+    Parameters
+    ----------
+    truth
+        What the measurement consists of.
+    fit
+        What calibration made of it.
+    baselines
+        Their antennas, lengths and channels.
 
     Returns
     -------
-    Measurements by name. Ratios are of rms amplitudes; "aligned" means free of the phases and the scale that no fit can
-    know (`calstudy.calibrate.alignment`), "raw" as fitted. Names that end in "outside" or "inside" refer to delays
-    beyond or within the horizon of each baseline; those that no baseline has are left out.
+    Statistics by name. Ratios are of rms amplitudes; "aligned" means free of the phases and the scale that no fit can
+    know (`calstudy.calibrate.degeneracy.align`), "raw" as fitted. Names that end in "outside" or "inside" refer to
+    delays beyond or within the horizon of each baseline; those that no baseline has are left out.
     """
-    found = _gains(truth, fit, baselines) | _models(truth, fit) | _products(truth, fit, baselines)
+    found = _gains(truth, fit, baselines) | _models(truth, fit) | _fitted_data(truth, fit, baselines)
     return found | _residuals(truth, fit, baselines)
 
 
@@ -153,7 +161,7 @@ def _rms(values: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
     return np.sqrt(np.mean(values.real**2 + values.imag**2, axis=axis))
 
 
-def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
+def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
     aligned = np.stack([align(gains, truth.gains)[0] for gains in fit.gains])
     size = _rms(truth.gains, axis=1)
     power = [
@@ -162,51 +170,51 @@ def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measuremen
     ]
     by_delay = np.sqrt(power[0] / power[1])
     return {
-        "gains_aligned": Measurement.of(_rms(aligned - truth.gains, axis=2) / size, "antennas and integrations"),
-        "gains_raw": Measurement.of(_rms(fit.gains - truth.gains, axis=2) / size, "antennas and integrations"),
-        "gains_by_delay": Measurement.of(by_delay, "delays"),
-        "gains_worst_delay": Measurement(float(by_delay.max()), 0.0, by_delay.size, "delays"),
+        "gains_aligned": Statistic.of(_rms(aligned - truth.gains, axis=2) / size, "antennas and integrations"),
+        "gains_raw": Statistic.of(_rms(fit.gains - truth.gains, axis=2) / size, "antennas and integrations"),
+        "gains_by_delay": Statistic.of(by_delay, "delays"),
+        "gains_worst_delay": Statistic(float(by_delay.max()), 0.0, by_delay.size, "delays"),
     }
 
 
-def _models(truth: Truth, fit: Fit) -> dict[str, Measurement]:
+def _models(truth: Truth, fit: Fit) -> dict[str, Statistic]:
     scales = np.array([align(gains, truth.gains)[1] for gains in fit.gains])
     size = _rms(truth.foregrounds, axis=(0, 2))
     aligned = fit.model / scales[:, None, None] ** 2 - truth.foregrounds
     error = _rms(aligned, axis=(0, 2))
     return {
-        "model_aligned": Measurement.of(error / size, "baselines"),
-        "model_raw": Measurement.of(_rms(fit.model - truth.foregrounds, axis=(0, 2)) / size, "baselines"),
-        "model_over_noise": Measurement.of(error / _rms(truth.noise, axis=(0, 2)), "baselines"),
+        "model_aligned": Statistic.of(error / size, "baselines"),
+        "model_raw": Statistic.of(_rms(fit.model - truth.foregrounds, axis=(0, 2)) / size, "baselines"),
+        "model_over_noise": Statistic.of(error / _rms(truth.noise, axis=(0, 2)), "baselines"),
     }
 
 
-def _products(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
-    difference = truth.data - baselines.products(fit.gains) * fit.model
-    noise = baselines.products(truth.gains) * truth.noise
+def _fitted_data(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
+    difference = truth.data - baselines.gain_products(fit.gains) * fit.model
+    noise = baselines.gain_products(truth.gains) * truth.noise
     ratio = np.sqrt(baselines.delay_power(difference).mean(axis=0) / baselines.delay_power(noise).mean(axis=0))
     error = _rms(difference, axis=(0, 2))
     return {
-        "product_over_noise": Measurement.of(error / _rms(noise, axis=(0, 2)), "baselines"),
-        "product_over_data": Measurement.of(error / _rms(truth.data, axis=(0, 2)), "baselines"),
-        "product_worst_delay": Measurement(float(ratio.max()), 0.0, ratio.size, "delays"),
+        "product_over_noise": Statistic.of(error / _rms(noise, axis=(0, 2)), "baselines"),
+        "product_over_data": Statistic.of(error / _rms(truth.data, axis=(0, 2)), "baselines"),
+        "product_worst_delay": Statistic(float(ratio.max()), 0.0, ratio.size, "delays"),
         **_correction(truth, fit, baselines),
     }
 
 
-def _correction(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
-    """The gain-correction ratio beyond the wedge, over the noise relative to the foregrounds."""
+def _correction(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
+    """Return the gain-correction ratio beyond the wedge, over the noise relative to the foregrounds."""
     outside = baselines.outside
     used = outside.any(axis=1)
     if not used.any():
         return {}
-    ratio = baselines.products(truth.gains) / baselines.products(fit.gains) - 1
+    ratio = baselines.gain_products(truth.gains) / baselines.gain_products(fit.gains) - 1
     relative_noise = truth.noise / _rms(truth.foregrounds, axis=(0, 2))[:, None]
     power = [_masked_mean(baselines.delay_power(values), outside)[used] for values in (ratio, relative_noise)]
-    return {"correction_over_noise_outside": Measurement.of(np.sqrt(power[0] / power[1]), "baselines")}
+    return {"correction_over_noise_outside": Statistic.of(np.sqrt(power[0] / power[1]), "baselines")}
 
 
-def _residuals(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measurement]:
+def _residuals(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
     data, residual, noise = (baselines.delay_power(values) for values in (truth.data, fit.residual, truth.noise))
     found = {}
     for name, above, below, mask in (
@@ -218,7 +226,7 @@ def _residuals(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Measur
         used = mask.any(axis=1)
         if used.any():
             ratio = _masked_mean(above, mask)[used] / _masked_mean(below, mask)[used]
-            found[name] = Measurement.of(np.sqrt(ratio), "baselines")
+            found[name] = Statistic.of(np.sqrt(ratio), "baselines")
     return found
 
 
@@ -227,11 +235,11 @@ def _masked_mean(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.sum(values, axis=1, where=mask) / np.maximum(mask.sum(axis=1), 1)
 
 
-def as_json(measurements: Mapping[str, Measurement]) -> dict[str, Any]:
-    """Return measurements as plain JSON types."""
-    return {name: asdict(measurement) for name, measurement in measurements.items()}
+def as_json(statistics: Mapping[str, Statistic]) -> dict[str, Any]:
+    """Return statistics as plain JSON types."""
+    return {name: asdict(statistic) for name, statistic in statistics.items()}
 
 
-def from_json(values: Mapping[str, Any]) -> dict[str, Measurement]:
+def from_json(values: Mapping[str, Any]) -> dict[str, Statistic]:
     """Return what `as_json` was given."""
-    return {name: Measurement(**value) for name, value in values.items()}
+    return {name: Statistic(**value) for name, value in values.items()}

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.constants import speed_of_light
 from scipy.signal.windows import dpss
 
+from calstudy.base.errors import InputError
 from calstudy.calibrate.settings import BasisSettings
 
 # Sequences asked for beyond the Shannon number 2NW; concentrations fall to 1e-14 well within these.
@@ -136,11 +137,11 @@ def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
 
     Raises
     ------
-    ValueError
+    InputError
         If there are fewer than two channels, or they lie on no even grid.
     """
     spacings = np.abs(np.diff(frequencies))
-    refusal = ValueError("frequencies: the DPSS foreground basis needs at least two channels on an even grid")
+    refusal = InputError("frequencies: the DPSS foreground basis needs at least two channels on an even grid")
     # Written so that frequencies that are not numbers are refused as well.
     if spacings.size == 0 or not spacings.min() > 0:
         raise refusal
@@ -154,9 +155,20 @@ def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
 
 
 def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -> np.ndarray:
-    """Return an orthonormal basis of sequences on the grid, (n_channels, Nvec), seen at the channels that exist.
+    """Return an orthonormal basis of the restriction of sequences to the channels that exist.
 
-    Combinations of which the existing channels hold less than `eigenvalue_cutoff` are left out.
+    Parameters
+    ----------
+    vectors
+        Orthonormal sequences on the whole grid, (n_channels, Nvec), float64.
+    grid
+        The grid, and which of its channels exist.
+    eigenvalue_cutoff
+        Combinations of which the existing channels hold less than this fraction of the power are left out.
+
+    Returns
+    -------
+    ndarray, float64, (Nfreqs, at most Nvec)
     """
     if len(grid.positions) == grid.n_channels:
         return vectors
@@ -178,7 +190,7 @@ def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSett
 
     Raises
     ------
-    ValueError
+    InputError
         If channels are on no even grid, a half-width is zero, or a basis would leave no channel's worth of freedom
         to the data.
     """
@@ -189,14 +201,14 @@ def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSett
     buckets = []
     for half_width in np.unique(half_widths):
         if half_width <= 0:
-            raise ValueError("calibration.basis: the delay half-width is 0 s; set min_delay or buffer above zero")
+            raise InputError("calibration.basis: the delay half-width is 0 s; set min_delay or buffer above zero")
         product = half_width * width
         vectors = None
         if product < 0.5:
             sequences = dpss_vectors(grid.n_channels, grid.n_channels * product, settings.eigenvalue_cutoff)
             vectors = restrict(sequences, grid, settings.eigenvalue_cutoff)
         if vectors is None or vectors.shape[1] >= n_frequencies:
-            raise ValueError(
+            raise InputError(
                 f"calibration.basis: a delay half-width of {half_width * 1e9:.0f} ns fills all {n_frequencies} "
                 f"channels of {width / 1e3:.4g} kHz, so that foregrounds would fit any data; "
                 "use shorter baselines, a smaller buffer, or more or narrower channels"

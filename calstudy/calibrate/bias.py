@@ -24,27 +24,35 @@ class Realization:
         As measured, gains included.
     noise
         The noise in them, before the gains.
-    products
+    gain_products
         The true g_a g_b*.
     """
 
     visibilities: np.ndarray
     noise: np.ndarray
-    products: np.ndarray
+    gain_products: np.ndarray
 
-    def left(self, fitted_products: np.ndarray, model: np.ndarray) -> np.ndarray:
-        """Return the residual without the noise, on the scale of the true gains, which no degeneracy of the fit moves.
+    def residual_without_noise(self, fitted_products: np.ndarray, model: np.ndarray) -> np.ndarray:
+        """Return the residual on the scale of the true gains, which no degeneracy of the fit moves, without the noise.
 
         Parameters
         ----------
         fitted_products, model
             g_a g_b* and F as fitted, (Nbls, Nfreqs).
         """
-        return (self.visibilities - fitted_products * model) / self.products - self.noise
+        return (self.visibilities - fitted_products * model) / self.gain_products - self.noise
 
 
 def cross_power(even: np.ndarray, odd: np.ndarray, baselines: Baselines) -> np.ndarray:
-    """Return Re <even* odd> of each baseline, (Nbls,), added up over its delays outside the wedge, (Jy Hz)^2."""
+    """Return Re <even* odd> of each baseline, (Nbls,), added up over its delays outside the wedge, (Jy Hz)^2.
+
+    Parameters
+    ----------
+    even, odd
+        Visibilities of one integration, (Nbls, Nfreqs), complex, Jy.
+    baselines
+        Their lengths, channels and the buffer of the wedge.
+    """
     first, second = (delay_transform(values, baselines.frequency, TAPER) for values in (even, odd))
     return np.sum((first.conj() * second).real, axis=1, where=baselines.outside)
 
@@ -52,8 +60,8 @@ def cross_power(even: np.ndarray, odd: np.ndarray, baselines: Baselines) -> np.n
 def ratio_over_antennas(power: np.ndarray, reference: np.ndarray, antennas: np.ndarray) -> tuple[float, float]:
     """Return sum(power) / sum(reference) over baselines and its standard deviation.
 
-    What a fit leaves is above all errors of its gains, which the baselines of an antenna share: the scatter is that of
-    leaving out one antenna after the other (the jackknife), not that of baselines.
+    What a fit leaves of the foregrounds is mostly due to errors of its gains, which the baselines of an antenna share.
+    The scatter is therefore that of leaving out one antenna after the other (the jackknife), not that of baselines.
 
     Parameters
     ----------
@@ -63,6 +71,6 @@ def ratio_over_antennas(power: np.ndarray, reference: np.ndarray, antennas: np.n
         The two antennas of each baseline, (Nbls, 2).
     """
     without = [(antennas != antenna).all(axis=1) for antenna in np.unique(antennas)]
-    left = np.array([power[kept].sum() / reference[kept].sum() for kept in without if kept.any()])
-    scatter = np.sum((left - left.mean()) ** 2) * (left.size - 1) / left.size
+    ratios = np.array([power[kept].sum() / reference[kept].sum() for kept in without if kept.any()])
+    scatter = np.sum((ratios - ratios.mean()) ** 2) * (ratios.size - 1) / ratios.size
     return float(power.sum() / reference.sum()), float(np.sqrt(scatter))

@@ -1,32 +1,27 @@
-"""CALAMITY (Ewall-Wice et al. 2022): visibilities in, gains, foreground model and calibrated residual out."""
+"""CALAMITY (Ewall-Wice et al. 2022) and its relatives: every integration and polarization is a least-squares fit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from pyuvdata import UVCal, UVData
 
-from calstudy.calibrate.joint import JointGroup
-from calstudy.calibrate.measured import Measured, make_problem, measure
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
-from calstudy.calibrate.products import make_gains, make_visibilities
-from calstudy.calibrate.records import CalibrationResult, SolveRecord
-from calstudy.calibrate.settings import CalibrationSettings, GaussNewtonSettings, LbfgsSettings
+from calstudy.base.observation import Observation
+from calstudy.base.resources import Usage
+from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
+from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure
+from calstudy.calibrate.settings import GainFit, GaussNewtonSettings, LbfgsSettings
 from calstudy.calibrate.solution import Solution
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solver, WarmStart, solve_warm
 from calstudy.calibrate.solvers.lbfgs import Lbfgs
 from calstudy.calibrate.structure import repeat_structure
-from calstudy.errors import InputError
-from calstudy.resources import Usage
-
-Progress = Callable[[int, int], None]
 
 
-def make_solver(settings: CalibrationSettings) -> Solver:
+def make_solver(settings: GainFit) -> Solver:
     """Return the solver of the `calibration.solver` section."""
     solver = settings.solver
     if isinstance(solver, GaussNewtonSettings):
@@ -38,102 +33,81 @@ def make_solver(settings: CalibrationSettings) -> Solver:
 
 
 class Solve(NamedTuple):
-    """One solve: its integrations, first and one past the last, its polarization, and how it went."""
+    """One solve: its integrations, its polarization, and how it went."""
 
-    first: int
-    last: int
+    times: slice
     polarization: int
     solution: Solution
     peak_memory: int
 
 
-def calibrate(
-    data: UVData,
-    settings: CalibrationSettings,
-    sky_model: UVData | None = None,
-    gains: UVCal | None = None,
+def fit(
+    observation: Observation,
+    assumed: Assumed,
+    settings: GainFit,
     progress: Progress | None = None,
-    joint: Sequence[JointGroup] = (),
-) -> CalibrationResult:
+) -> Calibration:
     """Solve for gains and foregrounds, independently for every polarization and every integration or group of them.
+
+    Flagged samples have no influence. Autocorrelations are left out, also of the results, unless `settings.autos` is
+    set.
 
     Parameters
     ----------
-    data
-        Visibilities, rectangular and time-major, with parallel-hand polarizations only; not changed. Flagged samples
-        have no influence. Autocorrelations are left out, also of the results, unless `settings.autos` is set.
+    observation
+        Visibilities with parallel-hand polarizations only.
+    assumed
+        A sky model, whose weighted sum fixes the overall scale, and which is taken for the truth if foregrounds are not
+        fitted; the data themselves if there is none, which makes gains of about unity. Gains to start from come before
+        what `settings.initial_gains` says.
     settings
-        Calibrator, foreground basis, weights, solver and prior.
-    sky_model
-        Visibilities whose weighted sum fixes the overall scale, with the baselines, times, channels and polarizations
-        of `data`; the data themselves if none is given, which makes gains of about unity. The sky-based calibrator
-        takes them for the truth.
-    gains
-        Where to start, before what `settings.initial_gains` says.
+        Foreground basis, weights, solver and prior.
     progress
         Called after each solve with the number done and the total.
-    joint
-        Groups of baselines with common coefficients, before what `settings.joint_basis` says.
 
     Raises
     ------
     InputError
-        If weights, gains or joint groups do not fit the data, or the sky-based calibrator has no sky model.
-    ValueError
-        If the data are not rectangular, not finite where unflagged, of cross-hand polarizations, without any baseline
-        to fit, or differ from the sky model in shape; or if the basis does not fit into the channels.
+        As for `calstudy.calibrate.preparation.prepare`.
     """
-    if settings.code is not None:
-        raise InputError("calibration.calibrator: 'code' stands for another calibrator; it is run in studies only")
-    measured = measure(data, settings, sky_model, gains, joint)
-    return _collect(measured, _solve_all(settings, measured, progress))
-
-
-def _collect(measured: Measured, solves: Iterator[Solve]) -> CalibrationResult:
-    """Put the solutions together."""
-    data, structure = measured.data, measured.structure
-    visibilities, used = measured.visibilities, measured.weights > 0
-    gains, gain_flags = np.ones(measured.start.shape, complex), np.ones(measured.start.shape, bool)
-    model, residual, flags = np.zeros_like(visibilities), np.zeros_like(visibilities), ~used
-    records = []
-    for first, last, p, solution, peak_memory in solves:
-        records.append(_record(data, Solve(first, last, p, solution, peak_memory)))
+    prepared = prepare(observation, settings, assumed)
+    shape, used = prepared.data.shape, prepared.weights > 0
+    gains, gain_flags = np.ones(prepared.start.shape, complex), np.ones(prepared.start.shape, bool)
+    model = np.zeros(shape, complex)
+    outcomes = []
+    for times, p, solution, peak_memory in _solve_all(settings, prepared, progress):
+        outcomes.append(_outcome(solution, peak_memory))
         if not solution.usable:
-            flags[first:last, :, :, p] = True
             continue
-        fitted = solution.model.reshape(last - first, *visibilities.shape[1:3])
-        for t in range(first, last):
-            present = used[t, :, :, p]
-            gain_flags[:, :, t, p] = ~_has_data(structure, present)
+        model[times, :, :, p] = solution.model.reshape(-1, *shape[1:3])
+        for t in range(times.start, times.stop):
+            gain_flags[:, :, t, p] = ~_has_data(prepared.structure, used[t, :, :, p])
             gains[:, :, t, p] = np.where(gain_flags[:, :, t, p], 1, solution.gains)
-            model[t, :, :, p] = fitted[t - first]
-            products = gain_products(gains[:, :, t, p], structure.antennas)
-            calibrated = np.where(present, visibilities[t, :, :, p], 0) / products
-            residual[t, :, :, p] = np.where(present, calibrated - fitted[t - first], 0)
-    return CalibrationResult(
-        make_gains(data, measured.numbers, gains, gain_flags),
-        make_visibilities(data, model, flags),
-        make_visibilities(data, residual, flags),
-        tuple(records),
+    return Calibration(
+        gains=gains,
+        gain_flags=gain_flags,
+        model=model,
+        flags=~used,
+        baselines=prepared.fitted,
+        outcomes=outcomes,
     )
 
 
-def _solve_all(settings: CalibrationSettings, measured: Measured, progress: Progress | None) -> Iterator[Solve]:
+def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | None) -> Iterator[Solve]:
     """Yield every solve, polarization by polarization, each in the order of time."""
     solver = make_solver(settings)
-    n_times, _, _, n_polarizations = measured.visibilities.shape
-    step = settings.integrations_per_solve
-    groups = [(first, min(first + step, n_times)) for first in range(0, n_times, step)]
+    groups = settings.solves(prepared.data.n_times)
+    n_polarizations = prepared.data.n_polarizations
     for p in range(n_polarizations):
         warm: WarmStart | None = None
-        for index, (first, last) in enumerate(groups):
+        for index, times in enumerate(groups):
             with Usage() as usage:
-                problem = make_problem(measured, settings, slice(first, last), p)
+                problem = make_problem(prepared, settings, times, p)
                 if isinstance(problem, str):
-                    solution = _skipped(repeat_structure(measured.structure, last - first), problem)
+                    solution = _skipped(repeat_structure(prepared.structure, times.stop - times.start), problem)
                 else:
                     solution, warm = _solve(problem, solver, warm if settings.solver.warm_start else None)
-            yield Solve(first, last, p, solution, usage.peak_memory)
+            yield Solve(times, p, solution, usage.peak_memory)
             if progress is not None:
                 progress(p * len(groups) + index + 1, len(groups) * n_polarizations)
 
@@ -155,21 +129,16 @@ def _skipped(structure: FitStructure, message: str) -> Solution:
     return Solution(gains, model, np.empty(0), "skipped", message, 0, 0.0)
 
 
-def _record(data: UVData, solve: Solve) -> SolveRecord:
-    solution = solve.solution
-    return SolveRecord(
-        integration=solve.first,
-        n_integrations=solve.last - solve.first,
-        time=float(data.time_array[solve.first * data.Nbls]),
-        polarization=int(data.polarization_array[solve.polarization]),
+def _outcome(solution: Solution, peak_memory: int) -> Outcome:
+    return Outcome(
         status=solution.status,
         message=solution.message,
-        n_steps=solution.n_steps,
+        steps=solution.n_steps,
         loss_history=solution.loss_history,
         seconds=solution.seconds,
-        remaining=solution.remaining,
-        remaining_rms=solution.remaining_rms,
-        peak_memory=solve.peak_memory,
+        newton_decrement=solution.newton_decrement,
+        decrement_rms=solution.decrement_rms,
+        peak_memory=peak_memory,
     )
 
 

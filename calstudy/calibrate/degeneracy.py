@@ -1,4 +1,4 @@
-"""Directions that no residual can see, fixed on purpose once the fit is done.
+"""Degeneracies: directions that no residual can see, fixed after the fit, and left out of comparisons with the truth.
 
 The likelihood (paper Eq. LOGLIKELIHOOD) does not change under two exact transformations:
 
@@ -32,11 +32,20 @@ def fix_phase(gains: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> float:
-    """Return the real factor by which the model is multiplied, and the gains' products divided; one if it is frozen.
+    """Return the real factor by which the model is multiplied, and g_a g_b* divided; one if the model is frozen.
 
     For the ``sum`` prior this is the exact minimum of the prior along the scale, so that the likelihood keeps its own
     minimum; for ``post-hoc`` the ratio of the moduli of the two sums (paper §Method); for ``gains`` what gives the
     gains the geometric mean of the initial ones; for ``none`` one.
+
+    Parameters
+    ----------
+    gains
+        As fitted, (Nants, Nfreqs), complex.
+    model
+        Intrinsic visibilities as fitted, (Nbls, Nfreqs), complex, in the unit of the data.
+    problem
+        What was fitted, and its prior.
 
     Raises
     ------
@@ -64,9 +73,23 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
 def fix_degeneracies(
     gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains (Nants, Nfreqs) and model (Nbls, Nfreqs) with phase and scale fixed; g g* F is unchanged.
+    """Return gains and model with phase and scale fixed; g_a g_b* F is unchanged.
 
-    Gains in a smooth basis keep to it, and have but one phase fixed.
+    Gains in a smooth basis stay in its span, and have only one phase fixed.
+
+    Parameters
+    ----------
+    gains
+        As fitted, (Nants, Nfreqs), complex. Not mutated.
+    model
+        Intrinsic visibilities as fitted, (Nbls, Nfreqs), complex, in the unit of the data. Not mutated.
+    problem
+        What was fitted: its prior, and the initial gains as the reference of the phase.
+
+    Raises
+    ------
+    ValueError
+        If no positive scale exists (see `model_scale`).
     """
     scale = model_scale(gains, model, problem)
     if problem.structure.gain_vectors is None:
@@ -74,3 +97,27 @@ def fix_degeneracies(
     else:
         turned = fix_phase(gains.reshape(-1, 1), problem.initial_gains.reshape(-1, 1)).reshape(gains.shape)
     return turned / np.sqrt(scale), model * scale
+
+
+def align(gains: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, float]:
+    """Turn and scale fitted gains to come closest to a reference, in least squares over all antennas and channels.
+
+    A comparison with the truth must not charge a fit with a phase per channel or a real scale, which the likelihood
+    does not determine. All else, near degeneracies between gains and smooth foregrounds included, is left as fitted.
+
+    Parameters
+    ----------
+    gains, reference
+        Complex, (Nants, Nfreqs). Not mutated.
+
+    Returns
+    -------
+    aligned
+        The gains, multiplied by one phase per channel and by `scale`, (Nants, Nfreqs).
+    scale
+        Real and positive. A model fitted with these gains must be divided by its square, so that the product of gains
+        and model, which is what was fitted, stays the same.
+    """
+    turned = fix_phase(gains, reference)
+    scale = float(np.vdot(turned, reference).real / np.vdot(turned, turned).real)
+    return scale * turned, scale

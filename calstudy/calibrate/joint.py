@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 
 FIELD = "calibration.joint_basis"
 # Singular values of normalized vectors below this, relative to the largest, are rounding.
@@ -96,10 +96,10 @@ def read_joint_groups(path: Path) -> tuple[JointGroup, ...]:
         raise InputError(f"{FIELD}.path: {path} cannot be read as an .npz file of plain arrays ({error})") from None
     groups = []
     for name in sorted({key.partition("_")[2] for key in arrays}):
-        pair = (f"antennas_{name}", f"vectors_{name}")
-        if not all(key in arrays for key in pair):
+        antennas, vectors = arrays.get(f"antennas_{name}"), arrays.get(f"vectors_{name}")
+        if antennas is None or vectors is None:
             break
-        groups.append(JointGroup(*(arrays[key] for key in pair), name=name))
+        groups.append(JointGroup(antennas, vectors, name))
     if not groups or 2 * len(groups) != len(arrays):
         raise InputError(
             f"{FIELD}.path: {path} holds {', '.join(arrays) or 'nothing'}, expected arrays antennas_NAME and "

@@ -9,6 +9,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Frame
 from calstudy.calibrate.basis import ForegroundBasis
 from calstudy.calibrate.settings import MODELS_AT_ONCE
 
@@ -80,7 +82,17 @@ class FitStructure:
 
     @classmethod
     def per_baseline(cls, antennas: np.ndarray, n_antennas: int, basis: ForegroundBasis) -> FitStructure:
-        """Return the structure in which every baseline has a foreground model of its own (paper Eq. LOGLIKELIHOOD)."""
+        """Return the structure in which every baseline has a foreground model of its own (paper Eq. LOGLIKELIHOOD).
+
+        Parameters
+        ----------
+        antennas
+            Antenna indices (a, b) of each baseline, (Nbls, 2).
+        n_antennas
+            Number of antennas.
+        basis
+            The bases of Nbls models.
+        """
         n_baselines = len(antennas)
         return cls(antennas, n_antennas, basis, np.arange(n_baselines), np.zeros(n_baselines, bool))
 
@@ -137,14 +149,7 @@ class CalibrationProblem:
     frozen: bool = False
 
     def __post_init__(self) -> None:
-        shape = (self.structure.n_baselines, self.structure.n_frequencies)
-        gain_shape = (self.structure.n_antennas, self.structure.n_frequencies)
-        expected = {"visibilities": shape, "weights": shape, "initial_gains": gain_shape}
-        if self.sky_model is not None:
-            expected["sky_model"] = shape
-        for name, wanted in expected.items():
-            if getattr(self, name).shape != wanted:
-                raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {wanted}")
+        self._check_shapes()
         if self.prior not in get_args(Prior):
             raise ValueError(f"prior: {self.prior!r} is not one of {', '.join(get_args(Prior))}")
         if self.frozen and self.sky_model is None:
@@ -153,16 +158,33 @@ class CalibrationProblem:
             raise ValueError("weights: must be real, finite and not negative")
         if not np.isfinite(self.initial_gains).all() or (self.initial_gains == 0).any():
             raise ValueError("initial_gains: must be finite and not zero")
-        used = self.weights > 0
-        object.__setattr__(self, "visibilities", np.where(used, self.visibilities, 0).astype(np.complex128))
-        if not np.isfinite(self.visibilities).all():
-            raise ValueError("visibilities: not finite where the weight is not zero; flag those samples")
+        self._blank("visibilities")
         if not self.visibilities.any():
             raise ValueError("visibilities: zero wherever the weight is not, so that there is nothing to calibrate")
         if self.sky_model is not None:
-            object.__setattr__(self, "sky_model", np.where(used, self.sky_model, 0).astype(np.complex128))
-            if not np.isfinite(self.sky_model).all():
-                raise ValueError("sky_model: not finite where the weight is not zero")
+            self._blank("sky_model")
+
+    def _check_shapes(self) -> None:
+        shape = (self.structure.n_baselines, self.structure.n_frequencies)
+        gain_shape = (self.structure.n_antennas, self.structure.n_frequencies)
+        expected = {"visibilities": shape, "weights": shape, "initial_gains": gain_shape}
+        if self.sky_model is not None:
+            expected["sky_model"] = shape
+        for name, wanted in expected.items():
+            if getattr(self, name).shape != wanted:
+                raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {wanted}")
+
+    def _blank(self, name: str) -> None:
+        """Set a cube to zero where its weight is, complex128; what remains must be finite."""
+        values = np.where(self.weights > 0, getattr(self, name), 0).astype(np.complex128)
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name}: not finite where the weight is not zero; flag those samples")
+        object.__setattr__(self, name, values)
+
+    @property
+    def frozen_model(self) -> np.ndarray | None:
+        """The sky model if the foregrounds are frozen to it, (Nbls, Nfreqs); None if they are fitted."""
+        return self.sky_model if self.frozen else None
 
     @property
     def antenna_weights(self) -> np.ndarray:
@@ -179,6 +201,21 @@ class CalibrationProblem:
         if sky_model is None:
             sky_model = self.visibilities / gain_products(self.initial_gains, self.structure.antennas)
         return complex(np.sum(self.weights * sky_model))
+
+
+def fitted_baselines(frame: Frame, autos: bool) -> np.ndarray:
+    """Return which baselines are calibrated, bool, shape (Nbls,): all, or all but the autocorrelations.
+
+    Raises
+    ------
+    InputError
+        If there are none; the message starts with the path of a setting where it is about one.
+    """
+    if autos and not frame.autos.any():
+        raise InputError("autos: is true, but the data hold no autocorrelations")
+    if not autos and frame.autos.all():
+        raise InputError("the data hold no cross-correlations, so that there is nothing to calibrate")
+    return np.ones(frame.n_baselines, bool) if autos else ~frame.autos
 
 
 def flag_weights(flags: np.ndarray) -> np.ndarray:

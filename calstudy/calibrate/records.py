@@ -1,8 +1,9 @@
-"""What a calibration gives back: products in standard formats, and how every solve went."""
+"""What a calibration gives back: gains, model and residual in standard formats, and how every solve went."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,8 +26,12 @@ class SolveRecord:
         Julian date of the first.
     polarization
         Polarization number of the AIPS convention, such as -5 for XX.
+    n_steps
+        None if the calibrator does not iterate.
     peak_memory
         Largest resident memory of the process during the solve, bytes.
+    diagnostics
+        Further diagnostics of the calibrator, JSON-able, by name.
     """
 
     integration: int
@@ -35,12 +40,13 @@ class SolveRecord:
     polarization: int
     status: str
     message: str
-    n_steps: int
+    n_steps: int | None
     loss_history: np.ndarray
     seconds: float
-    remaining: float
-    remaining_rms: float
+    newton_decrement: float
+    decrement_rms: float
     peak_memory: int
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """Return everything but the full loss history, as plain JSON types."""
@@ -56,9 +62,10 @@ class SolveRecord:
             "first_loss": _number(losses[0]) if losses.size else None,
             "last_loss": _number(losses[-1]) if losses.size else None,
             "seconds": self.seconds,
-            "remaining": _number(self.remaining),
-            "remaining_rms": _number(self.remaining_rms),
+            "newton_decrement": _number(self.newton_decrement),
+            "decrement_rms": _number(self.decrement_rms),
             "peak_memory": self.peak_memory,
+            **({"diagnostics": dict(self.diagnostics)} if self.diagnostics else {}),
         }
 
     def detail(self) -> dict[str, Any]:
@@ -73,7 +80,7 @@ def _number(value: float) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """What `calstudy.calibrate.calamity.calibrate` returns.
+    """What `calstudy.calibrate.execution.run_calibrator` returns.
 
     Attributes
     ----------

@@ -1,15 +1,15 @@
-"""The `calibration` section of an experiment file."""
+"""Sections of the `calibration` block of an experiment file that calibrators share."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from calstudy.plugins import Plugin
-from calstudy.schema import Section, choice, fault
-from calstudy.units import Delay, Length
+from calstudy.base.schema import UNKEYED, Section, choice
+from calstudy.base.units import Delay, Length
+from calstudy.calibrate.interface import Calibrator
 
 MODELS_AT_ONCE = 512
 
@@ -138,67 +138,48 @@ class JointBasisSettings(Section):
     path: Path = Field(strict=False)
 
 
-class CalibrationSettings(Section):
-    """The calibrator, its foreground basis and its solver."""
+class GainFit(Calibrator):
+    """Settings of calibrators that fit gains by weighted least squares, w |V - g_a g_b* F|^2."""
 
-    calibrator: Literal["calamity", "calamity-redundant", "sky-based", "code"] = Field(
-        "calamity",
-        description="One foreground model per baseline (LOGLIKELIHOOD) or group (LOGLIKELIHOODREDUNDANT), or none: "
-        "gains alone, with the sky model frozen; or a function of your own, see `code`.",
-    )
-    code: Plugin | None = Field(
-        None,
-        description="With calibrator `code`: the function, called with data, sky model and options; it returns gains "
-        "and model (`calstudy.calibrate.own.calibrate_with`). Basis, solver, prior and weights are not read.",
-    )
-    redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are one group.")
-    basis: BasisSettings = BasisSettings()
-    # Left out where it is not used, so that calibrations without it are identified as before.
-    joint_basis: JointBasisSettings | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="Groups of baselines with common coefficients and vectors of your own, in place of the DPSS basis; "
-        "other baselines keep theirs.",
-    )
     solver: Solver = GaussNewtonSettings()
-    prior: Literal["sum", "post-hoc", "gains", "none"] = Field(
-        "sum",
-        description="How the overall scale is fixed: by the paper's prior on the summed model, by the summed model "
-        "afterwards, by the geometric mean of the gains afterwards, or not.",
-    )
-    autos: bool = Field(False, description="Include autocorrelations in the fit.")
     weights: Weights = FlagWeights()
     initial_gains: InitialGains = UnityStart()
+    redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
     gain_delay: Delay | None = Field(
         None, gt=0, description="Restrict gains to a DPSS basis up to this delay; null: any gain in any channel."
     )
-    integrations_per_solve: int = Field(
-        1, ge=1, description="Consecutive integrations that are solved together and share their gains."
-    )
+    autos: bool = Field(False, description="Include autocorrelations in the fit.")
     skip_flagged: float = Field(
         1.0, gt=0, le=1, description="Skip a solve when at least this fraction of its samples is flagged."
     )
-    chunks: int = Field(
-        4, ge=1, description="Pieces of consecutive integrations; the unit of resuming and of work sharing."
-    )
-
     models_at_once: int = Field(
         MODELS_AT_ONCE,
         ge=16,
         description="Foreground models that a solver works on at a time: fewer need less memory, and change results by "
         "rounding only. A run chooses fewer by itself where memory is short.",
+        json_schema_extra=UNKEYED,
     )
 
-    @model_validator(mode="after")
-    def _code_goes_with_its_calibrator(self) -> CalibrationSettings:
-        if (self.calibrator == "code") != (self.code is not None):
-            raise fault("code", "goes with calibrator: code, and that needs it")
-        return self
 
-    @model_validator(mode="after")
-    def _joint_basis_is_used(self) -> CalibrationSettings:
-        if self.joint_basis is not None and self.calibrator not in ("calamity", "calamity-redundant"):
-            raise fault(
-                "joint_basis", f"goes with the calibrators calamity and calamity-redundant, not {self.calibrator}"
-            )
-        return self
+class ForegroundFit(GainFit):
+    """Settings of calibrators that fit foregrounds with the gains, in a basis of functions of frequency.
+
+    Attributes
+    ----------
+    grouped
+        Whether redundant baselines share one foreground model.
+    """
+
+    grouped: ClassVar[bool] = False
+
+    basis: BasisSettings = BasisSettings()
+    joint_basis: JointBasisSettings | None = Field(
+        None,
+        description="Groups of baselines with common coefficients and vectors of your own, in place of the DPSS basis; "
+        "other baselines keep theirs.",
+    )
+    prior: Literal["sum", "post-hoc", "gains", "none"] = Field(
+        "sum",
+        description="How the overall scale is fixed: by the paper's prior on the summed model, by the summed model "
+        "afterwards, by the geometric mean of the gains afterwards, or not.",
+    )

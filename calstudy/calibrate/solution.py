@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-Status = Literal["converged", "max-steps", "stalled", "failed", "skipped"]
+from calstudy.calibrate.interface import USABLE, Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +31,13 @@ class Solution:
         Steps taken.
     seconds
         Wall time.
-    remaining
-        How far from the minimum it stopped: the decrease of the loss that a further Gauss-Newton step is predicted to
-        bring, over the loss; NaN if there is no estimate. To first order the residual still holds this fraction of its
-        own power because the iteration stopped, orthogonal to the residual at the minimum.
-    remaining_rms
+    newton_decrement
+        Relative Newton decrement, which says how far from the minimum the iteration stopped: the decrease of the loss
+        that one more Gauss-Newton step is predicted to bring, d^T H^-1 d with the descent direction d and the
+        Gauss-Newton matrix H (lambda^2 / 2 of Boyd & Vandenberghe 2004, section 9.5), over the loss. NaN if there is no
+        estimate. To first order the residual still holds this fraction of its own power because the iteration stopped,
+        orthogonal to the residual at the minimum.
+    decrement_rms
         Root mean square of that part of the calibrated residual R, in the unit of the data; NaN likewise. Two solves
         that stop alike have it in common, and their cross power rises by up to its square.
     """
@@ -48,10 +49,10 @@ class Solution:
     message: str
     n_steps: int
     seconds: float
-    remaining: float = math.nan
-    remaining_rms: float = math.nan
+    newton_decrement: float = math.nan
+    decrement_rms: float = math.nan
 
     @property
     def usable(self) -> bool:
         """Whether gains and model are an estimate at all."""
-        return self.status in ("converged", "max-steps", "stalled")
+        return self.status in USABLE

@@ -6,82 +6,74 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from pyuvdata import UVData
 
+from calstudy.base.observation import Frame
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, make_basis
 from calstudy.calibrate.gain_space import gain_vectors
-from calstudy.calibrate.joint import JointGroup, PlacedGroup, other_baselines, place_groups, read_joint_groups
+from calstudy.calibrate.joint import PlacedGroup, other_baselines, place_groups, read_joint_groups
 from calstudy.calibrate.problem import FitStructure
-from calstudy.calibrate.settings import CalibrationSettings
-from calstudy.errors import InputError
+from calstudy.calibrate.settings import BasisSettings, ForegroundFit, GainFit
 from calstudy.instrument.layouts import redundant_groups
-from calstudy.visibilities import antenna_pairs, baseline_vectors
 
 
-def make_structure(
-    data: UVData, settings: CalibrationSettings, joint: Sequence[JointGroup] = ()
-) -> tuple[FitStructure, np.ndarray]:
-    """Return the structure of the fit of one integration, and the antenna numbers that its indices stand for.
+def make_structure(frame: Frame, settings: GainFit) -> FitStructure:
+    """Return the structure of the fit of one integration; its antennas are those of the frame.
 
     A redundant group is modelled with the basis of its longest baseline; baselines of a joint group belong to no other.
 
     Parameters
     ----------
-    data, settings
-        Visibilities that are fitted, and how.
-    joint
-        Groups of baselines with common coefficients, before what `settings.joint_basis` says.
+    frame, settings
+        Baselines that are fitted, and how.
 
     Raises
     ------
-    ValueError
-        If the basis does not fit into the channels (see `calstudy.calibrate.basis.make_basis`).
     InputError
-        If joint groups cannot be read, do not fit the data (see `calstudy.calibrate.joint.place_groups`), or
-        foregrounds are frozen.
+        If the basis does not fit into the channels (see `calstudy.calibrate.basis.make_basis`), or joint groups cannot
+        be read or do not fit the data (see `calstudy.calibrate.joint.place_groups`).
     """
-    numbers, antennas = np.unique(antenna_pairs(data), return_inverse=True)
-    antennas = antennas.reshape(-1, 2)
-    frequencies = np.asarray(data.freq_array, float)
-    if not joint and settings.joint_basis is not None:
-        joint = read_joint_groups(settings.joint_basis.path)
-    if settings.calibrator == "sky-based":
-        if joint:
-            raise InputError("calibration.calibrator: 'sky-based' has no foreground model, and joint groups are given")
-        structure = FitStructure.per_baseline(antennas, len(numbers), _no_basis(len(antennas), frequencies.size))
+    if isinstance(settings, ForegroundFit):
+        structure = _foregrounds(frame, settings)
+        cutoff = settings.basis.eigenvalue_cutoff
     else:
-        placed = place_groups(joint, numbers[antennas], frequencies.size)
-        others = other_baselines(placed, len(antennas))
-        structure = None
-        if others.size:
-            vectors = baseline_vectors(data)[others]
-            structure = _modelled(antennas[others], len(numbers), vectors, frequencies, settings)
-        if placed:
-            structure = _with_joint(antennas, len(numbers), structure, others, placed)
+        basis = _no_basis(frame.n_baselines, frame.n_channels)
+        structure = FitStructure.per_baseline(frame.antennas, frame.n_antennas, basis)
+        cutoff = BasisSettings().eigenvalue_cutoff
     if settings.gain_delay is not None:
-        vectors = gain_vectors(frequencies, settings.gain_delay, settings.basis.eigenvalue_cutoff)
+        vectors = gain_vectors(frame.frequencies, settings.gain_delay, cutoff)
         structure = replace(structure, gain_vectors=vectors)
-    return replace(structure, models_at_once=settings.models_at_once), numbers
+    return replace(structure, models_at_once=settings.models_at_once)
 
 
-def _modelled(
-    antennas: np.ndarray, n_antennas: int, vectors: np.ndarray, frequencies: np.ndarray, settings: CalibrationSettings
-) -> FitStructure:
+def _foregrounds(frame: Frame, settings: ForegroundFit) -> FitStructure:
+    joint = () if settings.joint_basis is None else read_joint_groups(settings.joint_basis.path)
+    placed = place_groups(joint, frame.pairs, frame.n_channels)
+    others = other_baselines(placed, frame.n_baselines)
+    if not placed:
+        return _modelled(frame, others, settings)
+    rest = _modelled(frame, others, settings) if others.size else None
+    return _with_joint(frame, rest, others, placed)
+
+
+def _modelled(frame: Frame, chosen: np.ndarray, settings: ForegroundFit) -> FitStructure:
+    """Return the structure of the chosen baselines, in the DPSS basis."""
+    antennas, vectors = frame.antennas[chosen], frame.vectors[chosen]
     lengths = np.linalg.norm(vectors, axis=1)
-    if settings.calibrator == "calamity":
-        return FitStructure.per_baseline(antennas, n_antennas, make_basis(lengths, frequencies, settings.basis))
+    if not settings.grouped:
+        basis = make_basis(lengths, frame.frequencies, settings.basis)
+        return FitStructure.per_baseline(antennas, frame.n_antennas, basis)
     groups = redundant_groups(vectors, settings.redundancy_tolerance)
     longest = np.zeros(groups.index.max() + 1)
     np.maximum.at(longest, groups.index, lengths)
-    basis = make_basis(longest, frequencies, settings.basis)
-    return FitStructure(antennas, n_antennas, basis, groups.index, groups.conjugated)
+    basis = make_basis(longest, frame.frequencies, settings.basis)
+    return FitStructure(antennas, frame.n_antennas, basis, groups.index, groups.conjugated)
 
 
 def _with_joint(
-    antennas: np.ndarray, n_antennas: int, rest: FitStructure | None, others: np.ndarray, placed: Sequence[PlacedGroup]
+    frame: Frame, rest: FitStructure | None, others: np.ndarray, placed: Sequence[PlacedGroup]
 ) -> FitStructure:
     """Return the structure of joint groups, and of the other baselines as they are in `rest`, None without any."""
-    groups, conjugated = np.empty(len(antennas), int), np.zeros(len(antennas), bool)
+    groups, conjugated = np.empty(frame.n_baselines, int), np.zeros(frame.n_baselines, bool)
     buckets: list[Bucket] = []
     n_models = 0
     if rest is not None:
@@ -93,7 +85,7 @@ def _with_joint(
         buckets.append(Bucket(None, members, group.vectors))
         n_models += members.size
     basis = ForegroundBasis(tuple(buckets), n_models, placed[0].vectors.shape[1])
-    return FitStructure(antennas, n_antennas, basis, groups, conjugated)
+    return FitStructure(frame.antennas, frame.n_antennas, basis, groups, conjugated)
 
 
 def _no_basis(n_models: int, n_frequencies: int) -> ForegroundBasis:

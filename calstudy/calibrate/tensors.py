@@ -17,7 +17,7 @@ from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 
 
-class Measurements(NamedTuple):
+class SortedData(NamedTuple):
     """The data of one problem, in the solvers' order and orientation.
 
     Attributes
@@ -96,15 +96,25 @@ class FitTensors:
         self.stretches = _stretches(self.baseline_slices, piece, joint)
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
 
-    def load(self, problem: CalibrationProblem, dtype: tf.DType) -> Measurements:
+    def load(self, problem: CalibrationProblem, dtype: tf.DType) -> SortedData:
         """Return the problem's data as tensors of `dtype`."""
         visibilities, weights = problem.visibilities[self._order], problem.weights[self._order]
         visibilities = np.where(self._conjugated[:, None], visibilities.conj(), visibilities)
         scale = float(np.sqrt(np.sum(weights * np.abs(visibilities) ** 2) / np.sum(weights)))
-        return Measurements(pairs.to_pair(visibilities / scale, dtype), tf.constant(weights, dtype), scale)
+        return SortedData(pairs.to_pair(visibilities / scale, dtype), tf.constant(weights, dtype), scale)
 
     def load_model(self, model: np.ndarray, scale: float, dtype: tf.DType) -> tf.Tensor:
-        """Return a model on the problem's baselines, (Nbls, Nfreqs), divided by `scale`; the inverse of `unload`."""
+        """Return a model as a tensor in the solvers' order and orientation, (2, Nbls, Nfreqs); the inverse of `unload`.
+
+        Parameters
+        ----------
+        model
+            On the problem's baselines, (Nbls, Nfreqs), complex, in the unit of the data.
+        scale
+            What it is divided by, in that unit.
+        dtype
+            Of the tensor.
+        """
         values = model[self._order] / scale
         return pairs.to_pair(np.where(self._conjugated[:, None], values.conj(), values), dtype)
 
@@ -130,7 +140,15 @@ class FitTensors:
         return tf.stack([self.sum_over_group(values[0]), self.sum_over_group(values[1])])
 
     def gain_products(self, gains: tf.Tensor, start: int = 0, end: int | None = None) -> tf.Tensor:
-        """Return g_a g_b* of baselines start ... end, shape (2, Nbls, Nfreqs), from gains (2, Nants, Nfreqs)."""
+        """Return g_a g_b* of a range of baselines, (2, end - start, Nfreqs).
+
+        Parameters
+        ----------
+        gains
+            (2, Nants, Nfreqs).
+        start, end
+            First baseline, and one past the last, in the solvers' order; by default all.
+        """
         first = tf.gather(gains, self.first[start:end], axis=1)
         second = tf.gather(gains, self.second[start:end], axis=1)
         return pairs.conjugate_multiply(second, first)

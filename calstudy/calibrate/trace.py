@@ -1,4 +1,4 @@
-"""What a solver holds after so many steps, on the way to where it ends."""
+"""The estimates of a solver after given numbers of steps."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from calstudy.calibrate.degeneracy import fix_degeneracies
 from calstudy.calibrate.problem import CalibrationProblem
-from calstudy.calibrate.solvers.gauss_newton import remaining_at
-from calstudy.calibrate.solvers.interface import Solver, remaining_rms
+from calstudy.calibrate.solvers.interface import Solver, decrement_rms
+from calstudy.calibrate.solvers.reduced import newton_decrement_at
 
 
 class Checkpoint(NamedTuple):
@@ -22,21 +22,34 @@ class Checkpoint(NamedTuple):
         Steps taken.
     gains, model
         Shapes (Nants, Nfreqs) and (Nbls, Nfreqs), complex128, degeneracies fixed.
-    remaining, remaining_rms
+    newton_decrement, decrement_rms
         How far from the minimum, as in `calstudy.calibrate.solution.Solution`.
     """
 
     n_steps: int
     gains: np.ndarray
     model: np.ndarray
-    remaining: float
-    remaining_rms: float
+    newton_decrement: float
+    decrement_rms: float
 
 
 def trace(problem: CalibrationProblem, solver: Solver, steps: Sequence[int]) -> list[Checkpoint]:
-    """Run a solver to its end, and return what it held after certain numbers of steps, and at the end.
+    """Run a solver to its end, and return its estimates after given numbers of steps, and at the end.
 
-    A solver that takes several steps at once is looked at when it has taken as many or more; the checkpoint tells.
+    Parameters
+    ----------
+    problem
+        What is fitted, from its initial gains.
+    solver
+        Any solver. One that takes several steps at once gives its estimate when it has taken as many or more;
+        `Checkpoint.n_steps` says how many.
+    steps
+        Numbers of steps.
+
+    Raises
+    ------
+    ValueError
+        If an estimate has no positive scale (see `calstudy.calibrate.degeneracy.model_scale`).
     """
     state = solver.init(problem)
     due = sorted(set(steps))
@@ -47,9 +60,9 @@ def trace(problem: CalibrationProblem, solver: Solver, steps: Sequence[int]) -> 
         if ended or (due and done >= due[0]):
             due = [step for step in due if step > done]
             gains, model = fix_degeneracies(*solver.estimate(state), problem)
-            remaining = min(max(remaining_at(problem, gains), 0.0), 1.0)
-            rms = remaining_rms(gains, model, problem, remaining)
-            found.append(Checkpoint(done, gains, model, remaining, rms))
+            newton_decrement = min(max(newton_decrement_at(problem, gains), 0.0), 1.0)
+            rms = decrement_rms(gains, model, problem, newton_decrement)
+            found.append(Checkpoint(done, gains, model, newton_decrement, rms))
         if ended:
             return found
         state = solver.step(state)

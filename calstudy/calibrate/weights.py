@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pyuvdata import UVData, UVFlag
+from pyuvdata import UVFlag
 
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Observation
 from calstudy.calibrate.settings import FileWeights, Weights
-from calstudy.errors import InputError
-from calstudy.visibilities import antenna_pairs, flag_cube, to_cube
 
 # Times of weights and data agree within this, in days.
 TIME_TOLERANCE = 1e-6
 
 
-def make_weights(data: UVData, fitted: np.ndarray, settings: Weights) -> np.ndarray:
+def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np.ndarray:
     """Return the weight of every sample, zero where flagged.
 
     In each integration and polarization their mean over unflagged samples is that of the paper, 1 / (Nbls Nfreqs).
@@ -23,7 +23,7 @@ def make_weights(data: UVData, fitted: np.ndarray, settings: Weights) -> np.ndar
     Parameters
     ----------
     data
-        Visibilities, autocorrelations included where they are needed, rectangular and time-major.
+        Visibilities, autocorrelations included where they are needed.
     fitted
         Which baselines are calibrated, bool, shape (Nbls,).
     settings
@@ -39,11 +39,11 @@ def make_weights(data: UVData, fitted: np.ndarray, settings: Weights) -> np.ndar
         If autocorrelations are asked for and missing, or a file does not fit the data or holds weights that are
         complex, negative or not finite.
     """
-    used = ~flag_cube(data)[:, fitted]
+    used = ~data.flags[:, fitted]
     if settings.kind == "flags":
         weights = used.astype(float)
     elif settings.kind == "nsamples":
-        weights = _samples(data)[:, fitted] * used
+        weights = data.nsamples[:, fitted] * used
     elif settings.kind == "autos":
         weights = _from_autos(data, fitted) * used
     else:
@@ -53,13 +53,9 @@ def make_weights(data: UVData, fitted: np.ndarray, settings: Weights) -> np.ndar
     return weights * (count / size / np.where(total > 0, total, 1))
 
 
-def _samples(data: UVData) -> np.ndarray:
-    return np.asarray(data.nsample_array, float).reshape(flag_cube(data).shape)
-
-
-def _from_autos(data: UVData, fitted: np.ndarray) -> np.ndarray:
+def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:
     """Return nsamples / (V_aa V_bb), zero where either is flagged or not positive."""
-    antennas = antenna_pairs(data)
+    antennas = data.pairs
     autos = {int(a): row for row, (a, b) in enumerate(antennas) if a == b}
     missing = sorted(set(antennas[fitted].ravel().tolist()) - set(autos))
     if missing:
@@ -67,13 +63,13 @@ def _from_autos(data: UVData, fitted: np.ndarray) -> np.ndarray:
             "weights: 'autos' needs autocorrelations, which the data lack for antenna(s) "
             f"{', '.join(map(str, missing))}"
         )
-    power = np.where(flag_cube(data), 0, np.nan_to_num(to_cube(data).real))
+    power = np.where(data.flags, 0, np.nan_to_num(data.visibilities.real))
     inverse = np.where(power > 0, 1 / np.where(power > 0, power, 1), 0)
     first, second = (np.array([autos[int(a)] for a in column]) for column in antennas[fitted].T)
-    return inverse[:, first] * inverse[:, second] * _samples(data)[:, fitted]
+    return inverse[:, first] * inverse[:, second] * data.nsamples[:, fitted]
 
 
-def _from_file(data: UVData, settings: FileWeights) -> np.ndarray:
+def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
     """Return the file's weights in the order of the data, shape (Ntimes, Nbls, Nfreqs, Npols)."""
     where = f"weights.path = {str(settings.path)!r}"
     file = _read_uvflag(settings.path, where)
@@ -82,7 +78,7 @@ def _from_file(data: UVData, settings: FileWeights) -> np.ndarray:
         raise InputError(f"{where}: weights must be real, these are complex")
     if not np.isfinite(values).all() or (values < 0).any():
         raise InputError(f"{where}: weights must be finite and not negative")
-    if file.Nfreqs != data.Nfreqs or not np.allclose(file.freq_array, data.freq_array, rtol=1e-9, atol=0):
+    if file.Nfreqs != data.n_channels or not np.allclose(file.freq_array, data.frequencies, rtol=1e-9, atol=0):
         raise InputError(f"{where}: the channels of the weights are not those of the data")
     rows = {
         (int(baseline), round(float(time) / TIME_TOLERANCE)): row
@@ -90,15 +86,15 @@ def _from_file(data: UVData, settings: FileWeights) -> np.ndarray:
     }
     wanted = [
         (int(baseline), round(float(time) / TIME_TOLERANCE))
-        for baseline, time in zip(data.baseline_array, data.time_array, strict=True)
+        for baseline, time in zip(data.uvd.baseline_array, data.uvd.time_array, strict=True)
     ]
     if any(key not in rows for key in wanted):
         raise InputError(f"{where}: no weights for some baselines or integrations of the data")
-    hands = [np.flatnonzero(file.polarization_array == pol) for pol in data.polarization_array]
+    hands = [np.flatnonzero(file.polarization_array == pol) for pol in data.polarizations]
     if any(hand.size != 1 for hand in hands):
         raise InputError(f"{where}: no weights for some polarizations of the data")
     found = values[[rows[key] for key in wanted]][:, :, np.concatenate(hands)]
-    return found.astype(float).reshape(flag_cube(data).shape)
+    return found.astype(float).reshape(data.shape)
 
 
 def _read_uvflag(path: Path, where: str) -> UVFlag:

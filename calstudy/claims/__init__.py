@@ -1,1 +1,1 @@
-"""The sentences of the paper as checks: each measures a number from the tables of a run and says PASS or FAIL."""
+"""What finished runs show to the statements of papers, and the products that hold the verdicts."""

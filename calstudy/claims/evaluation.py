@@ -1,50 +1,146 @@
-"""All claims of the paper, evaluated on the runs that there are."""
+"""The statements of papers, evaluated on the runs that there are."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from calstudy.claims import calibration, computation, low_snr, redundant, window
-from calstudy.claims.facts import Role
-from calstudy.claims.run_times import RunTimes
-from calstudy.claims.statement import Claim, Statement
-from calstudy.claims.study import Study, Unevaluated
-
-STATEMENTS: tuple[Statement, ...] = tuple(
-    item
-    for module in (calibration, window, redundant, low_snr, computation)
-    for item in vars(module).values()
-    if isinstance(item, Statement)
-)
-"""In the order of the paper's sections."""
-
-REDUNDANT_FROM = 0.5
-"""An array is redundant if this part of its baselines has a redundant partner."""
+from calstudy.base.plugins import guarded
+from calstudy.claims.paper import Paper
+from calstudy.claims.results import RunResults
+from calstudy.claims.run_times import RUN_TIME, RunTimes
+from calstudy.experiment.model import Experiment
+from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.statement import Statement
 
 
-def roles_of(study: Study) -> tuple[Role, ...]:
-    """Return the parts that a run can play, from its gains, its array, its calibrator and its solver."""
-    kind = study.corruption.gains.kind
-    if kind == "reflection" and study.calibration.code is None:
-        return ("low_snr",)
-    if kind != "per-channel" or study.calibration.code is not None:
-        return ()
-    try:
-        fraction = study.agreement["redundant_fraction"]
-    except Unevaluated:
-        return ()
-    if fraction >= REDUNDANT_FROM:
-        return ("redundant",) if study.calibration.calibrator == "calamity" else ("redundant_modelling",)
-    papers = study.calibration.solver.name == "adamax"
-    return ("minimally_redundant", "paper_solver") if papers else ("minimally_redundant",)
+@dataclass(frozen=True)
+class Evaluation:
+    """What came of holding runs to papers.
+
+    Attributes
+    ----------
+    verdicts
+        One for each statement.
+    without_role
+        A sentence for each paper in which a run plays no role, with the reasons; such a paper has no verdicts.
+    """
+
+    verdicts: list[Verdict]
+    without_role: tuple[str, ...] = ()
 
 
-def evaluate(studies: Mapping[Role, Study | RunTimes]) -> list[Claim]:
-    """Evaluate every statement on the runs that play its roles.
+def evaluate_run(papers: Sequence[Paper], results: RunResults) -> Evaluation:
+    """Evaluate the statements of papers that are about a role that one run plays."""
+    verdicts: list[Verdict] = []
+    without_role = []
+    for paper in papers:
+        refusals = refusals_of_run(paper, results)
+        played = [role for role, refusal in refusals.items() if refusal is None]
+        if played:
+            verdicts += _evaluate(paper, dict.fromkeys(played, results), only_played=True)
+        else:
+            without_role.append(_told(paper, refusals))
+    return Evaluation(verdicts, tuple(without_role))
+
+
+def refusals_of_run(paper: Paper, results: RunResults) -> dict[str, str | None]:
+    """Return why a run cannot play each role of a paper, None for the roles that it plays."""
+    with guarded(paper):
+        return {role: paper.refusal_of_run(role, results) for role in paper.roles}
+
+
+def _told(paper: Paper, refusals: Mapping[str, str | None]) -> str:
+    """Say in one sentence why a run plays no role, every reason once."""
+    roles: dict[str, list[str]] = {}
+    for role, refusal in refusals.items():
+        roles.setdefault(str(refusal), []).append(role)
+    reasons = "; ".join(f"{refusal} ({', '.join(names)})" for refusal, names in roles.items())
+    return f"The run plays no role in {paper.label}: {reasons or 'the paper has none'}."
+
+
+def evaluate_run_times(papers: Sequence[Paper], run: RunTimes) -> Evaluation:
+    """Evaluate the statements of papers on run times."""
+    verdicts: list[Verdict] = []
+    without_role = []
+    for paper in papers:
+        if RUN_TIME in paper.roles:
+            verdicts += _evaluate(paper, {RUN_TIME: run}, only_played=True)
+        else:
+            without_role.append(f"The run plays no role in {paper.label}: the paper says nothing on run times.")
+    return Evaluation(verdicts, tuple(without_role))
+
+
+def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults]) -> Evaluation:
+    """Evaluate every statement of papers on the runs that play its roles.
 
     Parameters
     ----------
-    studies
-        The runs by the role they play; statements whose roles nobody plays come back as not evaluated, with the reason.
+    papers
+        Whose statements.
+    runs
+        By the role that they play; statements whose roles nobody plays come back as not evaluated, with the reason.
     """
-    return [statement.evaluate(studies) for statement in STATEMENTS]
+    return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs))])
+
+
+def _accepted(paper: Paper, runs: Mapping[str, RunResults]) -> dict[str, RunResults]:
+    """Return the runs that a paper lets play their roles: another paper may have a role of the same name."""
+    with guarded(paper):
+        return {
+            role: run
+            for role, run in runs.items()
+            if role in paper.roles and paper.refusal(role, run.experiment) is None
+        }
+
+
+def _evaluate(paper: Paper, runs: Mapping[str, RunResults | RunTimes], only_played: bool = False) -> list[Verdict]:
+    """Evaluate the statements of a paper; with `only_played`, those alone that are about one of the roles."""
+
+    def wanted(statement: Statement) -> bool:
+        return not only_played or any(role in runs for role in statement.roles)
+
+    with guarded(paper):
+        return [statement.evaluate(runs, paper.roles) for statement in paper.statements() if wanted(statement)]
+
+
+def members_by_role(
+    papers: Sequence[Paper], members: Mapping[str, Experiment], named: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the members of a collection by the role that they play in any of some papers.
+
+    Parameters
+    ----------
+    papers
+        The usual members of the first that has a role count.
+    members
+        The experiments by name.
+    named
+        Members by role, in place of the usual ones. Members that a paper refuses are left out.
+    """
+    usual = {role: name for paper in reversed(papers) for role, name in paper.usual_members.items() if name in members}
+    return {
+        role: name
+        for role, name in (usual | dict(named)).items()
+        if any(role in paper.roles for paper in papers) and refusal_of_role(papers, role, members[name]) is None
+    }
+
+
+def refusal_of_role(papers: Sequence[Paper], role: str, experiment: Experiment) -> str | None:
+    """Return why an experiment cannot play a role in any of the papers that have it, or None if it can in one.
+
+    Parameters
+    ----------
+    papers
+        Those that do not have the role are not asked.
+    role
+        Its name.
+    experiment
+        That would play it.
+    """
+    found: list[str | None] = []
+    for paper in papers:
+        if role in paper.roles:
+            with guarded(paper):
+                found.append(paper.refusal(role, experiment))
+    return None if None in found else next(iter(found), None)

@@ -1,62 +1,108 @@
-"""Evaluate the claims on the folder of a finished run, or of a finished collection."""
+"""Evaluate the statements of papers on the folder of a finished run, or of a finished collection."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calstudy.claims.evaluation import evaluate, roles_of
+from pydantic import ValidationError
+
+from calstudy.base.errors import InputError
+from calstudy.claims.evaluation import (
+    Evaluation,
+    evaluate_members,
+    evaluate_run,
+    evaluate_run_times,
+    members_by_role,
+)
+from calstudy.claims.paper import Paper
+from calstudy.claims.results import RunResults
 from calstudy.claims.run_times import RunTimes
-from calstudy.claims.statement import Claim
-from calstudy.claims.study import Study
-from calstudy.claims.tables import write_claims
-from calstudy.errors import InputError
-from calstudy.experiment.files import read_mapping
+from calstudy.experiment.files import read_mapping, validate
+from calstudy.experiment.messages import sentences
+from calstudy.experiment.model import PAPERS
+from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.tables import write_claims
+
+MANIFEST, EXPERIMENT = "manifest.json", "experiment.yaml"
 
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """The claims of one run folder, and its name."""
+    """The claims of one run folder, its name, and a sentence for each paper in which it plays no role."""
 
     title: str
-    claims: list[Claim]
+    claims: list[Verdict]
+    without_role: tuple[str, ...] = ()
 
 
-def evaluate_folder(folder: Path) -> EvaluatedRun:
-    """Evaluate the claims on the tables of a run folder, and write claims.json and claims.md into it.
+def evaluate_folder(folder: Path, papers: Sequence[str] = ()) -> EvaluatedRun:
+    """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
     Parameters
     ----------
     folder
         Of a run (``experiment.yaml``, ``tables/``), or of a collection, whose members' folders are beside it.
+    papers
+        Names of papers, or files, in place of those that the run names.
 
     Raises
     ------
     InputError
-        If it is neither, or cannot be written.
+        If it is neither, names no paper, or cannot be written.
     """
     manifest = _manifest(folder)
+    if "points" in manifest:
+        raise InputError(f"{folder}: is the folder of a sweep; give that of one of its points, below {folder}/points")
+    named = [_paper(name) for name in papers]
     if manifest.get("kind") == "runtime":
-        studies = {"run_time": RunTimes.of(manifest["name"], _tables(folder))}
+        study = read_mapping(folder / EXPERIMENT)
+        times = RunTimes.of(manifest["name"], _tables(folder))
+        found = evaluate_run_times(_named(named, study.get("papers", ()), folder), times)
     elif "members" in manifest:
-        members = manifest["members"]
-        studies = {role: _study(folder.resolve().parent / members[name]) for role, name in manifest["roles"].items()}
+        found = _evaluate_collection(folder, manifest, named)
     else:
-        study = _study(folder)
-        studies = dict.fromkeys(roles_of(study), study)
-    evaluated = EvaluatedRun(manifest["name"], evaluate(studies))
+        run = _results(folder)
+        found = evaluate_run(_named(named, run.experiment.papers, folder), run)
+    evaluated = EvaluatedRun(manifest["name"], found.verdicts, found.without_role)
     try:
-        write_claims(evaluated.claims, folder, evaluated.title, manifest["stand_ins"])
+        write_claims(found.verdicts, folder, evaluated.title, manifest["stand_ins"], found.without_role)
     except OSError as error:
         raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
     return evaluated
 
 
+def _evaluate_collection(folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]) -> Evaluation:
+    members = {name: _results(folder.resolve().parent / place) for name, place in manifest["members"].items()}
+    own = {paper.reference: paper for run in members.values() for paper in run.experiment.papers}
+    papers = _named(named, list(own.values()), folder)
+    experiments = {name: run.experiment for name, run in members.items()}
+    roles = members_by_role(papers, experiments, manifest["roles"])
+    return evaluate_members(papers, {role: members[name] for role, name in roles.items()})
+
+
+def _paper(block: Any) -> Paper:
+    try:
+        return PAPERS.make(block)
+    except ValidationError as error:
+        found = "; ".join(sentences(error, PAPERS.base, block))
+        raise InputError(f"paper {block!r}: {found}") from None
+
+
+def _named(named: Sequence[Paper], own: Sequence[Any], folder: Path) -> list[Paper]:
+    papers = list(named) or [_paper(paper) for paper in own]
+    if not papers:
+        names = ", ".join(PAPERS.names())
+        raise InputError(f"{folder}: its experiment names no papers; give one with --paper ({names}, or a file.py)")
+    return papers
+
+
 def _manifest(folder: Path) -> dict[str, Any]:
     try:
-        return json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        return json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise InputError(
             f"{folder}: is not the folder of a finished run (it has no readable manifest.json); give one that "
@@ -70,5 +116,5 @@ def _tables(folder: Path) -> Path:
     return folder / "tables"
 
 
-def _study(folder: Path) -> Study:
-    return Study.of(read_mapping(folder / "experiment.yaml"), [_tables(folder)])
+def _results(folder: Path) -> RunResults:
+    return RunResults(validate(read_mapping(folder / EXPERIMENT), folder), (_tables(folder),))

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from calstudy.bench.scaling import PowerLaw, fit_power_law
-from calstudy.claims.study import Unevaluated
+from calstudy.products.run_times import RUNTIME
+from calstudy.verdicts.statement import Unevaluated
 
-RUNTIME = "runtime.json"
+RUN_TIME = "run_time"
+"""The role that a run-time study plays."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class RunTimes:
     name
         Of the run.
     table
-        What `calstudy.stages.runtime` wrote: ``cases``, one per array and device, and ``descent``.
+        What `calstudy.products.run_times` wrote: ``cases``, one per array and device, and ``descent``.
     """
 
     name: str
@@ -44,15 +46,47 @@ class RunTimes:
         return sorted(found, key=lambda case: case["size"])
 
     def medians(self, panel: str, kind: str, device: str = "cpu") -> np.ndarray:
-        """Return median seconds of each array, (Nsizes,)."""
+        """Return median seconds of each array, (Nsizes,).
+
+        Parameters
+        ----------
+        panel
+            Family of arrays, "rows" or "line".
+        kind
+            What was timed.
+        device
+            "cpu" or "gpu".
+        """
         return np.array([case["seconds"][kind]["median"] for case in self.cases(panel, device)])
 
     def column(self, panel: str, name: str, device: str = "cpu") -> np.ndarray:
-        """Return a property of each array, (Nsizes,)."""
+        """Return a property of each array, (Nsizes,).
+
+        Parameters
+        ----------
+        panel
+            Family of arrays, "rows" or "line".
+        name
+            Of the property, such as "size".
+        device
+            "cpu" or "gpu".
+        """
         return np.array([case[name] for case in self.cases(panel, device)], float)
 
     def scaling(self, panel: str, kind: str, against: str = "size", device: str = "cpu") -> PowerLaw:
-        """Fit the medians as a power of a property of the arrays."""
+        """Fit the medians as a power of a property of the arrays.
+
+        Parameters
+        ----------
+        panel
+            Family of arrays, "rows" or "line".
+        kind
+            What was timed.
+        against
+            Name of the property.
+        device
+            "cpu" or "gpu".
+        """
         return fit_power_law(self.column(panel, against, device), self.medians(panel, kind, device))
 
     def steps_to(self, excess: str) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 
 if TYPE_CHECKING:
     from calstudy.corrupt.settings import CorruptionSettings
@@ -39,10 +39,17 @@ def rms(visibilities: np.ndarray) -> float:
 
 
 def set_levels(foreground_rms: float, eor_rms: float, settings: CorruptionSettings) -> Levels:
-    """Scale the EoR to `eor_level` below the foregrounds and the noise to its reference (design §4).
+    """Scale the EoR to `eor_level` below the foregrounds and the noise to its reference.
 
     The paper's decibels are of brightness: -40 dB is a ratio of rms visibilities of 1e-4, so that the residuals'
     -45 dB are -90 dB in the power spectrum. So rms of scaled EoR / rms of foregrounds = 10^(level / 10).
+
+    Parameters
+    ----------
+    foreground_rms, eor_rms
+        Of the simulated visibilities, Jy.
+    settings
+        Level of the EoR and factor of the noise.
 
     Raises
     ------

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, SerializeAsAny, model_validator
 
-from calstudy.schema import Section, choice, fault
-from calstudy.units import Decibel, Delay
+from calstudy.base.schema import Section, choice, fault
+from calstudy.base.units import Decibel
+from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
+from calstudy.corrupt.interface import Effect, GainEffect
 
 
 def _different(seeds: tuple[int, int]) -> tuple[int, int]:
@@ -52,48 +54,61 @@ Noise = Annotated[
 ]
 
 
-class ChannelGains(Section):
-    """g = 1 + sigma (n + i n'), independent per antenna and channel, constant in time (paper §Simulations)."""
-
-    kind: Literal["per-channel"] = "per-channel"
-    sigma: float = Field(0.1, ge=0, le=10)
-    seed: int = Field(5, ge=0)
-
-
-class ReflectionGains(Section):
-    """One cable reflection per antenna (paper Eq. REFGAIN)."""
-
-    kind: Literal["reflection"]
-    amplitude: float = Field(0.01, ge=0, lt=1, description="Mean of the exponential distribution of r.")
-    delay: Delay = Field(1200e-9, description="Mean of the normal distribution of the delay.")
-    delay_scatter: Delay = Field(100e-9, ge=0)
-    seed: int = Field(5, ge=0)
-
-
-class UnityGains(Section):
-    """Perfect gains."""
-
-    kind: Literal["unity"]
-
-
-class FileGains(Section):
-    """Gains read from a CalH5 or calfits file with the same antennas and channels."""
-
-    kind: Literal["file"]
-    path: Path = Field(strict=False)
-
-
-Gains = Annotated[
-    ChannelGains | ReflectionGains | UnityGains | FileGains, Field(discriminator="kind"), choice("kind", "per-channel")
-]
+EFFECTS = Effect.registry
 
 
 class CorruptionSettings(Section):
-    """How the simulated components are scaled and combined into measurements."""
+    """How the simulated components are scaled, added up and changed on the way to the measurement.
+
+    Noise is added to the sum of foregrounds and EoR before the effects, so that it is multiplied by gains like them, as
+    in the paper.
+    """
 
     eor_level: Decibel | None = Field(
         -40.0,
         description="rms of EoR over foregrounds, 10 log10 of brightness: -40 dB is 1e-4; null: absolute units.",
     )
     noise: Noise = NoiseRelativeToEor()
-    gains: Gains = ChannelGains()
+    effects: Annotated[
+        tuple[Annotated[SerializeAsAny[Effect], EFFECTS.field()], ...],
+        Field(
+            strict=False,
+            description="What happens to the sum of foregrounds, EoR and noise, in this order; an empty list: nothing.",
+        ),
+    ] = (PerChannelGains(),)
+
+    @property
+    def gains(self) -> GainEffect | None:
+        """The first effect on the gains, or None."""
+        return next((effect for effect in self.effects if isinstance(effect, GainEffect)), None)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gains_are_effects(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and "gains" in data:
+            raise fault("gains", f"is now corruption.effects, a list: effects: {_as_effects(data['gains'])}")
+        return data
+
+    @model_validator(mode="after")
+    def _effects_are_independent(self) -> CorruptionSettings:
+        seen: dict[int, int] = {}
+        for place, effect in enumerate(self.effects):
+            if (seed := getattr(effect, "seed", None)) is None:
+                continue
+            if seed in seen:
+                raise fault(
+                    f"effects.{place}.seed",
+                    f"is {seed}, as that of item {seen[seed]}: what they draw would not be independent",
+                )
+            seen[seed] = place
+        return self
+
+
+def _as_effects(gains: Any) -> str:
+    """Return how a block of the former field `corruption.gains` is written as a list of effects."""
+    block = {"kind": gains} if isinstance(gains, str) else dict(gains) if isinstance(gains, Mapping) else {}
+    kind = block.pop("kind", "per-channel")
+    if kind == "unity":
+        return "[]"
+    settings = "".join(f", {name}: {value}" for name, value in block.items())
+    return f"[{{kind: {kind}-gains{settings}}}]"

@@ -1,1 +1,1 @@
-"""Experiment files: their schema, how they are read, and how their faults are told."""
+"""Experiment files: their schema, how they are read, and how their errors are reported."""

@@ -11,10 +11,12 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from calstudy.errors import ExperimentError, InputError
-from calstudy.experiment.messages import nearest, sentences
+from calstudy.base.errors import ExperimentError, InputError, nearest
+from calstudy.base.plugins import load_function
+from calstudy.calibrate.interface import CALIBRATORS
+from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
-from calstudy.plugins import Plugin, plugin_fault
+from calstudy.instrument.size import antenna_count
 
 
 class _Loader(yaml.SafeLoader):
@@ -39,6 +41,8 @@ _Loader.add_implicit_resolver(
 )
 
 
+TAGS = {"solver": "name", "calibration": CALIBRATORS.tag}
+"""What a bare string stands for, where a block may be written as one; elsewhere its `kind`."""
 UNKNOWN_TAG = re.compile(r"could not determine a constructor for the tag '(.*)'")
 
 
@@ -85,22 +89,71 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
-    """Return a copy of `data` with the field at the dotted path set to `value`."""
+    """Return a copy of `data` with the field at the dotted path set to `value`.
+
+    Items of a list are counted from 0: ``corruption.effects.0.sigma``. A list that the data do not have starts as the
+    default of an experiment.
+
+    Parameters
+    ----------
+    data
+        Content of an experiment file; not changed.
+    path
+        Names of nested fields and places in lists, joined by dots.
+    value
+        Any JSON-able value.
+    """
     result = deepcopy(dict(data))
-    block = result
+    block: dict | list = result
     *parents, last = path.split(".")
-    for step in parents:
-        inner = block.get(step)
+    for place, step in enumerate(parents):
+        key = _key(block, step, path)
+        inner = block.get(key) if isinstance(block, dict) else block[key]
         if isinstance(inner, str):
-            inner = {"name" if step == "solver" else "kind": inner}
+            inner = {TAGS.get(step, "kind"): inner}
         elif inner is None:
-            inner = {}
-        elif not isinstance(inner, dict):
+            inner = (_default_items(parents[: place + 1]) if path.split(".")[place + 1].isdigit() else None) or {}
+        elif not isinstance(inner, dict | list):
             raise InputError(f"{path}: cannot be set, for {step!r} is {inner!r} and not a block of keys")
-        block[step] = inner
+        block[key] = inner
         block = inner
-    block[last] = value
+    block[_key(block, last, path)] = value
     return result
+
+
+def _key(block: dict | list, step: str, path: str) -> Any:
+    """Return the key of a block, or the place in a list, that a step of a dotted path means."""
+    if isinstance(block, dict):
+        return step
+    if not step.isdigit() or int(step) >= len(block):
+        raise InputError(
+            f"{path}: cannot be set, for {step!r} is not an item of a list of {len(block)}, counted from 0"
+        )
+    return int(step)
+
+
+def _default_items(steps: Sequence[str]) -> list[Any] | None:
+    """Return the default of a field that is a list of blocks, as plain values; None for any other field."""
+    section: type = Experiment
+    value: Any = None
+    for step in steps:
+        field = section.model_fields.get(step) if issubclass(section, BaseModel) else None
+        if field is None:
+            return None
+        value = field.get_default(call_default_factory=True)
+        section = type(value)
+    if not isinstance(value, tuple) or not all(isinstance(item, BaseModel) for item in value):
+        return None
+    return [item.model_dump(mode="json") for item in value]
+
+
+def short_names(paths: Sequence[str]) -> dict[str, str]:
+    """Return the last word of each dotted path, or the last two where that alone would be ambiguous."""
+    last = [path.rpartition(".")[2] for path in paths]
+    return {
+        path: word if last.count(word) == 1 else ".".join(path.split(".")[-2:])
+        for path, word in zip(paths, last, strict=True)
+    }
 
 
 def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
@@ -118,16 +171,16 @@ def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
     return result
 
 
-def _input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, BaseModel, str]]:
+def input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, BaseModel, str]]:
     """Yield (dotted path, block, field) of every input file that the experiment names."""
     for field in type(section).model_fields:
         value, path = getattr(section, field), f"{prefix}{field}"
         if isinstance(value, BaseModel) and field != "outputs":
-            yield from _input_files(value, f"{path}.")
-        elif isinstance(value, Mapping):
-            for name, block in value.items():
+            yield from input_files(value, f"{path}.")
+        elif isinstance(value, Mapping | tuple):
+            for name, block in value.items() if isinstance(value, Mapping) else enumerate(value):
                 if isinstance(block, BaseModel):
-                    yield from _input_files(block, f"{path}.{name}.")
+                    yield from input_files(block, f"{path}.{name}.")
         elif isinstance(value, Path):
             yield path, section, field
 
@@ -159,7 +212,7 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
                     "'calstudy data fetch gleam', give a file under sky.foregrounds.path, or use 'g4jy-and-counts'"
                 ]
             )
-    for path, section, field in _input_files(experiment):
+    for path, section, field in input_files(experiment):
         target = getattr(section, field)
         file = base / expand_user(target, path)
         resolved = override(resolved, path, str(file.resolve()))
@@ -167,29 +220,25 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
             faults.append(f"{path} = {str(target)!r}: no such file (looked for {file})")
     if faults:
         raise ExperimentError(faults)
-    resolved_experiment = Experiment.model_validate(resolved)
-    _require_functions(resolved_experiment)
+    resolved_experiment = Experiment.model_validate(resolved, context={"folder": base})
+    _require_function(resolved_experiment)
     for name in ("store", "runs"):
         expand_user(getattr(experiment.outputs, name), f"outputs.{name}")
     _require_known_antennas(resolved_experiment)
     return resolved_experiment
 
 
-def _require_functions(experiment: Experiment) -> None:
-    plugins = [
-        (path.removesuffix(".path"), section)
-        for path, section, _ in _input_files(experiment)
-        if isinstance(section, Plugin)
-    ]
-    faults = [f"{path}.{fault}" for path, section in plugins if (fault := plugin_fault(section)) is not None]
-    if faults:
-        raise ExperimentError(faults)
+def _require_function(experiment: Experiment) -> None:
+    foregrounds = experiment.sky.foregrounds
+    if foregrounds.kind == "code":
+        try:
+            load_function(foregrounds.path, foregrounds.function)
+        except InputError as error:
+            raise ExperimentError([f"sky.foregrounds: {error}"]) from None
 
 
 def _require_known_antennas(experiment: Experiment) -> None:
-    from calstudy.graph.estimates import antenna_count
-
-    count = antenna_count(experiment.instrument.layout.model_dump())
+    count = antenna_count(experiment.instrument.layout)
     named = {"outputs.inspect": [place for pair in experiment.outputs.inspect.pairs for place in pair]}
     for name, group in experiment.instrument.antenna_beams.items():
         named[f"instrument.antenna_beams.{name}.antennas"] = list(group.antennas)
@@ -219,7 +268,7 @@ def validate(data: Mapping[str, Any], base: Path) -> Experiment:
     """
     plain = dict(data)
     try:
-        experiment = Experiment.model_validate(plain)
+        experiment = Experiment.model_validate(plain, context={"folder": base})
     except ValidationError as error:
         raise ExperimentError(sentences(error, Experiment, plain)) from None
     return _resolve_files(plain, experiment, base)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import types
+from collections.abc import Iterator
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+
+from calstudy.base.errors import nearest
+from calstudy.base.plugins import NESTED
 
 KINDS = {
     "int_type": "a whole number",
@@ -28,12 +31,6 @@ BOUNDS = {
     "less_than": "less than {lt:g}{unit}",
     "less_than_equal": "at most {le:g}{unit}",
 }
-
-
-def nearest(word: object, allowed: list[str]) -> str:
-    """Return ``", did you mean 'x'?"`` for the closest allowed word, or an empty string if none is close."""
-    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.6) if isinstance(word, str) else []
-    return f", did you mean {close[0]!r}?" if close else ""
 
 
 def _members(annotation: Any) -> list[Any]:
@@ -101,9 +98,10 @@ def _unit(holder: type[BaseModel] | None, field: int | str) -> str:
     return f" {extra['unit']}" if isinstance(extra, dict) else ""
 
 
-def _sentence(root: type[BaseModel], error: Any, data: Any) -> str:
+def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:
     kind, context = error["type"], error.get("ctx", {})
-    path, holder = _locate(root, error["loc"])
+    inner, holder = _locate(root, error["loc"])
+    path = f"{prefix}{inner}" if inner else prefix.removesuffix(".")
     if kind == "fault":
         path = ".".join(part for part in (path, context["path"]) if part)
         return f"{path}: {context['sentence']}"
@@ -114,23 +112,37 @@ def _sentence(root: type[BaseModel], error: Any, data: Any) -> str:
         return f"{path}: unknown key{nearest(str(error['loc'][-1]), keys)} (allowed: {', '.join(keys)})"
     if kind == "missing":
         return f"{path}: missing, and it has no default"
-    start = f"{path}{_written(data, path)}:"
     if kind == "union_tag_invalid":
         tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
         return f"{path}: {context['tag']!r} is not a choice{nearest(context['tag'], tags)} (allowed: {', '.join(tags)})"
-    if kind == "literal_error":
-        allowed = [word.strip(" '") for word in context["expected"].replace(" or ", ", ").split(",")]
-        return f"{start} not a choice{nearest(error['input'], allowed)} (allowed: {', '.join(allowed)})"
-    if kind in BOUNDS:
-        return f"{start} must be {BOUNDS[kind].format(unit=_unit(holder, error['loc'][-1]), **context)}"
-    if kind in KINDS:
-        return f"{start} must be {KINDS[kind]}"
-    if kind == "string_pattern_mismatch":
-        return f"{start} must match {context['pattern']}"
     if kind in ("too_short", "too_long"):
         bound = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
         return f"{path}: must have {bound} item(s), has {context['actual_length']}"
-    return f"{start} {error['msg']}"
+    return f"{path}{_written(data, inner)}: {_wanted(error, holder)}"
+
+
+def _wanted(error: Any, holder: type[BaseModel] | None) -> str:
+    """Return what a value should have been."""
+    kind, context = error["type"], error.get("ctx", {})
+    if kind == "literal_error":
+        allowed = [word.strip(" '") for word in context["expected"].replace(" or ", ", ").split(",")]
+        return f"not a choice{nearest(error['input'], allowed)} (allowed: {', '.join(allowed)})"
+    if kind in BOUNDS:
+        return f"must be {BOUNDS[kind].format(unit=_unit(holder, error['loc'][-1]), **context)}"
+    if kind in KINDS:
+        return f"must be {KINDS[kind]}"
+    if kind == "string_pattern_mismatch":
+        return f"must match {context['pattern']}"
+    return str(error["msg"])
+
+
+def _all(error: ValidationError, root: type[BaseModel], data: Any, prefix: str) -> Iterator[str]:
+    for item in error.errors():
+        if item["type"] == NESTED:
+            path, context = f"{prefix}{_locate(root, item['loc'])[0]}.", item["ctx"]
+            yield from _all(context["error"], context["model"], context["content"], path)
+        else:
+            yield _sentence(root, item, data, prefix)
 
 
 def sentences(error: ValidationError, root: type[BaseModel], data: Any) -> list[str]:
@@ -145,4 +157,4 @@ def sentences(error: ValidationError, root: type[BaseModel], data: Any) -> list[
     data
         The file's content as plain dictionaries and lists.
     """
-    return list(dict.fromkeys(_sentence(root, item, data) for item in error.errors()))
+    return list(dict.fromkeys(_all(error, root, data, "")))

@@ -4,63 +4,55 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol, cast
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
-from calstudy.calibrate.settings import CalibrationSettings, FirstOrderSettings, GaussNewtonSettings, Solver
-from calstudy.constants import HYDROGEN_LINE
+from calstudy.base.constants import HYDROGEN_LINE
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.base.schema import Section, fault
+from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.interface import CALIBRATORS, Calibrator
+from calstudy.calibrate.settings import FirstOrderSettings, GaussNewtonSettings, Solver
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.settings import PowerSettings
-from calstudy.schema import Section, fault
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.settings import SkySettings
 
 Component = Literal["foregrounds", "eor", "noise"]
-FigureName = Literal[
-    "layout",
-    "gains",
-    "model",
-    "data",
-    "baselines",
-    "wedge",
-    "spherical",
-    "spherical-excised",
-    "reflections",
-    "signal-loss",
-    "expected-loss",
-    "convergence",
-]
 SIGNAL_LOSS_VARIANTS = ("residual", "residual_without_eor", "eor")
-FIGURE_VARIANTS: dict[str, tuple[str, ...]] = {
-    "layout": (),
-    "gains": ("residual",),
-    "model": ("residual", "noise"),
-    "data": ("residual", "noise"),
-    "baselines": ("residual", "noise"),
-    "reflections": (),
-    "wedge": ("uncorrupted", "uncalibrated", "residual", "eor", "noise"),
-    "spherical": ("eor",),
-    "spherical-excised": ("eor",),
-    "signal-loss": SIGNAL_LOSS_VARIANTS,
-    "expected-loss": SIGNAL_LOSS_VARIANTS,
-    "convergence": SIGNAL_LOSS_VARIANTS,
-}
-"""Names of the variants that each figure cannot do without."""
+FIGURES: Registry[Any] = Registry("figure", "calstudy.figures", "calstudy.figures:StudyFigure")
+PAPERS: Registry[Any] = Registry("paper", "calstudy.papers", "calstudy.claims.paper:Paper")
+DEFAULT_FIGURES = ("layout", "gains", "model", "data", "baselines", "wedge", "spherical", "signal-loss")
 
-
+FIGURE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+class Refusing(Protocol):
+    """What an experiment asks of its figures, which are `calstudy.figures.StudyFigure`."""
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
 
 
 class Variant(Section):
     """One version of the data that is carried to a power spectrum."""
 
     components: Annotated[tuple[Component, ...], Field(strict=False, min_length=1)] = Field(
-        description="What is added up before the gains."
+        description="What is added up before any effect."
     )
-    gains: bool = Field(False, description="Multiply by the corrupting gains.")
+    effects: bool = Field(False, description="Let the effects of `corruption.effects` happen to the data.")
     calibrate: bool = Field(False, description="Calibrate, and use the residual R.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gains_are_effects(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "gains" in data:
+            raise fault("gains", "is now 'effects': true lets all effects of corruption.effects happen to the data")
+        return data
 
     @model_validator(mode="after")
     def _components_are_unique(self) -> Variant:
@@ -73,9 +65,9 @@ def _paper_variants() -> dict[str, Variant]:
     everything: tuple[Component, ...] = ("foregrounds", "eor", "noise")
     return {
         "uncorrupted": Variant(components=everything),
-        "uncalibrated": Variant(components=everything, gains=True),
-        "residual": Variant(components=everything, gains=True, calibrate=True),
-        "residual_without_eor": Variant(components=("foregrounds", "noise"), gains=True, calibrate=True),
+        "uncalibrated": Variant(components=everything, effects=True),
+        "residual": Variant(components=everything, effects=True, calibrate=True),
+        "residual_without_eor": Variant(components=("foregrounds", "noise"), effects=True, calibrate=True),
         "eor": Variant(components=("eor",)),
         "noise": Variant(components=("noise",)),
     }
@@ -129,15 +121,9 @@ class Convergence(Section):
 class Outputs(Section):
     """What is drawn, and where products and run folders go."""
 
-    figures: Annotated[tuple[FigureName, ...], Field(strict=False)] = (
-        "layout",
-        "gains",
-        "model",
-        "data",
-        "baselines",
-        "wedge",
-        "spherical",
-        "signal-loss",
+    figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] = Field(
+        default_factory=lambda: tuple(FIGURES.make(name) for name in DEFAULT_FIGURES),
+        description="What is drawn: names of figures, or files of your own.",
     )
     inspect: Inspection = Inspection()
     convergence: Convergence = Convergence()
@@ -162,12 +148,17 @@ class Experiment(Section):
     sky: SkySettings = SkySettings()
     simulation: SimulationSettings = SimulationSettings()
     corruption: CorruptionSettings = CorruptionSettings()
-    calibration: CalibrationSettings = CalibrationSettings()
+    calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Calamity()
     power: PowerSettings = PowerSettings()
     variants: dict[str, Variant] = Field(
         default_factory=_paper_variants, min_length=1, description="By default the six of the paper's figures."
     )
-    outputs: Outputs = Outputs()
+    outputs: Outputs = Field(default_factory=Outputs)
+    papers: Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)] = Field(
+        (),
+        description="Published papers whose statements the run is compared with, such as [calamity2022]; none by "
+        "default.",
+    )
     sweep: Annotated[tuple[SweepBlock, ...], Field(strict=False), BeforeValidator(_as_list)] = Field(
         (),
         description="Fields to vary (dotted path: list of values; several fields: all combinations), or a list of such "
@@ -188,17 +179,9 @@ class Experiment(Section):
                 raise fault(f"variants.{name}", "is not a usable name: use letters, digits, '_', '-'; not 'transfer'")
         return self
 
-    @model_validator(mode="after")
-    def _figures_have_their_variants(self) -> Experiment:
-        for figure in self.outputs.figures:
-            missing = [name for name in FIGURE_VARIANTS[figure] if name not in self.variants]
-            if missing:
-                raise fault("outputs.figures", f"asks for {figure!r}, which needs the variant(s) {', '.join(missing)}")
-        return self
-
     @property
     def measures_signal_loss(self) -> bool:
-        """Whether data are calibrated with the EoR and without, all else equal, so that its loss can be told."""
+        """Whether data are calibrated with the EoR and without, all else equal, so that its loss can be measured."""
         residual, without, eor = (self.variants.get(name) for name in SIGNAL_LOSS_VARIANTS)
         if residual is None or without is None or eor is None:
             return False
@@ -206,31 +189,24 @@ class Experiment(Section):
             set(residual.components) == {*without.components, "eor"} != set(without.components)
             and residual.calibrate
             and without.calibrate
-            and residual.gains == without.gains
+            and residual.effects == without.effects
             and eor == Variant(components=("eor",))
         )
 
     @model_validator(mode="after")
-    def _signal_loss_is_told(self) -> Experiment:
-        asking = [name for name in ("signal-loss", "expected-loss", "convergence") if name in self.outputs.figures]
-        if asking and not self.measures_signal_loss:
-            raise fault(
-                "variants",
-                f"of the figure {asking[0]!r} must be residual and residual_without_eor, which differ in the EoR alone "
-                "and have calibrate: true, and eor, with components [eor] alone",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _inspected_data_exist(self) -> Experiment:
-        needing = [figure for figure in self.outputs.figures if "residual" in FIGURE_VARIANTS[figure]]
-        residual = self.variants.get("residual")
-        complete = residual and residual.gains and residual.calibrate and "foregrounds" in residual.components
-        if needing and residual and not complete:
-            raise fault(
-                "variants.residual",
-                f"must have foregrounds, gains: true and calibrate: true for the figure {needing[0]!r}",
-            )
+    def _figures_can_be_drawn(self) -> Experiment:
+        labels = [figure.label for figure in self.outputs.figures]
+        for index, figure in enumerate(self.outputs.figures):
+            path = f"outputs.figures.{index}"
+            if not FIGURE_NAME.fullmatch(figure.label) or figure.label in labels[:index]:
+                raise fault(path, f"{figure.label!r} cannot name a picture, or does so already: use another file name")
+            try:
+                with guarded(figure):
+                    refusal = cast(Refusing, figure).refusal(self)
+            except InputError as error:
+                raise fault(path, str(error)) from None
+            if refusal is not None:
+                raise fault("outputs.figures", f"asks for {figure.label!r}, which {refusal}")
         count = self.instrument.times.count
         if self.outputs.inspect.integration >= count:
             raise fault(
@@ -256,16 +232,4 @@ class Experiment(Section):
         last = channels.first + (channels.count - 1) * channels.width
         if last >= HYDROGEN_LINE:
             raise fault("instrument.channels", f"end at {last / 1e6:g} MHz, above the 21 cm line at redshift zero")
-        return self
-
-    @model_validator(mode="after")
-    def _channels_hold_the_basis(self) -> Experiment:
-        basis, channels = self.calibration.basis, self.instrument.channels
-        nyquist = 0.5 / channels.width
-        if basis.min_delay + basis.buffer >= nyquist:
-            raise fault(
-                "calibration.basis.buffer",
-                f"with min_delay makes a half-width of {1e9 * (basis.min_delay + basis.buffer):.0f} ns, which must "
-                f"stay below the {1e9 * nyquist:.0f} ns that channels of {channels.width / 1e3:g} kHz resolve",
-            )
         return self

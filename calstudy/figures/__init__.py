@@ -1,1 +1,213 @@
-"""figures"""
+"""Figures of studies: one module each, with its caption, what it needs, how it is drawn, and its tolerances.
+
+A `StudyFigure` declares all that the rest of the package must know of it. Its name is that of its module; a user's own
+is named by the path of its file in ``outputs.figures``.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin, guarded
+from calstudy.base.resources import Cost
+from calstudy.calibrate.settings import GainFit
+from calstudy.experiment.model import FIGURES, Experiment
+from calstudy.run.task import Job, Stage, Task
+from calstudy.verdicts.tolerances import Rules
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from calstudy.products.graph import Graph
+
+
+class Drawing(NamedTuple):
+    """A drawn figure.
+
+    Attributes
+    ----------
+    figure
+        From matplotlib.
+    shown
+        The arrays that it shows: dataclasses, mappings and sequences of them (`calstudy.plotting.save.figure_arrays`).
+    notes
+        JSON-able, kept in the record of the product.
+    """
+
+    figure: Figure
+    shown: Any
+    notes: Mapping[str, Any] = {}
+
+
+class StudyFigure(Plugin):
+    """The base of all figures of a study.
+
+    Attributes
+    ----------
+    caption
+        One sentence for the report.
+    variants
+        Names of the variants of the data that it requires.
+    needs_calibration
+        Whether `residual` must be calibrated data with foregrounds and effects.
+    needs_signal_loss
+        Whether the experiment must calibrate data with the EoR and without.
+    needs_least_squares
+        Whether the calibrator must be one that fits by least squares: it is repeated, or its tangent space needed.
+    shows_sky
+        Whether a stand-in for sky, beam or scale enters it, and so is printed on it.
+    tolerances
+        How far its arrays may be from a reference: pairs of a pattern of array names and a tolerance, the first that
+        matches counts (`calstudy.verdicts.tolerances`).
+    """
+
+    registry: ClassVar = FIGURES
+    caption: ClassVar[str] = ""
+    variants: ClassVar[tuple[str, ...]] = ()
+    needs_calibration: ClassVar[bool] = False
+    needs_signal_loss: ClassVar[bool] = False
+    needs_least_squares: ClassVar[bool] = False
+    shows_sky: ClassVar[bool] = True
+    tolerances: ClassVar[Rules] = ()
+
+    kind: str
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
+        missing = [name for name in self.variants if name not in experiment.variants]
+        if missing:
+            return f"needs the variant(s) {', '.join(missing)}"
+        residual = experiment.variants.get("residual")
+        complete = residual and residual.effects and residual.calibrate and "foregrounds" in residual.components
+        if self.needs_calibration and not complete:
+            return "needs variants.residual to have foregrounds, effects: true and calibrate: true"
+        if self.needs_signal_loss and not experiment.measures_signal_loss:
+            return (
+                "needs the variants residual and residual_without_eor, which differ in the EoR alone and have "
+                "calibrate: true, and eor, with components [eor] alone"
+            )
+        if self.needs_least_squares and not isinstance(experiment.calibration, GainFit):
+            return "needs a calibrator that fits by least squares, such as calamity"
+        return None
+
+    @abstractmethod
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the products that the figure shows, by names of its own."""
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return what it needs to know of the experiment besides: sections and JSON-able values."""
+        del graph
+        return {}
+
+    @abstractmethod
+    def draw(self, job: Job) -> Drawing:
+        """Draw the figure.
+
+        Parameters
+        ----------
+        job
+            Its `inputs` are folders of products; its `settings` what `settings` returned, and ``notes``: the stand-ins
+            to print.
+        """
+
+
+class ComparisonFigure(StudyFigure):
+    """A figure of a collection: it compares the members that play certain roles.
+
+    Attributes
+    ----------
+    titles
+        The roles that are compared, from left to right, and how each is headed. Its `draw` finds the product ``name``
+        of a member's `inputs` under ``name:role`` in ``job.inputs``, and its layout in ``job.settings["layouts"]``.
+    """
+
+    titles: ClassVar[Mapping[str, str]] = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
+
+    def refusal(self, experiment: Experiment) -> str:
+        """Refuse: a single experiment has nothing to compare."""
+        return "compares the members of a collection, and cannot be drawn of a single experiment"
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the products of one member that the figure shows: by default its averaged spectra."""
+        from calstudy.products.spectra import spectra
+
+        return {"spectra": spectra(graph)}
+
+
+def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:
+    """Return the figures that an experiment asks for; their registry lets no other plug-ins in."""
+    return cast(tuple[StudyFigure, ...], experiment.outputs.figures)
+
+
+def draw(job: Job) -> Mapping[str, Any]:
+    """Write one figure as png and pdf, and its arrays as npz.
+
+    Raises
+    ------
+    InputError
+        If a user's figure fails, or returns anything but a drawing with plain arrays.
+    """
+    from matplotlib.figure import Figure
+
+    from calstudy.plotting.save import figure_arrays, save_figure
+
+    shown: StudyFigure = job.settings["figure"]
+    with guarded(shown):
+        drawing = shown.draw(job)
+    if not isinstance(drawing, Drawing) or not isinstance(drawing.figure, Figure):
+        raise InputError(f"figure {shown.label!r}: draw returned a {type(drawing).__name__}, expected a Drawing")
+    try:
+        arrays = figure_arrays(drawing.shown)
+    except ValueError as error:
+        raise InputError(f"figure {shown.label!r}: {error}") from None
+    save_figure(drawing.figure, arrays, job.output, shown.label)
+    return {"caption": shown.caption, **drawing.notes}
+
+
+DRAW = Stage(name="figure", version=2, make=draw, cost=lambda task: Cost(3, disk=1e6))
+
+
+def comparison_task(graphs: Mapping[str, Graph], figure: ComparisonFigure, stand_ins: Sequence[str]) -> Task:
+    """Return the task that draws one figure of a collection; `graphs` are those of the members, by role.
+
+    Parameters
+    ----------
+    graphs
+        Of the members, by the role that they play.
+    figure
+        Which.
+    stand_ins
+        To be printed on it, if it shows the sky.
+    """
+    settings = {"layouts": {role: graphs[role].experiment.instrument.layout for role in figure.titles}}
+    with guarded(figure):
+        inputs = {
+            f"{name}:{role}": task for role in figure.titles for name, task in figure.inputs(graphs[role]).items()
+        }
+    return _task(figure, stand_ins, settings, inputs)
+
+
+def figure_task(graph: Graph, figure: StudyFigure, stand_ins: Sequence[str]) -> Task:
+    """Return the task that draws one figure of an experiment.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    figure
+        Which.
+    stand_ins
+        To be printed on it, if it shows the sky.
+    """
+    with guarded(figure):
+        return _task(figure, stand_ins, figure.settings(graph), figure.inputs(graph))
+
+
+def _task(
+    figure: StudyFigure, stand_ins: Sequence[str], settings: Mapping[str, Any], inputs: Mapping[str, Task]
+) -> Task:
+    notes = list(stand_ins) if figure.shows_sky else []
+    return Task(DRAW, figure.label, {"figure": figure, "notes": notes, **settings}, inputs)

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calstudy.figures import style
-from calstudy.figures.domains import horizon_delay
-from calstudy.figures.panels import mark_horizon, name_baseline
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.gains import inspected_calibration
+from calstudy.plotting import style
+from calstudy.plotting.domains import TAPER
+from calstudy.plotting.panels import mark_horizon, name_baseline
+from calstudy.power.delay import channel_width, delay_transform, delays, horizon_delay
+from calstudy.products import corruption
+from calstudy.products.files import DATA, MODEL, RESIDUAL
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, scatter_of_noise
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,7 @@ class BaselineSpectra:
     uncorrupted: np.ndarray | None = None
 
 
-LINES = {
+LINES: dict[str, tuple[str, dict[str, Any]]] = {
     "uncorrupted": (r"$S+F+N$", {"color": style.BLACK, "linestyle": "-", "linewidth": 0.8}),
     "data": (r"uncalibrated $V$", {"color": style.GREY, "linestyle": "-", "linewidth": 1.6}),
     "model": (r"model $\hat{g}_a\hat{g}_b^*\widehat{F}$", {"color": style.MAGENTA, "linestyle": "-", "linewidth": 0.7}),
@@ -97,3 +106,72 @@ def _draw_baseline(axes: Axes, spectra: BaselineSpectra) -> None:
     mark_horizon(axes, horizon_delay(spectra.baseline_length))
     name_baseline(axes, spectra.antennas, spectra.baseline_length)
     axes.set(yscale="log", xlim=(spectra.delay[0] * 1e9, spectra.delay[-1] * 1e9))
+
+
+SHOWN_BASELINES = 4
+"""Baselines in the figure, where the experiment names none."""
+
+
+def rms_over_time(spectra: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """Return the rms over integrations of the Blackman-Harris delay transforms of spectra.
+
+    Parameters
+    ----------
+    spectra
+        Visibilities in Jy, (..., Ntimes, Nfreqs).
+    frequency
+        Channel centres, Hz, (Nfreqs,).
+
+    Returns
+    -------
+    Real, (..., Ndelays), Jy Hz.
+    """
+    return np.sqrt(np.mean(np.abs(delay_transform(spectra, frequency, TAPER)) ** 2, axis=-2))
+
+
+class Baselines(StudyFigure):
+    """Data, model and residual of some baselines against delay."""
+
+    caption = "RMS over time of delay-transformed visibilities of several baselines."
+    variants = ("residual", "noise")
+    needs_calibration = True
+    tolerances = ((r".*", Drawn(scatter_of_noise, "the scatter over delays of the noise's rms over time", rms=3.0)),)
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return calibration, data and noise, and uncorrupted data where the experiment has them."""
+        variants, realization = graph.experiment.variants, graph.experiment.outputs.inspect.realization
+        names = {"data": "residual", "noise": "noise", "uncorrupted": "uncorrupted"}
+        inputs = {
+            name: corruption.data(graph, variants[variant], realization)
+            for name, variant in names.items()
+            if variant in variants
+        }
+        return {"calibration": inspected_calibration(graph)["calibration"], **inputs}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return which baselines are shown."""
+        pairs = graph.experiment.outputs.inspect.baselines
+        shown = None if pairs is None else [list(pair) for pair in pairs]
+        return {"layout": graph.experiment.instrument.layout, "baselines": shown}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the RMS over time of delay transforms of some baselines."""
+        from calstudy.products.selection import baseline, layout_of, read_gains, read_spectra, spread_in_length
+
+        layout = layout_of(job.settings["layout"])
+        places = job.settings["baselines"] or spread_in_length(layout, SHOWN_BASELINES)
+        pairs, lengths = zip(*(baseline(layout, place) for place in places), strict=True)
+        gains = read_gains(job.inputs["calibration"])
+        first, second = (np.moveaxis(gains.of([pair[side] for pair in pairs]), 1, 0) for side in (0, 1))
+        residual = read_spectra(job.inputs["calibration"] / RESIDUAL, pairs)
+        model = first * second.conj() * read_spectra(job.inputs["calibration"] / MODEL, pairs)
+        spectra = {"residual": residual, "model": model}
+        measured = [name for name in ("data", "noise", "uncorrupted") if name in job.inputs]
+        spectra |= {name: read_spectra(job.inputs[name] / DATA, pairs) for name in measured}
+        shown = {name: rms_over_time(values, gains.frequency) for name, values in spectra.items()}
+        delay = delays(gains.frequency.size, channel_width(gains.frequency))
+        panels = [
+            BaselineSpectra(pair, length, delay, **{name: values[index] for name, values in shown.items()})
+            for index, (pair, length) in enumerate(zip(pairs, lengths, strict=True))
+        ]
+        return Drawing(draw_baselines(panels, stand_ins=job.settings["notes"]), panels)

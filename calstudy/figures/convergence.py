@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from calstudy.figures import style
+from calstudy.calibrate.bias import ratio_over_antennas
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95
+from calstudy.plotting import style
+from calstudy.products.convergence import PATHS, followed
+from calstudy.products.files import read_json
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, half
 
 SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
 BIAS = r"$|P^{R}|\,/\,P^{S}$, no EoR in the data"
@@ -62,7 +73,7 @@ def draw_convergence(
     integrations
         Which were solved, for the title.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
 
     Raises
     ------
@@ -120,3 +131,92 @@ def _draw_bias(axes: Axes, path: ConvergencePath, marker: str, colour: str) -> N
             label=path.solver if positive else None,
         )
     axes.plot(path.steps, np.where(path.predicted > 0, path.predicted, np.nan), color=colour, linestyle="--")
+
+
+COLUMNS = ("solver", "steps", "bias", "bias error", "with EoR", "with EoR error", "predicted")
+
+
+class Convergence(StudyFigure):
+    """The bias of the residual power against the steps of several solvers, with convergence.csv."""
+
+    caption = "What solvers leave of the foregrounds in even and odd alike, against their steps, over the EoR."
+    variants = SIGNAL_LOSS_VARIANTS
+    needs_signal_loss = True
+    needs_least_squares = True
+    needs_calibration = True
+    tolerances = ((r".*\.predicted", Drawn(half, "an estimate to within a factor of two; half of it")),)
+
+    def _integrations(self, graph: Graph) -> list[int]:
+        last = graph.experiment.instrument.times.count - 1
+        count = min(graph.experiment.outputs.convergence.integrations, last + 1)
+        return np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return every solver on every integration of data with the EoR and without."""
+        solvers = graph.experiment.outputs.convergence.solvers
+        names = dict(zip(("with", "without"), SIGNAL_LOSS_VARIANTS, strict=False))
+        return {
+            f"{label} {kind} {integration}": followed(graph, names[kind], solver, integration)
+            for (label, solver), kind, integration in itertools.product(
+                solvers.items(), names, self._integrations(graph)
+            )
+        }
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return the names of the solvers, and the integrations."""
+        solvers = list(graph.experiment.outputs.convergence.solvers)
+        return {"solvers": solvers, "integrations": self._integrations(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Put the integrations of every solver together, write convergence.csv, and draw them."""
+        paths = [_path(job, label) for label in job.settings["solvers"]]
+        with (job.output / "convergence.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(COLUMNS)
+            for path in paths:
+                columns = (path.steps, path.bias, path.bias_error, path.with_eor, path.with_eor_error, path.predicted)
+                writer.writerows([path.solver, *row] for row in zip(*(part.tolist() for part in columns), strict=True))
+        figure = draw_convergence(paths, job.settings["integrations"], stand_ins=job.settings["notes"])
+        notes = {path.solver: {"steps": int(path.steps[-1]), "bias": round(float(path.bias[-1]), 4)} for path in paths}
+        return Drawing(figure, {"paths": paths}, notes)
+
+
+def _path(job: Job, label: str) -> ConvergencePath:
+    """Return the path of a solver, all integrations together: their baselines' powers add up."""
+    found = {
+        variant: [read_json(job.inputs[f"{label} {variant} {index}"] / PATHS) for index in job.settings["integrations"]]
+        for variant in ("without", "with")
+    }
+    # Those that end early stay where they are.
+    longest = {name: max(items, key=lambda item: len(item["checkpoints"])) for name, items in found.items()}
+    count = max(len(item["checkpoints"]) for item in longest.values())
+    steps = max(longest.values(), key=lambda item: len(item["checkpoints"]))["checkpoints"]
+    ratios = {name: [_ratio(items, row) for row in range(count)] for name, items in found.items()}
+    predicted = [np.mean([_predicted(item, row) for item in found["without"]]) for row in range(count)]
+    columns = {name: np.array(values).T for name, values in ratios.items()}
+    return ConvergencePath(
+        solver=label,
+        steps=np.array([max(row["steps"]) for row in steps]),
+        bias=columns["without"][0],
+        bias_error=columns["without"][1],
+        with_eor=columns["with"][0],
+        with_eor_error=columns["with"][1],
+        predicted=np.array(predicted),
+    )
+
+
+def _checkpoint(item: Mapping[str, Any], row: int) -> Mapping[str, Any]:
+    return item["checkpoints"][min(row, len(item["checkpoints"]) - 1)]
+
+
+def _ratio(items: Sequence[Mapping[str, Any]], row: int) -> tuple[float, float]:
+    power = np.sum([_checkpoint(item, row)["power"] for item in items], axis=0)
+    return ratio_over_antennas(
+        power, np.sum([item["signal"] for item in items], axis=0), np.array(items[0]["antennas"])
+    )
+
+
+def _predicted(item: Mapping[str, Any], row: int) -> float:
+    """Return the power that the solver says it leaves, as if all of it were common, over that of the EoR."""
+    even, odd = _checkpoint(item, row)["decrement_rms"]
+    return even * odd / item["signal_rms"] ** 2

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calstudy.figures import style
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER, draw_transfer
+from calstudy.plotting import style
+from calstudy.products import expected_loss, signal_loss
+from calstudy.products.files import spectrum_file
+from calstudy.products.graph import Graph, required
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, half, power_over_samples, typical_error
 
 if TYPE_CHECKING:
     from calstudy.power.expected import ExpectedBins
@@ -50,7 +57,7 @@ def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9, stand_ins: Se
     buffer
         What was added to the horizon to tell inside from outside, s.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 2.9)
     left, right = figure.subplots(1, 2, sharey=True)
@@ -58,7 +65,13 @@ def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9, stand_ins: Se
     left.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
     draw_transfer(left, measured, "injected EoR", "o", style.BLUE)
     left.plot(expected.k, expected.outside, color=style.ORANGE, label="expected at the solution")
-    left.plot(measured.k, measured.retained, color=style.BLUE, linestyle=":", label="injected, free of the flux scale")
+    left.plot(
+        measured.k,
+        measured.squared_coherence,
+        color=style.BLUE,
+        linestyle=":",
+        label="injected, free of the flux scale",
+    )
     filled = np.isfinite(measured.transfer)
     left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, min(measured.bin_edges[1:][filled].max(), 1.5)))
     left.set_title(f"outside wedge + {1e9 * buffer:.0f} ns")
@@ -94,3 +107,41 @@ def _draw_lengths(axes: Axes, loss: ExpectedLoss) -> None:
     axes.set(xlabel=style.DELAY, xlim=(0, 1e9 * min(MAX_DELAY, loss.map.delay[-1])))
     axes.set_title("points injected, lines expected")
     axes.legend(loc="lower right")
+
+
+class ExpectedLossFigure(StudyFigure):
+    """The transfer function that the fit predicts, against the one that injection measures."""
+
+    caption = "Signal loss expected from the fit alone, against what injection measures."
+    variants = SIGNAL_LOSS_VARIANTS
+    needs_signal_loss = True
+    needs_least_squares = True
+    needs_calibration = True
+    tolerances = (
+        (r"map\..*", Drawn(typical_error, "its error bar, at least the median of its baseline length", largest=12.0)),
+        (r".*\.signal", Drawn(power_over_samples, "sample variance", largest=12.0)),
+        (r"expected\..*", Drawn(half, "follows from fitted gains; half of it")),
+    )
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return expectation and measurement."""
+        return {"expected": expected_loss.expected_loss(graph), "transfer": required(signal_loss.transfer(graph))}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return where the wedge ends."""
+        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw expected and measured T side by side."""
+        from calstudy.power.expected import ExpectedBins
+        from calstudy.power.tables import load_spectrum
+        from calstudy.power.transfer import TransferFunction, TransferMap
+
+        folder, name = job.inputs["transfer"], signal_loss.TRANSFER
+        found = ExpectedLoss(
+            expected=load_spectrum(job.inputs["expected"] / expected_loss.EXPECTED, ExpectedBins),
+            measured=load_spectrum(folder / spectrum_file(name, "outside-wedge"), TransferFunction),
+            map=load_spectrum(folder / spectrum_file(name, "wedge"), TransferMap),
+        )
+        figure = draw_expected_loss(found, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
+        return Drawing(figure, found)

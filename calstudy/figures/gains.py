@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from calstudy.figures import style
-from calstudy.figures.domains import TwoDomains, in_two_domains
-from calstudy.figures.panels import delay_panel, frequency_and_delay
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.plotting import style
+from calstudy.plotting.domains import TwoDomains, in_two_domains
+from calstudy.plotting.panels import delay_panel, frequency_and_delay
+from calstudy.products import calibration, corruption
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, departure_from_mean, rms_of
 
 ANTENNA_COLOURS = ((style.BLUE, "#003A5C"), (style.ORANGE, "#7A5300"))
 """Colours of true and of recovered gains, for each antenna."""
@@ -46,6 +51,15 @@ def compare_gains(
     """Compare true and recovered gains, (2, Nfreqs) complex, on channels `frequency` (Nfreqs,) Hz.
 
     The recovered gains must have their degeneracies fixed (overall scale and phase), or residuals mean nothing.
+
+    Parameters
+    ----------
+    antennas
+        The two antenna numbers.
+    frequency
+        Channel centres, Hz, (Nfreqs,).
+    true, recovered
+        Gains, complex, (2, Nfreqs).
     """
     if np.shape(true) != (2, frequency.size) or np.shape(recovered) != (2, frequency.size):
         raise ValueError(
@@ -71,7 +85,7 @@ def draw_gains(comparison: GainComparison, stand_ins: Sequence[str] = ()) -> Fig
         _draw_both(residuals, delays, comparison.residual, index, {"color": bright, "linestyle": ":", "linewidth": 1.0})
         axes.set_ylabel(rf"Re $g_{{{comparison.antennas[index]}}}$")
     ratio = comparison.correction
-    black = {"color": style.BLACK, "linestyle": ":"}
+    black: dict[str, Any] = {"color": style.BLACK, "linestyle": ":"}
     residuals.plot(ratio.frequency / 1e6, ratio.values.real, **black)
     delays.plot(ratio.delay * 1e9, np.abs(ratio.transform), **black)
     residuals.set_ylabel("Re residual")
@@ -89,9 +103,62 @@ def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: 
 def _add_legend(figure: Figure, antennas: tuple[int, int]) -> None:
     handles = []
     for number, (bright, dark) in zip(antennas, ANTENNA_COLOURS, strict=True):
-        for colour, line, label in ((bright, "-", "true"), (dark, "--", "recovered"), (bright, ":", "residual")):
-            handles.append(Line2D([], [], color=colour, linestyle=line, label=rf"$g_{{{number}}}$ {label}"))
+        looks: tuple[tuple[str, dict[str, Any]], ...] = (
+            ("true", {"color": bright, "linestyle": "-"}),
+            ("recovered", {"color": dark, "linestyle": "--"}),
+            ("residual", {"color": bright, "linestyle": ":"}),
+        )
+        handles += [Line2D([], [], label=rf"$g_{{{number}}}$ {name}", **look) for name, look in looks]
     a, b = antennas
     ratio = rf"$g_{{{a}}}g_{{{b}}}^*/(\hat{{g}}_{{{a}}}\hat{{g}}_{{{b}}}^*)-1$"
     handles.append(Line2D([], [], color=style.BLACK, linestyle=":", label=ratio))
     figure.legend(handles=handles, loc="outside upper center", ncols=7, columnspacing=1.1)
+
+
+def inspected(graph: Graph) -> dict[str, Any]:
+    """Return which antennas and integration the figures of single gains and baselines show."""
+    inspect = graph.experiment.outputs.inspect
+    return {
+        "layout": graph.experiment.instrument.layout,
+        "antennas": list(inspect.antennas),
+        "integration": inspect.integration,
+    }
+
+
+def inspected_calibration(graph: Graph) -> dict[str, Task]:
+    """Return the true gains and the calibration of `residual` that is looked at."""
+    experiment = graph.experiment
+    fitted = calibration.calibration(graph, experiment.variants["residual"], experiment.outputs.inspect.realization)
+    return {"gains": corruption.gains(graph), "calibration": fitted}
+
+
+class Gains(StudyFigure):
+    """True and fitted gains of two antennas in one integration."""
+
+    caption = "Gains of two antennas: true, recovered, and their ratio."
+    variants = ("residual",)
+    needs_calibration = True
+    tolerances = (
+        # The errors of the gains lie at small delays, far above their rms.
+        (r"(recovered|residual)\.transform", Drawn(rms_of("residual"), "the rms error of the gains", largest=12.0)),
+        (r"(recovered|residual)\..*", Drawn(rms_of("residual"), "the rms error of the gains")),
+        (r"correction\..*", Drawn(departure_from_mean, "the rms of the ratio about its mean")),
+    )
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return true gains and calibration."""
+        return inspected_calibration(graph)
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return which antennas and integration are shown."""
+        return inspected(graph)
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw true and fitted gains of two antennas."""
+        from calstudy.products.selection import layout_of, read_aligned_gains
+
+        numbers = layout_of(job.settings["layout"]).numbers[job.settings["antennas"]].tolist()
+        gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], job.settings["integration"])
+        rows = gains.rows(numbers)
+        comparison = compare_gains(tuple(numbers), gains.frequency, gains.true[rows], gains.fitted[rows])
+        return Drawing(draw_gains(comparison, stand_ins=job.settings["notes"]), comparison)

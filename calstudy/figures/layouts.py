@@ -1,85 +1,27 @@
-"""Array layouts side by side (the paper's Fig. LAYOUTS)."""
+"""The array layouts of two members of a collection side by side (the paper's Fig. LAYOUTS)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from scipy.spatial.distance import pdist
-
-from calstudy.figures import style
-
-NUMBERED_ANTENNAS = 64
-"""Arrays of more antennas than this are drawn without their numbers."""
+from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures.layout import draw_layouts, layout_panel
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
 
 
-@dataclass(frozen=True)
-class LayoutPanel:
-    """One array.
+class Layouts(ComparisonFigure):
+    """The arrays of the members that play the roles `minimally_redundant` and `redundant`."""
 
-    Attributes
-    ----------
-    title
-        Name of the array.
-    numbers
-        Antenna numbers, (Nants,) int.
-    enu
-        Antenna positions east, north, up, (Nants, 3) or without up (Nants, 2), metres.
-    highlight
-        Antenna numbers drawn in another colour.
-    """
+    caption = "The two arrays."
+    shows_sky = False
 
-    title: str
-    numbers: np.ndarray
-    enu: np.ndarray
-    highlight: tuple[int, ...] = ()
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return nothing: the settings say all."""
+        del graph
+        return {}
 
-
-@style.journal_style()
-def draw_layouts(panels: Sequence[LayoutPanel], stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw one or two arrays, east to the right and north up, in equal scales.
-
-    Raises
-    ------
-    ValueError
-        If there are not one or two panels, or positions and numbers of a panel do not match.
-    """
-    if len(panels) not in (1, 2):
-        raise ValueError(f"a layout figure has 1 or 2 panels, not {len(panels)}")
-    width, height = (style.ONE_COLUMN, 3.4) if len(panels) == 1 else (style.TWO_COLUMNS, 3.8)
-    figure = style.new_figure(width, height)
-    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        _draw_array(axes, panel)
-    style.note_stand_ins(figure, stand_ins)
-    return figure
-
-
-def _draw_array(axes: Axes, panel: LayoutPanel) -> None:
-    numbers, east_north = np.asarray(panel.numbers), np.asarray(panel.enu, dtype=float)[:, :2]
-    if numbers.shape != (len(east_north),):
-        raise ValueError(f"layout '{panel.title}': {numbers.size} antenna numbers for {len(east_north)} positions")
-    limits, extent = _square_limits(east_north)
-    axes_points = 72 * 2.7
-    spacing = pdist(east_north).min() if len(numbers) > 1 else extent
-    marker = float(np.clip(0.95 * spacing * axes_points / extent, 2.0, 13.0))
-    special = np.isin(numbers, panel.highlight)
-    for chosen, face in ((~special, "white"), (special, style.ORANGE)):
-        axes.plot(*east_north[chosen].T, "o", markersize=marker, markerfacecolor=face, markeredgecolor=style.BLUE)
-    if len(numbers) <= NUMBERED_ANTENNAS:
-        size = float(np.clip(0.62 * marker, 5.0, 6.5))
-        for number, position in zip(numbers, east_north, strict=True):
-            axes.annotate(str(number), position, ha="center", va="center_baseline", fontsize=size)
-    axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", title=panel.title)
-    axes.set(xlabel="east (m)", ylabel="north (m)")
-    axes.locator_params(nbins=6)
-
-
-def _square_limits(east_north: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return limits (2, 2) of a square around all antennas, and its side, in metres."""
-    low, high = east_north.min(axis=0), east_north.max(axis=0)
-    side = max(float((high - low).max()) * 1.14, 1.0)
-    centre = (low + high) / 2
-    return np.column_stack([centre - side / 2, centre + side / 2]), side
+    def draw(self, job: Job) -> Drawing:
+        """Draw the arrays from left to right."""
+        panels = [layout_panel(job.settings["layouts"][role], title) for role, title in self.titles.items()]
+        return Drawing(draw_layouts(panels, stand_ins=job.settings["notes"]), panels)

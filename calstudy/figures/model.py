@@ -2,15 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from matplotlib.figure import Figure
 
-from calstudy.figures import style
-from calstudy.figures.comparison import VisibilityComparison, draw_comparison
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.gains import inspected, inspected_calibration
+from calstudy.plotting import style
+from calstudy.plotting.visibility_comparison import (
+    Visibilities,
+    VisibilityComparison,
+    compare_visibilities,
+    draw_comparison,
+)
+from calstudy.products import corruption, simulation
+from calstudy.products.files import DATA, MODEL, VISIBILITIES
+from calstudy.products.graph import Graph, required
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, rms_of
 
 
 @style.journal_style()
 def draw_model(comparison: VisibilityComparison, stand_ins: Sequence[str] = ()) -> Figure:
     """Draw true foregrounds F (the reference) and their fitted model F̂, both without gains."""
     return draw_comparison(comparison, (r"true foregrounds $F$", r"fitted model $\widehat{F}$"), stand_ins)
+
+
+class Model(StudyFigure):
+    """True and fitted foregrounds of one baseline in one integration."""
+
+    caption = "Foregrounds of one baseline: true and fitted."
+    variants = ("residual", "noise")
+    needs_calibration = True
+    tolerances = (
+        (r"(model|residual)\..*", Drawn(rms_of("residual"), "the rms error of the model")),
+        (r"noise\..*", Drawn(rms_of("noise"), "the rms of the noise")),
+    )
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return gains, calibration, true foregrounds and noise."""
+        experiment = graph.experiment
+        noise = corruption.data(graph, experiment.variants["noise"], experiment.outputs.inspect.realization)
+        return {**inspected_calibration(graph), "foregrounds": required(simulation.foregrounds(graph)), "noise": noise}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return which baseline and integration are shown."""
+        return inspected(graph)
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the true foregrounds of a baseline and the fitted ones, on the scale of the true gains."""
+        from calstudy.products.selection import baseline, layout_of, read_aligned_gains, read_spectra
+
+        integration = job.settings["integration"]
+        pair, length = baseline(layout_of(job.settings["layout"]), job.settings["antennas"])
+        gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], integration)
+        paths = (
+            job.inputs["foregrounds"] / VISIBILITIES,
+            job.inputs["calibration"] / MODEL,
+            job.inputs["noise"] / DATA,
+        )
+        foregrounds, model, noise = (read_spectra(path, [pair])[0, integration] for path in paths)
+        shown = Visibilities(foregrounds, model / gains.scale**2, noise)
+        comparison = compare_visibilities(pair, length, gains.frequency, shown)
+        return Drawing(draw_model(comparison, stand_ins=job.settings["notes"]), comparison)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from calstudy.figures import style
-from calstudy.figures.domains import TwoDomains
-from calstudy.figures.panels import delay_panel
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.plotting import style
+from calstudy.plotting.domains import TwoDomains, in_two_domains
+from calstudy.plotting.panels import delay_panel
+from calstudy.products import corruption
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
 
 
 @style.journal_style()
@@ -19,11 +23,11 @@ def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6, stand_ins: Sequ
     Parameters
     ----------
     gains
-        Gains of shape (Nants, Nfreqs), see `calstudy.figures.domains.in_two_domains`.
+        Gains of shape (Nants, Nfreqs), see `calstudy.plotting.domains.in_two_domains`.
     max_delay
         Delays from -max_delay / 4 to max_delay are shown, seconds: Eq. REFGAIN has its peaks at positive delays.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
     """
     amplitude = np.abs(gains.transform)
     figure = style.new_figure(style.ONE_COLUMN, 2.7)
@@ -40,3 +44,22 @@ def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6, stand_ins: Sequ
     axes.legend(loc="upper right")
     style.note_stand_ins(figure, stand_ins)
     return figure
+
+
+class Reflections(StudyFigure):
+    """The true gains against delay."""
+
+    caption = "Delay transform of the true gains."
+    shows_sky = False
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the true gains."""
+        return {"gains": corruption.gains(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the delay transforms of the true gains."""
+        from calstudy.products.selection import read_gains
+
+        gains = read_gains(job.inputs["gains"])
+        shown = in_two_domains(gains.frequency, gains.values[0])
+        return Drawing(draw_reflections(shown, stand_ins=job.settings["notes"]), shown)

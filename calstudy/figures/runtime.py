@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from calstudy.bench.scaling import RuntimeSeries
-from calstudy.figures import style
+from calstudy.bench.scaling import RuntimeSeries, summarize_runtime
+from calstudy.experiment.model import Experiment
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.plotting import style
+from calstudy.products.files import read_json
+from calstudy.products.graph import Graph
+from calstudy.products.run_times import CASE
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import MACHINE
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA)
 MARKERS = ("o", "s", "D", "^")
+SHOWN = {
+    "paper-step": "paper's Adamax, step",
+    "adamax-step": "our Adamax, step",
+    "default-step": "default solver, step",
+    "default-solve": "default solver, solve",
+}
+"""What the figures show of what was timed."""
+AXES = {"rows": ("number of antennas", r"N_\mathrm{ant}"), "line": ("longest baseline (m)", r"b_\mathrm{max}")}
+CLOCKS = {"cpu": "one core", "gpu": "GPU"}
 MOST = 2 * len(COLOURS)
 """Series in one figure; the second four have open markers and broken lines."""
 
@@ -35,7 +52,7 @@ def draw_runtime(
     symbol
         The size in mathematical notation, for the fits in the legend: ``r"N_\mathrm{ant}"``.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
     time_label
         Label of the upright axis with its unit.
 
@@ -66,8 +83,53 @@ def draw_runtime(
 def _add_legend(figure: Figure, series: Sequence[RuntimeSeries], symbol: str) -> None:
     """Put one line per series above the axes: its marker on its fit, what it is, and the fitted exponent."""
     lines = figure.axes[0].get_lines()
-    handles = [(lines[2 * index + 1], lines[2 * index]) for index in range(len(series))]
+    # What matplotlib declares for a figure leaves out that a handle may be several artists.
+    handles: list[Any] = [(lines[2 * index + 1], lines[2 * index]) for index in range(len(series))]
     labels = [
         rf"{item.label} $\propto {symbol}^{{\,{item.fit.exponent:.2f} \pm {item.fit.error:.2f}}}$" for item in series
     ]
     figure.legend(handles, labels, loc="outside upper left", ncols=1)
+
+
+class Runtime(StudyFigure):
+    """Time per step, or per solve, of the solvers against the size of the array."""
+
+    caption = "Run time against the size of the array: medians, central 95 %, fitted powers."
+    tolerances = ((r".*", MACHINE),)
+
+    panel: Literal["rows", "line"] = "rows"
+
+    @property
+    def label(self) -> str:
+        """The name with the panel."""
+        return f"runtime-{self.panel}"
+
+    def refusal(self, experiment: Experiment) -> str:
+        """Refuse: an experiment times nothing."""
+        return "shows a run-time study, and cannot be drawn of an experiment"
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return nothing: the measurements are those of the study."""
+        return {}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the time per step against the number of antennas, or against the longest baseline."""
+        series = _series([read_json(folder / CASE) for folder in job.inputs.values()])
+        label, symbol = AXES[self.panel]
+        clock = "time" if len(series) > len(SHOWN) else "processor time"
+        figure = draw_runtime(series, label, symbol, job.settings["notes"], f"{clock} per step, or solve (s)")
+        notes = {item.label: f"{item.fit.exponent:.2f} ± {item.fit.error:.2f}" for item in series}
+        return Drawing(figure, series, notes)
+
+
+def _series(cases: Sequence[Mapping[str, Any]]) -> list[RuntimeSeries]:
+    """Return what is shown, solver after solver, for each device."""
+    devices = sorted({case["device"] for case in cases})
+    series = []
+    for device in devices:
+        found = sorted((case for case in cases if case["device"] == device), key=lambda case: case["size"])
+        sizes = [case["size"] for case in found]
+        for kind, label in SHOWN.items():
+            shown = label if len(devices) == 1 else f"{label}, {CLOCKS[device]}"
+            series.append(summarize_runtime(shown, sizes, [case["seconds"][kind] for case in found]))
+    return series

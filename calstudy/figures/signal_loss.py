@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,8 +12,15 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from calstudy.figures import style
-from calstudy.figures.cylinder import cells, delay_axis, draw_horizon, label_axes
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.plotting import style
+from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
+from calstudy.products import signal_loss
+from calstudy.products.files import spectrum_file
+from calstudy.products.graph import Graph, required
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import ERROR_OF_ERROR, Drawn, own_error, power_over_samples, typical_error
 
 if TYPE_CHECKING:
     from calstudy.power.transfer import TransferFunction, TransferMap
@@ -21,7 +28,7 @@ if TYPE_CHECKING:
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""
 TRANSFER = r"$T = P^{R}/P^{S}$"
-RETAINED = "outside, free of the flux scale"
+SCALE_FREE = "outside, free of the flux scale"
 MAP_COLOURS = "cividis"
 EMPTY = "0.8"
 
@@ -58,7 +65,7 @@ def draw_signal_loss(
     max_delay
         Upper end of the delay axis, s; all delays if None or larger than those.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
 
     Raises
     ------
@@ -83,15 +90,29 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
         (loss.inside, f"inside {where}", "s", style.ORANGE),
     ):
         draw_transfer(axes, part, label, marker, colour)
-    axes.plot(loss.outside.k, loss.outside.retained, color=style.BLUE, linewidth=0.7, zorder=1, label=RETAINED)
+    axes.plot(
+        loss.outside.k, loss.outside.squared_coherence, color=style.BLUE, linewidth=0.7, zorder=1, label=SCALE_FREE
+    )
     axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, _last_k(loss)), ylim=_limits(loss))
     handles, labels = axes.get_legend_handles_labels()
-    order = sorted(range(len(labels)), key=lambda index: labels[index] == RETAINED)
+    order = sorted(range(len(labels)), key=lambda index: labels[index] == SCALE_FREE)
     axes.legend([handles[index] for index in order], [labels[index] for index in order], loc="lower right")
 
 
 def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, colour: str) -> None:
-    """Draw one transfer function as points with 95 % bars at the centres of its bins."""
+    """Draw one transfer function as points with 95 % bars at the centres of its bins.
+
+    Parameters
+    ----------
+    axes
+        To draw on.
+    part
+        What is drawn; bins without modes are left out.
+    label
+        In the legend.
+    marker, colour
+        As matplotlib has them.
+    """
     known = np.isfinite(part.transfer)
     axes.errorbar(
         part.k[known],
@@ -128,3 +149,39 @@ def _draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, 
     delay_axis(axes, transfer)
     bar = figure.colorbar(ScalarMappable(norm, MAP_COLOURS), ax=axes, extend="max", pad=0.02, aspect=25)
     bar.set_label(TRANSFER)
+
+
+class SignalLossFigure(StudyFigure):
+    """The transfer function of the calibration, measured by injection."""
+
+    caption = "What the calibration leaves of the EoR: T = P^R / P^S, per k and per baseline length and delay."
+    variants = SIGNAL_LOSS_VARIANTS
+    needs_signal_loss = True
+    needs_calibration = True
+    tolerances = (
+        (r"map\..*", Drawn(typical_error, "its error bar, at least the median of its baseline length", largest=12.0)),
+        (r".*\.(transfer|coherence|retained)", Drawn(own_error, "its error bar", largest=12.0)),
+        (r".*_error", ERROR_OF_ERROR),
+        (r".*\.signal", Drawn(power_over_samples, "sample variance", largest=12.0)),
+    )
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the transfer functions."""
+        return {"transfer": required(signal_loss.transfer(graph))}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return where the wedge ends."""
+        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw T per k and per (|b|, tau)."""
+        from calstudy.power.tables import load_spectrum
+        from calstudy.power.transfer import TransferFunction, TransferMap
+
+        folder, name = job.inputs["transfer"], signal_loss.TRANSFER
+        outside, inside = (
+            load_spectrum(folder / spectrum_file(name, part), TransferFunction) for part in signal_loss.REGIONS
+        )
+        loss = SignalLoss(outside, inside, load_spectrum(folder / spectrum_file(name, "wedge"), TransferMap))
+        figure = draw_signal_loss(loss, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
+        return Drawing(figure, loss)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,10 +14,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
-from calstudy.figures import style
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.plotting import style
+from calstudy.products import spectra
+from calstudy.products.files import spectrum_file
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 if TYPE_CHECKING:
-    from calstudy.power.spherical import SphericalSpectrum
+    from calstudy.power.spectra import SphericalSpectrum
 
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""
@@ -89,7 +96,7 @@ def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stan
     zoom_k
         Upper end of the lower row's k axis, h/Mpc.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
 
     Raises
     ------
@@ -102,7 +109,7 @@ def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stan
         _check(column)
     width = style.ONE_COLUMN if len(columns) == 1 else style.TWO_COLUMNS
     figure = style.new_figure(width, 5.6)
-    figure.get_layout_engine().set(hspace=0.02, wspace=0.02)
+    figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
     grid = figure.subplots(2, len(columns), sharex="row", sharey="row", squeeze=False)
     for top, bottom, column in zip(*grid, columns, strict=True):
         _draw_column(top, column, tuple(MARKINGS))
@@ -204,18 +211,73 @@ def _k_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
 
 
 def _add_legend(figure: Figure, columns: Sequence[SphericalColumn]) -> None:
-    handles: list[Line2D | tuple[Patch, Line2D]] = []
+    handles: list[Any] = []
     labels: list[str] = []
     for name in LEGEND_ORDER:
         if _present(columns, (name,)):
             marking = MARKINGS[name]
-            shape = {"marker": marking.marker, "color": marking.colour, "markersize": marking.size + 0.8}
+            shape: dict[str, Any] = {
+                "marker": marking.marker,
+                "color": marking.colour,
+                "markersize": marking.size + 0.8,
+            }
             handles.append(Line2D([], [], linestyle="none", **shape))
             labels.append(marking.label)
     handles.append((Patch(color=style.BAND), Line2D([], [], color=style.GREY, linewidth=0.7)))
     labels.append(r"$P^{S}$, 95% sample variance")
-    open_marker = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
+    open_marker: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
     handles.append(Line2D([], [], linestyle="none", **open_marker))
     labels.append(r"open: $P < 0$")
-    spacing = {"columnspacing": 1.0, "handletextpad": 0.3}
+    spacing: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3}
     figure.legend(handles, labels, loc="outside upper center", ncols=7 if len(columns) == 2 else 3, **spacing)
+
+
+SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eor", "noise")
+"""The variants that are shown as far as the experiment has them."""
+
+
+def read_column(folder: Path, title: str, modes: str) -> SphericalColumn:
+    """Read the spherical spectra of all series that a product of stage `spectra` has, over one choice of modes.
+
+    Parameters
+    ----------
+    folder
+        Of the product.
+    title
+        Of the column.
+    modes
+        "all-modes" or "outside-wedge".
+    """
+    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.tables import load_spectrum
+
+    found = {name: folder / spectrum_file(name, modes) for name in SERIES}
+    series = {name: load_spectrum(path, SphericalSpectrum) for name, path in found.items() if path.exists()}
+    return SphericalColumn(title=title, **series)
+
+
+class Spherical(StudyFigure):
+    """Spherical power spectra over all modes, and outside the wedge."""
+
+    caption = "Spherical power spectra with 95 % bars; open where negative."
+    variants = ("eor",)
+    tolerances = SPHERICAL_RULES
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the averaged spectra."""
+        return {"spectra": spectra.spectra(graph)}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return where the wedge ends."""
+        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
+
+    def excised(self, job: Job) -> SphericalColumn:
+        """Read the spectra over the modes outside the wedge."""
+        title = f"outside wedge + {1e9 * job.settings['wedge_buffer']:.0f} ns"
+        return read_column(job.inputs["spectra"], title, "outside-wedge")
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a column for each choice of modes."""
+        everything = read_column(job.inputs["spectra"], "all modes", "all-modes")
+        columns = {"all_modes": everything, "excised": self.excised(job)}
+        return Drawing(draw_spherical(list(columns.values()), stand_ins=job.settings["notes"]), columns)

@@ -7,7 +7,10 @@ from dataclasses import replace
 
 from matplotlib.figure import Figure
 
-from calstudy.figures.spherical import SphericalColumn, draw_spherical
+from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures.spherical import SphericalColumn, draw_spherical, read_column
+from calstudy.run.task import Job
+from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 
 def draw_spherical_comparison(
@@ -20,9 +23,36 @@ def draw_spherical_comparison(
 
     The columns should average the same Fourier modes: those outside the wedge and its buffer. Their titles are
     replaced by the names of the arrays.
+
+    Parameters
+    ----------
+    minimally_redundant, redundant
+        Spectra of both arrays.
+    zoom_k
+        Upper end of the lower row's k axis, h/Mpc.
+    stand_ins
+        See `calstudy.plotting.style.note_stand_ins`.
     """
     columns = (
         replace(minimally_redundant, title="Minimally redundant"),
         replace(redundant, title="Redundant"),
     )
     return draw_spherical(columns, zoom_k, stand_ins)
+
+
+class SphericalComparison(ComparisonFigure):
+    """Spherical power spectra outside the wedge of the members in the roles `minimally_redundant` and `redundant`."""
+
+    caption = "Spherical power spectra outside the wedge, of both arrays; below, enlarged."
+    tolerances = SPHERICAL_RULES
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a column for each array."""
+        columns = {
+            role: read_column(job.inputs[f"spectra:{role}"], title, "outside-wedge")
+            for role, title in self.titles.items()
+        }
+        figure = draw_spherical_comparison(
+            columns["minimally_redundant"], columns["redundant"], stand_ins=job.settings["notes"]
+        )
+        return Drawing(figure, columns)

@@ -2,25 +2,51 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from calstudy.figures import style
+from calstudy.experiment.files import short_names
+from calstudy.experiment.model import Experiment
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
+from calstudy.plotting import style
+from calstudy.products import signal_loss
+from calstudy.products.files import spectrum_file
+from calstudy.products.graph import Graph, required
+from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
     from calstudy.power.transfer import TransferFunction
 
 SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
 """Marker and colour of each band of k, from small k up."""
+SKIES = "sky.eor.seed"
+"""The field whose values are further samples of the same thing, to be pooled."""
+COLUMNS_OF_SUMMARY = (
+    "point",
+    "changes",
+    "region",
+    "k from [h/Mpc]",
+    "k to [h/Mpc]",
+    "transfer",
+    "transfer error",
+    "cross transfer",
+    "cross transfer error",
+    "squared coherence",
+    "squared coherence error",
+    "baselines or groups",
+)
+SUMMARY = "summary.csv"
 COLUMNS = 2
 PANEL_HEIGHT = 1.9
 LABEL_WIDTH = 15
@@ -53,14 +79,14 @@ class SweepPanel:
 def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> Figure:
     """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
 
-    Dashes are C^2 / T: what is retained apart from the scale of the gains (see `calstudy.power.transfer`).
+    Dashes are the squared coherence C^2 / T, which is free of the scale of the gains (see `calstudy.power.transfer`).
 
     Parameters
     ----------
     panels
         At least one; at most five bands of k.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
 
     Raises
     ------
@@ -114,8 +140,8 @@ def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
             color=colour,
             elinewidth=0.7,
         )
-        retained = np.array([item.retained[band] for item in panel.transfers])
-        axes.plot(positions + shift, retained, "_", color=colour, markersize=7, linestyle=":", linewidth=0.6)
+        coherence = np.array([item.squared_coherence[band] for item in panel.transfers])
+        axes.plot(positions + shift, coherence, "_", color=colour, markersize=7, linestyle=":", linewidth=0.6)
     axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
     axes.set_xlim(-0.5, len(panel.values) - 0.5)
     axes.set_xticks(positions, [textwrap.fill(text, LABEL_WIDTH) for text in panel.values], fontsize=style.SMALL_SIZE)
@@ -126,7 +152,7 @@ def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
 
 def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> None:
     labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
-    handles = [
+    handles: list[Any] = [
         axes.errorbar([], [], yerr=[], fmt=marker, color=colour, elinewidth=0.7)
         for (marker, colour), _ in zip(SERIES, labels, strict=False)
     ]
@@ -134,3 +160,76 @@ def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> 
     handles.append(Line2D([], [], color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6))
     labels.append("free of the flux scale")
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)
+
+
+class Sweep(StudyFigure):
+    """The signal loss of all points of a sweep, with summary.csv: one row per point, region and band of k."""
+
+    caption = "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars."
+
+    def refusal(self, experiment: Experiment) -> str:
+        """Refuse: a single experiment has nothing to compare."""
+        return "compares the points of a sweep, and cannot be drawn of a single experiment"
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the signal loss of one point."""
+        return {"transfer": required(signal_loss.transfer(graph))}
+
+    def draw(self, job: Job) -> Drawing:
+        """Write summary.csv, and draw T against what was varied."""
+        blocks = job.settings["blocks"]
+        _write_summary(job.output / SUMMARY, [point for block in blocks for point in block], job.inputs)
+        panels = [_panel(block, job.inputs) for block in blocks]
+        return Drawing(draw_sweep(panels, stand_ins=job.settings["notes"]), {"panels": panels})
+
+
+def _bands(folder: Path, region: str) -> TransferFunction:
+    from calstudy.power.tables import load_spectrum
+    from calstudy.power.transfer import TransferFunction
+
+    return load_spectrum(folder / spectrum_file(signal_loss.BAND, region), TransferFunction)
+
+
+def _write_summary(path: Path, points: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS_OF_SUMMARY)
+        for point in points:
+            changes = "; ".join(f"{field} = {text}" for field, text in point["changes"].items())
+            for region in signal_loss.REGIONS:
+                found = _bands(folders[point["label"]], region)
+                columns = (
+                    found.bin_edges[:-1],
+                    found.bin_edges[1:],
+                    found.transfer,
+                    found.transfer_error,
+                    found.cross_transfer,
+                    found.cross_transfer_error,
+                    found.squared_coherence,
+                    found.squared_coherence_error,
+                    found.n_samples,
+                )
+                for row in zip(*(column.tolist() for column in columns), strict=True):
+                    writer.writerow([point["label"], changes, region, *row])
+
+
+def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> Any:
+    """Return one block as a panel: a category per combination of what varies, EoR skies of one combination pooled."""
+    from calstudy.power.transfer import pool
+
+    fields = list(block[0]["changes"])
+    varied = [field for field in fields if len({point["changes"][field] for point in block}) > 1] or fields[:1]
+    shown = [field for field in varied if field != SKIES] or varied
+    groups: dict[tuple[str, ...], list[TransferFunction]] = {}
+    for point in block:
+        category = tuple(point["changes"][field] for field in shown)
+        groups.setdefault(category, []).append(_bands(folders[point["label"]], "outside-wedge"))
+    names = short_names(fields)
+    fixed = [f"{names[field]} {block[0]['changes'][field]}" for field in fields if field not in varied]
+    skies = max(len(found) for found in groups.values())
+    return SweepPanel(
+        field=", ".join(shown),
+        note=", ".join(fixed + ([f"{skies} EoR skies"] if skies > 1 else [])),
+        values=[", ".join(category) for category in groups],
+        transfers=[pool(found) for found in groups.values()],
+    )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,11 +13,17 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from calstudy.figures import style
-from calstudy.figures.cylinder import cells, delay_axis, draw_horizon, label_axes
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.plotting import style
+from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
+from calstudy.products import spectra
+from calstudy.products.files import spectrum_file
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, cylindrical_error
 
 if TYPE_CHECKING:
-    from calstudy.power.wedge import WedgeSpectrum
+    from calstudy.power.spectra import CylindricalSpectrum
 
 # Yellow against blue: signs stay apart for every kind of colour vision, and both darken with |P|.
 POSITIVE = LinearSegmentedColormap.from_list(
@@ -45,11 +51,11 @@ class WedgePanels:
         P^N, thermal noise alone.
     """
 
-    uncorrupted: WedgeSpectrum
-    uncalibrated: WedgeSpectrum
-    residual: WedgeSpectrum
-    eor: WedgeSpectrum
-    noise: WedgeSpectrum
+    uncorrupted: CylindricalSpectrum
+    uncalibrated: CylindricalSpectrum
+    residual: CylindricalSpectrum
+    eor: CylindricalSpectrum
+    noise: CylindricalSpectrum
 
 
 TITLES = {
@@ -76,7 +82,7 @@ def draw_wedge(
     max_delay
         Upper end of the delay axis, seconds; all delays if None or larger than those.
     stand_ins
-        See `calstudy.figures.style.note_stand_ins`.
+        See `calstudy.plotting.style.note_stand_ins`.
 
     Raises
     ------
@@ -89,10 +95,10 @@ def draw_wedge(
     floor, highest, lowest = _colour_limits(spectra.values())
     norms = (LogNorm(floor, highest), LogNorm(floor, lowest))
     figure = style.new_figure(style.TWO_COLUMNS, 3.5)
-    figure.get_layout_engine().set(wspace=0.02, w_pad=0.02)
+    figure.set_layout_engine("constrained", wspace=0.02, w_pad=0.02)
     grid = figure.subplots(1, len(spectra), sharey=True)
     for axes, (name, spectrum) in zip(grid, spectra.items(), strict=True):
-        _draw_power(axes, spectrum, norms)
+        _draw_power(axes, spectrum, floor, norms)
         draw_horizon(axes, spectrum, buffer)
         label_axes(axes, spectrum, max_delay)
         axes.set_title(TITLES[name], pad=4)
@@ -104,7 +110,7 @@ def draw_wedge(
     return figure
 
 
-def _check(name: str, spectrum: WedgeSpectrum, delay: np.ndarray) -> None:
+def _check(name: str, spectrum: CylindricalSpectrum, delay: np.ndarray) -> None:
     shape = (len(spectrum.baseline_length), len(spectrum.delay))
     if spectrum.power.shape != shape:
         raise ValueError(f"wedge panel '{name}': power has shape {spectrum.power.shape}, its axes need {shape}")
@@ -115,7 +121,7 @@ def _check(name: str, spectrum: WedgeSpectrum, delay: np.ndarray) -> None:
         raise ValueError(f"wedge panel '{name}': its delays differ from those of 'uncorrupted'")
 
 
-def _colour_limits(spectra: Iterable[WedgeSpectrum]) -> tuple[float, float, float]:
+def _colour_limits(spectra: Iterable[CylindricalSpectrum]) -> tuple[float, float, float]:
     """Return the least |P| with a colour of its own, the largest P and the largest -P, in whole decades.
 
     The least is where a tenth of the faintest panel's values lie below.
@@ -128,19 +134,19 @@ def _colour_limits(spectra: Iterable[WedgeSpectrum]) -> tuple[float, float, floa
     return floor, highest, lowest
 
 
-def _draw_power(axes: Axes, spectrum: WedgeSpectrum, norms: tuple[LogNorm, LogNorm]) -> None:
+def _draw_power(axes: Axes, spectrum: CylindricalSpectrum, floor: float, norms: tuple[LogNorm, LogNorm]) -> None:
     x, y, power = cells(spectrum, spectrum.power.real)
     axes.set_facecolor(EMPTY)
     for sign, norm, colours in ((1, norms[0], POSITIVE), (-1, norms[1], NEGATIVE)):
         drawn = power >= 0 if sign > 0 else power < 0
         signed = np.ma.masked_where(~drawn, sign * power)
         # Fainter than the scale, exact zeros included, is not missing: it has the lowest colour.
-        axes.pcolormesh(x, y, np.ma.maximum(signed, norm.vmin), norm=norm, cmap=colours, rasterized=True)
+        axes.pcolormesh(x, y, np.ma.maximum(signed, floor), norm=norm, cmap=colours, rasterized=True)
 
 
 def _colour_bars(figure: Figure, grid: np.ndarray, norms: tuple[LogNorm, LogNorm]) -> None:
     columns = len(grid) - 2
-    settings = {"location": "bottom", "aspect": 30, "pad": 0.03, "fraction": 0.05}
+    settings: dict[str, Any] = {"location": "bottom", "aspect": 30, "pad": 0.03, "fraction": 0.05}
     for norm, colours, shared, label in (
         (norms[0], POSITIVE, grid[:columns], rf"$P > 0$ ({style.POWER_UNIT})"),
         (norms[1], NEGATIVE, grid[columns:], rf"$-P$ where $P < 0$ ({style.POWER_UNIT})"),
@@ -150,3 +156,37 @@ def _colour_bars(figure: Figure, grid: np.ndarray, norms: tuple[LogNorm, LogNorm
         bar.ax.xaxis.set_minor_locator(LogLocator(numticks=99))
         bar.ax.tick_params(which="both", direction="out")
         bar.set_label(label, labelpad=2)
+
+
+class Wedge(StudyFigure):
+    """Cylindrical power spectra of five variants of the data."""
+
+    caption = "Cylindrical power spectra; negative values in blue."
+    variants = ("uncorrupted", "uncalibrated", "residual", "eor", "noise")
+    needs_calibration = True
+    tolerances = (
+        (
+            r".*\.power",
+            # The power of few modes has an exponential distribution, with a longer tail than a Gaussian's.
+            Drawn(cylindrical_error, "noise + sample variance, and noise x foregrounds", largest=12.0),
+        ),
+    )
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the averaged spectra."""
+        return {"spectra": spectra.spectra(graph)}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return where the wedge ends."""
+        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a panel for each variant."""
+        from calstudy.power.spectra import CylindricalSpectrum
+        from calstudy.power.tables import load_spectrum
+
+        folder = job.inputs["spectra"]
+        files = {name: folder / spectrum_file(name, "wedge") for name in self.variants}
+        panels = WedgePanels(**{name: load_spectrum(file, CylindricalSpectrum) for name, file in files.items()})
+        figure = draw_wedge(panels, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
+        return Drawing(figure, panels)

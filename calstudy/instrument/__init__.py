@@ -1,1 +1,1 @@
-"""instrument"""
+"""The instrument: antenna layouts, beams, and the frequencies, times and baselines that it observes."""

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from calstudy.instrument.beams import Beam, make_beam
+from calstudy.instrument.beams import make_beam
+from calstudy.instrument.interface import Beam
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -64,7 +65,7 @@ def make_beams(settings: InstrumentSettings, n_antennas: int) -> Beam | AntennaB
     return AntennaBeams(beams, index) if len(beams) > 1 else beams[0]
 
 
-def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source, ...], np.ndarray]:
+def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source | Beam, ...], np.ndarray]:
     """Return the distinct beams of an array, and which of them each antenna of the telescope has, (Nants,) int."""
     if isinstance(beam, AntennaBeams):
         return beam.beams, beam.index

@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
-from calstudy.downloads import default_directory, download
-from calstudy.errors import InputError
+from calstudy.base.downloads import default_directory, download
+from calstudy.base.errors import InputError
 
 FILE = "mwa_full_embedded_element_pattern.h5"
 URL = f"http://ws.mwatelescope.org/static/{FILE}"
@@ -20,7 +20,7 @@ def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
     Parameters
     ----------
     directory
-        Where to put it, `calstudy.downloads.default_directory` by default; made if need be.
+        Where to put it, `calstudy.base.downloads.default_directory` by default; made if need be.
     progress
         Whether to show a progress bar.
 

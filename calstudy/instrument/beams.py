@@ -6,50 +6,25 @@ a visibility is V_xx = ½ ∫ A I exp(−2πi ν b·s/c) dΩ.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from pyuvdata import UVBeam
-from pyuvdata.analytic_beam import AiryBeam, AnalyticBeam, GaussianBeam, ShortDipoleBeam
+from pyuvdata.analytic_beam import AnalyticBeam
 from scipy.constants import speed_of_light
 from scipy.interpolate import CubicSpline
 
-from calstudy.instrument import settings as section
-from calstudy.instrument.tabulated import TabulatedBeam, read_beamfits, read_mwa_embedded_element
+from calstudy.base.plugins import Plugin, guarded
+from calstudy.instrument.interface import Beam, model_of
+from calstudy.instrument.settings import Channels
+from calstudy.instrument.tabulated import TabulatedBeam
 
 FEEDS = {"xx": 0, "yy": 1}
 ZENITH_ANGLES = np.linspace(0, np.pi / 2, 361)
 AZIMUTHS = np.linspace(0, 2 * np.pi, 180, endpoint=False)
-STAND_IN = "beam: {what}, not the MWA full embedded element of Sokolowski et al. (2017)"
 
 TILE_DIPOLES = 4
 TILE_SPACING = 1.1
 # Height of the bow-tie's centre above its image plane.
 TILE_HEIGHT = 0.278
-
-
-class Beam(Protocol):
-    """The primary beam of an antenna.
-
-    Attributes
-    ----------
-    name
-        Name of the beam.
-    stand_in
-        A note if it is not the beam of the paper, otherwise None.
-    """
-
-    name: str
-    stand_in: str | None
-
-    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
-        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)), feeds x (east-west) and y (north-south)."""
-
-    def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return Ω_p = ∫A dΩ and Ω_pp = ∫A² dΩ above the horizon, in sr, each of shape (Nfreqs,).
-
-        `frequencies` are in Hz; `polarization` is "xx" or "yy".
-        """
 
 
 class MwaTile(AnalyticBeam):
@@ -86,9 +61,9 @@ def _row_factor(wavenumber: np.ndarray) -> np.ndarray:
 class ExactBeam:
     """An analytic beam, evaluated at the requested directions and frequencies (`Beam`)."""
 
-    def __init__(self, analytic: AnalyticBeam, name: str, stand_in: str) -> None:
+    def __init__(self, analytic: AnalyticBeam, name: str, stand_in: str | None) -> None:
         self.name = name
-        self.stand_in = stand_in
+        self.stand_in: str | None = stand_in
         self._analytic = analytic
 
     def at(self, frequencies: np.ndarray) -> AnalyticBeam:
@@ -163,13 +138,13 @@ def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> tuple[float
     return first, second
 
 
-def make_beam(settings: section.Beam, channels: section.Channels | None = None) -> Beam:
+def make_beam(settings: Plugin, channels: Channels | None = None) -> Beam:
     """Return the beam that the `instrument.beam` section asks for.
 
     Parameters
     ----------
     settings
-        Any kind of beam section.
+        Any `BeamModel`.
     channels
         The channels of the observation, by default those of the paper. Tabulated beams are read and fitted over a
         slightly wider band, and do not accept frequencies outside it.
@@ -179,28 +154,5 @@ def make_beam(settings: section.Beam, channels: section.Channels | None = None) 
     InputError
         If a beam file is missing, cannot be read, or does not cover the channels.
     """
-    channels = section.Channels() if channels is None else channels
-    band = (channels.first, channels.first + (channels.count - 1) * channels.width)
-    if isinstance(settings, section.MwaEmbeddedBeam):
-        table = read_mwa_embedded_element(settings.path, band)
-        return GriddedBeam(TabulatedBeam(table, band, settings.interpolation), settings.kind, None)
-    if isinstance(settings, section.FileBeam):
-        table = TabulatedBeam(read_beamfits(settings.path), band, settings.interpolation)
-        return GriddedBeam(table, settings.path.name, STAND_IN.format(what=f"the file {settings.path.name}"))
-    return _exact(settings)
-
-
-def _exact(settings: section.Beam) -> ExactBeam:
-    if isinstance(settings, section.MwaAnalyticBeam):
-        return ExactBeam(MwaTile(), settings.kind, STAND_IN.format(what="an ideal 4 x 4 tile of short dipoles"))
-    if isinstance(settings, section.GaussianBeam):
-        # Half power at half the FWHM; the efield's sigma, for pyuvdata widens a power sigma again at every copy.
-        sigma = np.deg2rad(settings.fwhm_deg) / 2 / np.sqrt(np.log(2))
-        gaussian = GaussianBeam(
-            sigma=sigma, sigma_type="efield", spectral_index=-1.0, reference_frequency=settings.reference_frequency
-        )
-        return ExactBeam(gaussian, settings.kind, STAND_IN.format(what=f"a Gaussian of {settings.fwhm_deg:g}° FWHM"))
-    if isinstance(settings, section.AiryBeam):
-        airy = AiryBeam(diameter=settings.diameter)
-        return ExactBeam(airy, settings.kind, STAND_IN.format(what=f"a {settings.diameter:g} m Airy disk"))
-    return ExactBeam(ShortDipoleBeam(), settings.kind, STAND_IN.format(what="a short dipole"))
+    with guarded(settings):
+        return model_of(settings).make(Channels() if channels is None else channels)

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from astropy import units
 from astropy.coordinates import EarthLocation
-from pyuvdata import utils as uvutils
 from scipy.spatial.distance import pdist, squareform
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
 
 # The array centre in the metafits files of the observatory; given here because astropy looks up sites online.
@@ -137,7 +136,9 @@ def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
     tolerance
         Baselines that differ by less than this, in metres, are redundant.
     """
-    groups, _, _, _ = uvutils.redundancy.get_baseline_redundancies(
+    from pyuvdata.utils import redundancy
+
+    groups, _, _, _ = redundancy.get_baseline_redundancies(
         np.arange(len(vectors)), np.asarray(vectors, dtype=float), tol=tolerance, include_conjugates=True
     )
     index = np.empty(len(vectors), dtype=int)
@@ -150,11 +151,13 @@ def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
 
 def _mwa(settings: section.MwaLayout) -> Layout:
     """Tiles from the observatory positions that pyuvdata carries (ECEF relative to the array centre)."""
+    from pyuvdata.utils import ENU_from_ECEF
+
     with (files("pyuvdata") / "data" / "mwa_ant_pos.csv").open() as table:
         relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
     tiles = MWA_TILES[settings.kind][: settings.count]
     centre = np.array([axis.to_value("m") for axis in MWA_LOCATION.geocentric])
-    enu = uvutils.ENU_from_ECEF(centre + [relative[tile] for tile in COMPACT_TILES], center_loc=MWA_LOCATION)
+    enu = ENU_from_ECEF(centre + [relative[tile] for tile in COMPACT_TILES], center_loc=MWA_LOCATION)
     # The table's heights are above the ellipsoid, not the array centre (+377.83 m in all of them).
     enu[:, 2] -= enu[:, 2].mean()
     numbers = np.array([COMPACT_TILES.index(tile) for tile in tiles])

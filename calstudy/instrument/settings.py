@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 
-from calstudy.schema import Section, choice, fault
-from calstudy.units import Frequency, HourAngle, Length, Time
+from calstudy.base.plugins import Plugin, Registry
+from calstudy.base.schema import Section, choice, fault
+from calstudy.base.units import Frequency, HourAngle, Length, Time
 
 
 class MwaLayout(Section):
@@ -84,58 +85,9 @@ Layout = Annotated[
 ]
 
 
-class MwaEmbeddedBeam(Section):
-    """The MWA full embedded element beam (Sokolowski et al. 2017), pointed at zenith."""
-
-    kind: Literal["mwa-embedded-element"] = "mwa-embedded-element"
-    path: Path | None = Field(None, strict=False, description="Beam file; default: the file of the mwa_pb package.")
-    interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = Field(
-        "chebyshev",
-        description="Interpolation between tabulated frequencies, 1.28 MHz apart: `chebyshev` is a smooth fit, the "
-        "others go from point to point, as in the paper.",
-    )
-
-
-class MwaAnalyticBeam(Section):
-    """An ideal 4 x 4 MWA tile: array factor of short dipoles over a ground screen, pointed at zenith."""
-
-    kind: Literal["mwa-analytic"]
-
-
-class GaussianBeam(Section):
-    """A Gaussian power beam whose width scales with wavelength."""
-
-    kind: Literal["gaussian"]
-    fwhm_deg: float = Field(22.0, gt=0, lt=180, description="Full width at half maximum of the power beam, in degrees.")
-    reference_frequency: Frequency = Field(182.0e6, gt=0, description="Frequency at which the width is `fwhm_deg`.")
-
-
-class AiryBeam(Section):
-    """The beam of a uniformly illuminated circular aperture."""
-
-    kind: Literal["airy"]
-    diameter: Length = Field(4.0, gt=0)
-
-
-class DipoleBeam(Section):
-    """A short dipole."""
-
-    kind: Literal["short-dipole"]
-
-
-class FileBeam(Section):
-    """An E-field beam from a beamfits file, on a grid of azimuth and zenith angle."""
-
-    kind: Literal["beamfits"]
-    path: Path = Field(strict=False)
-    interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = "chebyshev"
-
-
-Beam = Annotated[
-    MwaEmbeddedBeam | MwaAnalyticBeam | GaussianBeam | AiryBeam | DipoleBeam | FileBeam,
-    Field(discriminator="kind"),
-    choice("kind", "mwa-embedded-element"),
-]
+BEAMS: Registry[Any] = Registry("beam", "calstudy.instrument.beam_models", "calstudy.instrument.interface:BeamModel")
+DEFAULT_BEAM = "mwa-embedded-element"
+Beam = Annotated[SerializeAsAny[Plugin], BEAMS.field(DEFAULT_BEAM)]
 
 
 class AntennaBeam(Section):
@@ -154,6 +106,11 @@ class Channels(Section):
     width: Frequency = Field(80e3, gt=0)
     count: int = Field(384, ge=8)
 
+    @property
+    def band(self) -> tuple[float, float]:
+        """Centres of the first and the last channel, Hz."""
+        return self.first, self.first + (self.count - 1) * self.width
+
 
 class Times(Section):
     """Equally spaced integrations; the default is the paper's (56 x 2 s from LST 1.8 h)."""
@@ -169,11 +126,9 @@ class InstrumentSettings(Section):
     """Positions and beams of the antennas, and times and frequencies of the observation."""
 
     layout: Layout = MwaLayout()
-    beam: Beam = MwaEmbeddedBeam()
-    # Left out where it is not used, so that it is no part of what identifies an array of like antennas.
+    beam: Beam = Field(default_factory=lambda: BEAMS.make(DEFAULT_BEAM))
     antenna_beams: dict[str, AntennaBeam] = Field(
         default_factory=dict,
-        exclude_if=lambda value: not value,
         description="Sets of antennas with another beam, with any names. Power spectra are normalized with `beam`.",
     )
     channels: Channels = Channels()
@@ -181,6 +136,10 @@ class InstrumentSettings(Section):
     polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(strict=False, min_length=1, max_length=2)] = Field(
         ("xx",), description="Linear polarizations, calibrated independently: xx (east-west dipoles), yy, or both."
     )
+
+    def without_beams(self) -> InstrumentSettings:
+        """Return the instrument with the default beam: for what reads antennas, channels and times only."""
+        return self.reset("beam", "antenna_beams")
 
     @model_validator(mode="after")
     def _polarizations_are_unique(self) -> InstrumentSettings:

@@ -11,7 +11,7 @@ from numpy.polynomial import chebyshev
 from pyuvdata import UVBeam
 from scipy.interpolate import interp1d
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.instrument.beam_file import find_beam
 
 PIXELS_PER_DEGREE = 1

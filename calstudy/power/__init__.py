@@ -1,1 +1,1 @@
-"""power"""
+"""Delay power spectra: estimators, error bars, averages over cylinders and spheres, and their cosmology."""

@@ -6,8 +6,8 @@ import numpy as np
 from astropy.time import Time
 from pyuvdata import UVData
 
+from calstudy.base.visibilities import require_rectangular
 from calstudy.instrument.telescope import use_bundled_earth_orientation
-from calstudy.visibilities import require_rectangular
 
 
 def fringe_stop_and_average(uvd: UVData) -> UVData:

@@ -6,7 +6,7 @@ hera_pspec has its own class with its own distances; `hera_conversions` makes on
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import astropy.cosmology
 import numpy as np
@@ -15,11 +15,13 @@ from astropy import units as u
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from calstudy.constants import HYDROGEN_LINE
+from calstudy.base.constants import HYDROGEN_LINE
 
 if TYPE_CHECKING:
     from astropy.cosmology import FLRW
     from hera_pspec.conversions import Cosmo_Conversions
+
+FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 
 def make_cosmology(name: str) -> FLRW:
@@ -29,7 +31,7 @@ def make_cosmology(name: str) -> FLRW:
     return getattr(astropy.cosmology, name)
 
 
-def redshift(frequency: float | np.ndarray) -> float | np.ndarray:
+def redshift(frequency: FloatOrArray) -> FloatOrArray:
     """Return the redshift at which the 21 cm line is observed at `frequency` (Hz)."""
     return HYDROGEN_LINE / frequency - 1.0
 
@@ -45,13 +47,33 @@ def radial_scale(cosmology: FLRW, z: float) -> float:
 
 
 def k_perpendicular(cosmology: FLRW, length: np.ndarray, frequency: float) -> np.ndarray:
-    """Return k_perp = 2 pi |b| / (lambda X) in h/Mpc for baseline lengths in m, any shape, at `frequency` (Hz)."""
+    """Return k_perp = 2 pi |b| / (lambda X) in h/Mpc.
+
+    Parameters
+    ----------
+    cosmology
+        Gives X and h.
+    length
+        Baseline lengths in m, any shape.
+    frequency
+        Hz.
+    """
     wavelengths = np.asarray(length) * frequency / constants.c.value
     return 2 * np.pi * wavelengths / transverse_scale(cosmology, redshift(frequency)) / cosmology.h
 
 
 def k_parallel(cosmology: FLRW, delay: np.ndarray, frequency: float) -> np.ndarray:
-    """Return k_par = 2 pi tau / Y in h/Mpc for delays in s, any shape, at the band centre `frequency` (Hz)."""
+    """Return k_par = 2 pi tau / Y in h/Mpc.
+
+    Parameters
+    ----------
+    cosmology
+        Gives Y and h.
+    delay
+        s, any shape.
+    frequency
+        Band centre in Hz.
+    """
     return 2 * np.pi * np.asarray(delay) / radial_scale(cosmology, redshift(frequency)) / cosmology.h
 
 

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from scipy.signal import windows
+
+from calstudy.base.constants import SPEED_OF_LIGHT
+
+FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 TAPERS = {
     "blackman-harris": windows.blackmanharris,
@@ -19,6 +25,11 @@ def make_taper(name: str, n_channels: int) -> np.ndarray:
     if name not in TAPERS:
         raise ValueError(f"taper {name!r} is unknown, allowed: {', '.join(TAPERS)}")
     return TAPERS[name](n_channels)
+
+
+def horizon_delay(length: FloatOrArray) -> FloatOrArray:
+    """Return the delay of the horizon |b|/c in s for baseline lengths in m, of the same shape."""
+    return length / SPEED_OF_LIGHT
 
 
 def delays(n_channels: int, channel_width: float) -> np.ndarray:

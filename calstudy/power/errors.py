@@ -19,17 +19,13 @@ Averages have fewer independent modes than modes:
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import constants
 from scipy.spatial import cKDTree
 
 from calstudy.power.delay import mode_correlation
-
-if TYPE_CHECKING:
-    from calstudy.power.spectra import DelaySpectra
-    from calstudy.power.spherical import SphericalSpectrum
+from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 
 NEGLIGIBLE = 1e-3
 """Correlations of powers below this are taken as zero."""
@@ -71,7 +67,21 @@ def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndar
 
 
 def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return how many independent modes of the signal each bin averages; parameters as in `noise_modes`."""
+    """Return how many independent modes of the signal each bin averages: sigma_S falls by its square root.
+
+    Parameters
+    ----------
+    spectra
+        The averaged spectra.
+    bins
+        Bin of each mode, (Nu, Nd) int, -1 for those left out.
+    n_bins
+        Number of bins.
+
+    Returns
+    -------
+    (n_bins,) float, zero for empty bins.
+    """
     first, second, correlation = _signal_correlation(spectra)
     return _effective_modes(spectra, bins, n_bins, (first, second, correlation))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from astropy import constants
@@ -16,12 +16,13 @@ from hera_pspec import UVPSpec
 from hera_pspec.pspecbeam import PSpecBeamFromArray
 from pyuvdata import UVData, utils
 
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
 from calstudy.power.optimal import DiagonalPSpecData
-from calstudy.visibilities import antenna_pairs, baseline_vectors
 
 if TYPE_CHECKING:
+    from calstudy.power.interface import PowerBeam
     from calstudy.power.settings import PowerSettings
 
 logger = logging.getLogger(__name__)
@@ -35,13 +36,6 @@ LARGEST_ANTENNA_NUMBER = 899
 """hera_pspec writes the numbers of four antennas, plus 100, into the twelve digits of one integer."""
 
 Baseline = tuple[int, int]
-
-
-class PowerBeam(Protocol):
-    """The part of the beam interface that the estimator uses (`calstudy.instrument.beams`)."""
-
-    def solid_angles(self, frequencies: np.ndarray, pol: str) -> tuple[np.ndarray, np.ndarray]:
-        """Integrals over the sky in sr of the power beam and of its square, (Nfreqs,) each, for "xx" or "yy"."""
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from calstudy.power.spherical import outside_wedge
+from calstudy.power.spectra import BaselineModes, outside_wedge
 
 
 @dataclass(frozen=True)
@@ -37,29 +37,7 @@ class ExpectedBins:
     by_length: np.ndarray = field(metadata={"unit": ""})
 
 
-@dataclass(frozen=True)
-class BaselineModes:
-    """Expected T of every baseline and delay, and where these modes are.
-
-    Attributes
-    ----------
-    transfer, error
-        (Nbls, Ndelays); NaN without data.
-    length, k_perp
-        m and h/Mpc, (Nbls,).
-    delay, k_parallel
-        s and h/Mpc, ascending, (Ndelays,).
-    """
-
-    transfer: np.ndarray
-    error: np.ndarray
-    length: np.ndarray
-    k_perp: np.ndarray
-    delay: np.ndarray
-    k_parallel: np.ndarray
-
-
-def bin_expected(modes: BaselineModes, edges: Sequence[float], buffer: float, length_bin: float) -> ExpectedBins:
+def bin_expected(modes: BaselineModes, edges: ArrayLike, buffer: float, length_bin: float) -> ExpectedBins:
     """Average over bins.
 
     Parameters

@@ -49,7 +49,7 @@ class DiagonalPSpecData(PSpecData):
         shared_key = ("weighting", self.taper, self.symmetric_taper, self._flag_weights(key).tobytes())
         if shared_key not in self._by_flags:
             self._by_flags[shared_key] = super().R(key)
-            self._R = {}
+            self._R: dict[tuple, np.ndarray] = {}
         return self._by_flags[shared_key]
 
     def get_G(self, key1: tuple, key2: tuple, exact_norm: bool = False, pol: bool = False) -> np.ndarray:

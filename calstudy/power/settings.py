@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 
-from calstudy.schema import Section
-from calstudy.units import Delay, Length, Wavenumber
+from calstudy.base.plugins import Plugin, Registry
+from calstudy.base.schema import Section
+from calstudy.base.units import Delay, Length, Wavenumber
+
+ESTIMATORS: Registry[Any] = Registry("estimator", "calstudy.power.estimators", "calstudy.power.interface:Estimator")
 
 
 class KBins(Section):
@@ -27,6 +30,10 @@ class KBins(Section):
 class PowerSettings(Section):
     """Cylindrical and spherical power spectra of calibrated visibilities."""
 
+    estimator: Annotated[SerializeAsAny[Plugin], ESTIMATORS.field("hera-pspec")] = Field(
+        default_factory=lambda: ESTIMATORS.make("hera-pspec"),
+        description="How delay spectra are made of two averaged data sets.",
+    )
     taper: Literal["blackman-harris", "hann", "tukey", "none"] = "blackman-harris"
     pairs: Literal["same-baseline", "redundant-group", "auto"] = Field(
         "auto",

@@ -1,4 +1,4 @@
-"""Delay spectra as plain arrays, the input of the cylindrical and spherical averages.
+"""Power spectra as plain arrays: per baseline and delay, and the cylindrical and spherical averages of them.
 
 A *unit* is one sample of the sky: a baseline crossed with itself, or a redundant group whose baselines are crossed with
 each other. The pairs of a unit share the signal; their noise products are independent.
@@ -6,7 +6,7 @@ each other. The pairs of a unit share the signal; their noise products are indep
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,11 +14,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
+from calstudy.power.delay import horizon_delay
+from calstudy.power.settings import PowerSettings
 
 if TYPE_CHECKING:
     from hera_pspec import UVPSpec
-
-    from calstudy.power.settings import PowerSettings
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,115 @@ class DelaySpectra:
         Name of the taper, see `calstudy.power.delay.TAPERS`.
     """
 
-    power: np.ndarray
-    vectors: np.ndarray
-    n_pairs: np.ndarray
-    n_polarizations: int
-    delay: np.ndarray
-    k_perp: np.ndarray
-    k_parallel: np.ndarray
-    frequency: float
-    omega_pp: float
-    taper: str
+    power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    vectors: np.ndarray = field(metadata={"unit": "m"})
+    n_pairs: np.ndarray = field(metadata={"unit": ""})
+    n_polarizations: int = field(metadata={"unit": ""})
+    delay: np.ndarray = field(metadata={"unit": "s"})
+    k_perp: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    frequency: float = field(metadata={"unit": "Hz"})
+    omega_pp: float = field(metadata={"unit": "sr"})
+    taper: str = field(metadata={"unit": ""})
 
     @property
     def length(self) -> np.ndarray:
         """Baseline lengths in m, (Nu,)."""
         return np.linalg.norm(self.vectors, axis=1)
+
+
+@dataclass(frozen=True)
+class BaselineModes:
+    """Expected T of every baseline and delay, and where these modes are.
+
+    Attributes
+    ----------
+    transfer, error
+        (Nbls, Ndelays); NaN without data.
+    length, k_perp
+        m and h/Mpc, (Nbls,).
+    delay, k_parallel
+        s and h/Mpc, ascending, (Ndelays,).
+    """
+
+    transfer: np.ndarray
+    error: np.ndarray
+    length: np.ndarray
+    k_perp: np.ndarray
+    delay: np.ndarray
+    k_parallel: np.ndarray
+
+
+@dataclass(frozen=True)
+class CylindricalSpectrum:
+    """A power spectrum in Nb bins of baseline length and Nd delays.
+
+    Attributes
+    ----------
+    baseline_length, k_perp
+        Mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
+    bin_edges
+        Lower and upper edge of each bin, (Nb, 2), m.
+    delay, k_parallel
+        (Nd,) ascending, s and h/Mpc; from zero up if folded.
+    power
+        Mean over the pairs of baselines in each bin, (Nb, Nd) complex; the real part estimates P(k).
+    n_pairs
+        Pairs of baselines averaged, (Nb,) int.
+    horizon_delay
+        |b|/c, the edge of the wedge, (Nb,), s.
+    """
+
+    baseline_length: np.ndarray = field(metadata={"unit": "m"})
+    bin_edges: np.ndarray = field(metadata={"unit": "m"})
+    k_perp: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    delay: np.ndarray = field(metadata={"unit": "s"})
+    k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    n_pairs: np.ndarray = field(metadata={"unit": ""})
+    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
+
+
+@dataclass(frozen=True)
+class SphericalSpectrum:
+    """A power spectrum in Nk bins of |k|. Empty bins hold NaN power and zero modes.
+
+    Attributes
+    ----------
+    k, bin_edges
+        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc. A bin holds what is above its lower and not above its upper edge.
+    power
+        Mean over modes, (Nk,) complex; the real part estimates P(k).
+    n_modes
+        Modes (baseline or redundant group, and delay) averaged, (Nk,) int.
+    noise_modes, sample_modes
+        Independent modes of noise and of signal among them, (Nk,); see `calstudy.power.errors`.
+    noise_error, sample_error
+        Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.errors.with_errors`.
+    wedge_excluded
+        Whether modes inside the wedge were left out.
+    """
+
+    k: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    n_modes: np.ndarray = field(metadata={"unit": ""})
+    noise_modes: np.ndarray = field(metadata={"unit": ""})
+    sample_modes: np.ndarray = field(metadata={"unit": ""})
+    noise_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    sample_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    wedge_excluded: bool = field(metadata={"unit": ""})
+
+    @property
+    def error(self) -> np.ndarray:
+        """sigma_P = sigma_N + sigma_S, one standard deviation, (Nk,)."""
+        return self.noise_error + self.sample_error
+
+
+def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndarray:
+    """Return which modes lie outside the wedge: |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool."""
+    horizon = horizon_delay(modes.length)
+    return np.abs(modes.delay) > horizon[:, None] + buffer
 
 
 def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
@@ -102,7 +196,7 @@ def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
 
 
 def _units(uvp: UVPSpec, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the units, baselines connected by `pairs` (Npairs, 2): unit of each pair, mean vector of each unit."""
+    """Return the unit of each pair and the mean vector of each unit: units are baselines connected by `pairs`."""
     baselines, positions = np.unique(pairs, return_inverse=True)
     first, second = positions.reshape(pairs.shape).T
     graph = coo_array((np.ones(first.size), (first, second)), shape=(baselines.size, baselines.size))

@@ -2,66 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
-
 import numpy as np
-from astropy import constants
 
 from calstudy.power.errors import noise_modes, sample_modes
-
-if TYPE_CHECKING:
-    from calstudy.power.expected import BaselineModes
-    from calstudy.power.settings import KBins, PowerSettings
-    from calstudy.power.spectra import DelaySpectra
-
-
-@dataclass(frozen=True)
-class SphericalSpectrum:
-    """A power spectrum in Nk bins of |k|. Empty bins hold NaN power and zero modes.
-
-    Attributes
-    ----------
-    k, bin_edges
-        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc. A bin holds what is above its lower and not above its upper edge.
-    power
-        Mean over modes, (Nk,) complex; the real part estimates P(k).
-    n_modes
-        Modes (baseline or redundant group, and delay) averaged, (Nk,) int.
-    noise_modes, sample_modes
-        Independent modes of noise and of signal among them, (Nk,); see `calstudy.power.errors`.
-    noise_error, sample_error
-        Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.errors.with_errors`.
-    wedge_excluded
-        Whether modes inside the wedge were left out.
-    """
-
-    k: np.ndarray = field(metadata={"unit": "h/Mpc"})
-    bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
-    power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
-    n_modes: np.ndarray = field(metadata={"unit": ""})
-    noise_modes: np.ndarray = field(metadata={"unit": ""})
-    sample_modes: np.ndarray = field(metadata={"unit": ""})
-    noise_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
-    sample_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
-    wedge_excluded: bool = field(metadata={"unit": ""})
-
-    @property
-    def error(self) -> np.ndarray:
-        """sigma_P = sigma_N + sigma_S, one standard deviation, (Nk,)."""
-        return self.noise_error + self.sample_error
+from calstudy.power.settings import KBins, PowerSettings
+from calstudy.power.spectra import DelaySpectra, SphericalSpectrum, outside_wedge
 
 
 def make_bin_edges(bins: KBins) -> np.ndarray:
     """Return the edges in h/Mpc of equal bins from ``bins.min`` up to at least ``bins.max``, shape (Nk + 1,)."""
     count = int(np.ceil((bins.max - bins.min) / bins.width - 1e-9))
     return bins.min + bins.width * np.arange(count + 1)
-
-
-def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndarray:
-    """Return which modes have |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool, for Nu lengths and Nd delays."""
-    horizon = modes.length / constants.c.value
-    return np.abs(modes.delay) > horizon[:, None] + buffer
 
 
 def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool) -> SphericalSpectrum:

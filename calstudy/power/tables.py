@@ -1,4 +1,4 @@
-"""Files of averaged power spectra: HDF5 with units, and CSV."""
+"""Files of power spectra: HDF5 with units, and CSV."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ import csv
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 
-from calstudy.power.spherical import SphericalSpectrum
+from calstudy.power.expected import ExpectedBins
+from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.power.transfer import TransferFunction, TransferMap
-from calstudy.power.wedge import WedgeSpectrum
 
-Spectrum = TypeVar("Spectrum", SphericalSpectrum, WedgeSpectrum, TransferFunction, TransferMap)
+Spectrum = TypeVar(
+    "Spectrum", DelaySpectra, SphericalSpectrum, CylindricalSpectrum, TransferFunction, TransferMap, ExpectedBins
+)
 
 CSV_COLUMNS = {
     "k [h/Mpc]": lambda s: s.k,
@@ -35,10 +37,10 @@ TRANSFER_COLUMNS = {
     "k to [h/Mpc]": lambda t: t.bin_edges[1:],
     "transfer": lambda t: t.transfer,
     "transfer error": lambda t: t.transfer_error,
-    "coherence": lambda t: t.coherence,
-    "coherence error": lambda t: t.coherence_error,
-    "retained": lambda t: t.retained,
-    "retained error": lambda t: t.retained_error,
+    "cross transfer": lambda t: t.cross_transfer,
+    "cross transfer error": lambda t: t.cross_transfer_error,
+    "squared coherence": lambda t: t.squared_coherence,
+    "squared coherence error": lambda t: t.squared_coherence_error,
     "baselines or groups": lambda t: t.n_samples,
 }
 
@@ -64,8 +66,14 @@ def load_spectrum(path: Path, kind: type[Spectrum]) -> Spectrum:
         found = file.attrs.get("kind")
         if found != kind.__name__:
             raise ValueError(f"{path} holds {found!r}, expected {kind.__name__!r}")
-        values = {item.name: file[item.name][()] for item in dataclasses.fields(kind)}
-    return kind(**{name: value.item() if np.ndim(value) == 0 else value for name, value in values.items()})
+        values = {item.name: _value(file[item.name]) for item in dataclasses.fields(kind)}
+    return kind(**values)
+
+
+def _value(data: h5py.Dataset) -> Any:
+    if h5py.check_string_dtype(data.dtype) is not None:
+        return data.asstr()[()]
+    return data[()].item() if data.shape == () else data[()]
 
 
 def write_csv(path: Path, spectrum: SphericalSpectrum) -> None:

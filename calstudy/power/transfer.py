@@ -16,19 +16,23 @@ powers, P^{R_with} - P^{R_without}, has the same mean, but also the scatter of t
 residuals. These cancel in D, up to the change of the gains (S / F, 1e-4) times the noise. T is computed from cross
 powers of even and odd data, so that the remaining noise in D gives no bias.
 
-The normalized cross power with the signal is C(k) = Re <S* D> / P^S (`coherence` in code and tables). If a calibration
-projects (D = M S with M = M* = M^2) and S is white, <D* D> = <S* M* M S> = <S* M S>: C and T are equal, and are the
-fraction of the mode that the fit cannot absorb.
+The *cross transfer* uses the cross power of signal and response instead,
+
+    C(k) = Re <S* D> / P^S,
+
+the coefficient of the linear regression of D on S. If a calibration projects (D = M S with M = M* = M^2) and S is
+white, <D* D> = <S* M* M S> = <S* M S>: C and T are equal, and are the fraction of the mode that the fit cannot absorb.
 
 The flux scale of a calibration is not determined by the fit: gains times sqrt(s) and a model divided by s fit as well.
 The prior that fixes s (in the paper, on the summed model) has an error of some per cent. It multiplies the residual by
-1/s, hence C by 1/s and T by 1/s^2, which is a part of P^R / P^S but not a loss. The combination
+1/s, hence C by 1/s and T by 1/s^2, which is a part of P^R / P^S but not a loss. The *squared coherence* of response and
+signal,
 
-    retained = C^2 / T = <S* D>^2 / (<S* S> <D* D>),
+    C^2 / T = (Re <S* D>)^2 / (<S* S> <D* D>),
 
-the squared coherence of residual and signal, does not depend on it: it is 1 if only the scale was changed, and for a
-projection of white S the fraction that remains. (Between different baselines of a redundant group C^2 / T does not
-depend on the scale either, but is not such a fraction.)
+does not depend on it: it is 1 if only the scale was changed. If each baseline is crossed with itself, it is the
+fraction of the power that remains after a projection of white S. Between different baselines of a redundant group it
+does not depend on the scale either, but is not such a fraction.
 
 Numerator and denominator contain the same sky, so that most of the sample variance cancels. The rest is estimated from
 the scatter of independent samples within a bin, where each baseline or redundant group is one sample (one patch of the
@@ -46,18 +50,22 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from astropy import constants
+from numpy.typing import ArrayLike
 
-from calstudy.power.spherical import outside_wedge
+from calstudy.power.delay import horizon_delay
+from calstudy.power.spectra import outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
-    from calstudy.power.spectra import DelaySpectra
-    from calstudy.power.spherical import SphericalSpectrum
+    from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 
 BANDS = (0.1, 0.2, 0.3, 0.5, 1.0)
 """Edges in h/Mpc of the wide bins in which studies are compared."""
+
+
+# The key `array` in the metadata of a field is its name among the arrays of a figure, where published figures have
+# another one than the field (see `calstudy.figures.save.figure_arrays`).
 
 
 @dataclass(frozen=True)
@@ -70,10 +78,11 @@ class TransferFunction:
         Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
     transfer, transfer_error
         T = P^D / P^S and its standard deviation, (Nk,).
-    coherence, coherence_error
+    cross_transfer, cross_transfer_error
         C = Re <S* D> / P^S and its standard deviation, (Nk,).
-    retained, retained_error
-        C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,).
+    squared_coherence, squared_coherence_error
+        C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,). Of spectra of each
+        baseline with itself it is the fraction of the power that is retained.
     signal
         Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins.
     n_samples
@@ -84,10 +93,10 @@ class TransferFunction:
     bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
     transfer: np.ndarray = field(metadata={"unit": ""})
     transfer_error: np.ndarray = field(metadata={"unit": ""})
-    coherence: np.ndarray = field(metadata={"unit": ""})
-    coherence_error: np.ndarray = field(metadata={"unit": ""})
-    retained: np.ndarray = field(metadata={"unit": ""})
-    retained_error: np.ndarray = field(metadata={"unit": ""})
+    cross_transfer: np.ndarray = field(metadata={"unit": "", "array": "coherence"})
+    cross_transfer_error: np.ndarray = field(metadata={"unit": "", "array": "coherence_error"})
+    squared_coherence: np.ndarray = field(metadata={"unit": "", "array": "retained"})
+    squared_coherence_error: np.ndarray = field(metadata={"unit": "", "array": "retained_error"})
     signal: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     n_samples: np.ndarray = field(metadata={"unit": ""})
 
@@ -104,7 +113,7 @@ class TransferMap:
         Lower and upper edge of each bin, (Nb, 2), m.
     delay, k_parallel
         (Nd,) ascending, s and h/Mpc.
-    transfer, transfer_error, coherence, coherence_error
+    transfer, transfer_error, cross_transfer, cross_transfer_error
         As in `TransferFunction`, (Nb, Nd). A baseline's two signs of the delay are two samples.
     horizon_delay
         |b|/c, the edge of the wedge, (Nb,), s.
@@ -117,8 +126,8 @@ class TransferMap:
     k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
     transfer: np.ndarray = field(metadata={"unit": ""})
     transfer_error: np.ndarray = field(metadata={"unit": ""})
-    coherence: np.ndarray = field(metadata={"unit": ""})
-    coherence_error: np.ndarray = field(metadata={"unit": ""})
+    cross_transfer: np.ndarray = field(metadata={"unit": "", "array": "coherence"})
+    cross_transfer_error: np.ndarray = field(metadata={"unit": "", "array": "coherence_error"})
     horizon_delay: np.ndarray = field(metadata={"unit": "s"})
 
 
@@ -173,7 +182,7 @@ def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
     return response
 
 
-def spherical_transfer(injection: Injection, edges: Sequence[float], buffer: float, inside: bool) -> TransferFunction:
+def spherical_transfer(injection: Injection, edges: ArrayLike, buffer: float, inside: bool) -> TransferFunction:
     """Return T in bins of |k|, outside or inside the wedge.
 
     Parameters
@@ -193,16 +202,17 @@ def spherical_transfer(injection: Injection, edges: Sequence[float], buffer: flo
     bins[(bins >= limits.size - 1) | (outside_wedge(signal, buffer) == inside)] = -1
     samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
     sums = _Sums.of(injection, bins, samples, limits.size - 1)
-    transfer, coherence, retained = sums.ratio(sums.response), sums.ratio(sums.cross), sums.retained()
+    transfer, cross_transfer = sums.ratio(sums.response), sums.ratio(sums.cross)
+    squared_coherence = sums.squared_coherence()
     return TransferFunction(
         k=(limits[1:] + limits[:-1]) / 2,
         bin_edges=limits,
         transfer=transfer[0],
         transfer_error=transfer[1],
-        coherence=coherence[0],
-        coherence_error=coherence[1],
-        retained=retained[0],
-        retained_error=retained[1],
+        cross_transfer=cross_transfer[0],
+        cross_transfer_error=cross_transfer[1],
+        squared_coherence=squared_coherence[0],
+        squared_coherence_error=squared_coherence[1],
         signal=sums.total(sums.signal),
         n_samples=sums.n_samples,
     )
@@ -219,7 +229,7 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
     samples = 2 * np.arange(row.size)[:, None] + (step < 0)
     shape = (lengths.size, column.max() + 1)
     sums = _Sums.of(injection, bins, samples, lengths.size * shape[1])
-    transfer, coherence = sums.ratio(sums.response), sums.ratio(sums.cross)
+    transfer, cross_transfer = sums.ratio(sums.response), sums.ratio(sums.cross)
     pairs = np.bincount(row, signal.n_pairs)
     length = np.bincount(row, signal.n_pairs * signal.length) / pairs
     return TransferMap(
@@ -230,9 +240,9 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
         k_parallel=np.bincount(column, np.abs(signal.k_parallel)) / np.bincount(column),
         transfer=transfer[0].reshape(shape),
         transfer_error=transfer[1].reshape(shape),
-        coherence=coherence[0].reshape(shape),
-        coherence_error=coherence[1].reshape(shape),
-        horizon_delay=length / constants.c.value,
+        cross_transfer=cross_transfer[0].reshape(shape),
+        cross_transfer_error=cross_transfer[1].reshape(shape),
+        horizon_delay=horizon_delay(length),
     )
 
 
@@ -278,7 +288,7 @@ class _Sums:
         value = self.total(numerator) / total
         return value, self._scatter((numerator - value[self.owner] * self.signal) / total[self.owner])
 
-    def retained(self) -> tuple[np.ndarray, np.ndarray]:
+    def squared_coherence(self) -> tuple[np.ndarray, np.ndarray]:
         """Return C^2 / T in each bin, and its standard deviation."""
         signal, response, cross = (self.total(part) for part in (self.signal, self.response, self.cross))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -331,10 +341,10 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
         first,
         transfer=mean("transfer"),
         transfer_error=error("transfer_error"),
-        coherence=mean("coherence"),
-        coherence_error=error("coherence_error"),
-        retained=mean("retained"),
-        retained_error=error("retained_error"),
+        cross_transfer=mean("cross_transfer"),
+        cross_transfer_error=error("cross_transfer_error"),
+        squared_coherence=mean("squared_coherence"),
+        squared_coherence_error=error("squared_coherence_error"),
         signal=total,
         n_samples=np.sum([item.n_samples for item in transfers], axis=0),
     )

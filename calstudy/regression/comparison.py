@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from calstudy.claims.computation import COMPUTATION
-from calstudy.claims.statement import Claim
-from calstudy.regression.tolerances import ROUNDING, Arrays, Drawn, Fixed, Measured, tolerance
+from calstudy.experiment.model import FIGURES
+from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.tolerances import ROUNDING, Arrays, Drawn, Fixed, Measured, Rules, tolerance
 
 Status = Literal["same", "moved", "beyond"]
 CLAIM_SIGMAS = 3.0
@@ -28,12 +28,12 @@ class ArrayComparison:
     status
         "same" to rounding, "moved" within the tolerance, or "beyond" it.
     relative
-        Largest difference over the largest magnitude of the reference; None if it cannot be told.
+        Largest difference over the largest magnitude of the reference; None if there is none.
     largest, rms, shift
-        In σ, see `calstudy.regression.tolerances.Drawn`; None for arrays that are not drawn.
+        In σ, see `calstudy.verdicts.tolerances.Drawn`; None for arrays that are not drawn.
     tolerance, why
         What was allowed, and why.
-    told
+    problem
         What is wrong besides numbers: another shape, an array that is missing or new; or empty.
     """
 
@@ -46,7 +46,7 @@ class ArrayComparison:
     shift: float | None
     tolerance: str
     why: str
-    told: str = ""
+    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,62 +62,96 @@ class ClaimComparison:
     sigmas: float | None
 
 
-def compare_figures(reference: Mapping[str, Arrays], made: Mapping[str, Arrays]) -> list[ArrayComparison]:
+def rules_of(figure: str, declared: Mapping[str, Rules] | None = None) -> Rules:
+    """Return the tolerances that a figure declares.
+
+    Parameters
+    ----------
+    figure
+        Its label: the name of its files.
+    declared
+        Tolerances by label, of the figures that the reference's experiment names; any other figure is looked for among
+        the built-in and installed ones, where its label may add a word to its name. None are known of one that is
+        nowhere.
+    """
+    if declared and figure in declared:
+        return declared[figure]
+    names = FIGURES.names()
+    found = next((name for name in (figure, figure.rpartition("-")[0]) if name in names), None)
+    return FIGURES.find(found).tolerances if found else ()
+
+
+def compare_figures(
+    reference: Mapping[str, Arrays], made: Mapping[str, Arrays], declared: Mapping[str, Rules] | None = None
+) -> list[ArrayComparison]:
     """Compare figures, each a mapping of arrays by name, with the reference of the same name.
 
     A figure or array that only the reference has is beyond any tolerance; one that only the new results have, moved.
+    `declared` is as for `rules_of`.
+
+    Parameters
+    ----------
+    reference, made
+        Arrays by name, by label of the figure.
+    declared
+        As for `rules_of`.
     """
     found = []
     for figure in dict.fromkeys([*reference, *made]):
-        old, new = reference.get(figure, {}), made.get(figure, {})
+        old, new, rules = reference.get(figure, {}), made.get(figure, {}), rules_of(figure, declared)
         for name in dict.fromkeys([*old, *new]):
             if name not in new:
-                anything = isinstance(tolerance(figure, name, old), Measured)
-                found.append(_told(figure, name, "moved" if anything else "beyond", "missing"))
+                anything = isinstance(tolerance(rules, name, old), Measured)
+                found.append(_without_numbers(figure, name, "moved" if anything else "beyond", "missing"))
             elif name not in old:
-                found.append(_told(figure, name, "moved", "new, the reference does not have it"))
+                found.append(_without_numbers(figure, name, "moved", "new, the reference does not have it"))
             else:
-                found.append(compare_array(figure, name, old, new[name]))
+                found.append(compare_array(figure, name, old, new[name], rules))
     return found
 
 
-def _told(figure: str, name: str, status: Status, told: str) -> ArrayComparison:
-    return ArrayComparison(figure, name, status, None, None, None, None, "", "", told)
+def _without_numbers(figure: str, name: str, status: Status, problem: str) -> ArrayComparison:
+    return ArrayComparison(figure, name, status, None, None, None, None, "", "", problem)
 
 
-def compare_array(figure: str, name: str, reference: Arrays, made: np.ndarray) -> ArrayComparison:
+def compare_array(
+    figure: str, name: str, reference: Arrays, made: np.ndarray, rules: Rules | None = None
+) -> ArrayComparison:
     """Compare one array of a figure.
 
     Parameters
     ----------
     figure, name
-        Which; they decide the tolerance.
+        Which.
     reference
         All reference arrays of the figure, from which error bars are taken.
     made
         The array to compare.
+    rules
+        Tolerances of the figure; by default those of the figure of that name.
     """
     old = reference[name]
-    rule = tolerance(figure, name, reference)
+    rule = tolerance(rules_of(figure) if rules is None else rules, name, reference)
     anything = isinstance(rule, Measured)
     if old.shape != made.shape:
-        return _told(figure, name, "moved" if anything else "beyond", f"shape {made.shape}, was {old.shape}")
+        return _without_numbers(figure, name, "moved" if anything else "beyond", f"shape {made.shape}, was {old.shape}")
     if old.dtype.kind not in "fc" or made.dtype.kind not in "fc":
         equal = np.array_equal(old, made)
-        told = "" if equal else "different"
+        problem = "" if equal else "different"
         status: Status = "same" if equal else "moved" if anything else "beyond"
-        return ArrayComparison(figure, name, status, None, None, None, None, "equal", rule.why, told)
+        return ArrayComparison(figure, name, status, None, None, None, None, "equal", rule.why, problem)
     if not np.array_equal(np.isfinite(old), np.isfinite(made)):
-        return _told(figure, name, "moved" if anything else "beyond", "finite in other places")
+        return _without_numbers(figure, name, "moved" if anything else "beyond", "finite in other places")
     relative = _relative(old, made)
     deviations = _deviations(rule, reference, name, made) if isinstance(rule, Drawn) else None
     if relative <= ROUNDING and (deviations is None or deviations[0] <= ROUNDING):
         status = "same"
-    elif isinstance(rule, Fixed) or (isinstance(rule, Drawn) and _too_far(rule, deviations)):
+    elif isinstance(rule, Fixed) or (isinstance(rule, Drawn) and deviations and _too_far(rule, deviations)):
         status = "beyond"
     else:
         status = "moved"
-    return ArrayComparison(figure, name, status, relative, *(deviations or (None,) * 3), str(rule), rule.why)
+    largest, rms, shift = deviations or (None, None, None)
+    return ArrayComparison(figure, name, status, relative, largest, rms, shift, str(rule), rule.why)
 
 
 def _too_far(rule: Drawn, deviations: tuple[float, float, float]) -> bool:
@@ -154,32 +188,41 @@ def _deviations(rule: Drawn, reference: Arrays, name: str, made: np.ndarray) -> 
     )
 
 
-def compare_claims(reference: Sequence[Claim], made: Sequence[Claim]) -> list[ClaimComparison]:
+def compare_claims(
+    reference: Sequence[Verdict], made: Sequence[Verdict], on_machines: bool = False
+) -> list[ClaimComparison]:
     """Compare claims by name.
 
     Another verdict is beyond if the number moved by more than three of its uncertainties, or has none; nearer than
-    that another draw of the noise changes it as well. So is a claim that is missing, or is no longer evaluated.
-    Claims on run time and memory are about a machine, and never beyond for their numbers.
+    that another draw of the noise changes it as well. So is a claim that was evaluated, and is missing or not evaluated
+    any more.
+
+    Parameters
+    ----------
+    reference, made
+        Claims.
+    on_machines
+        Whether they are about run time and memory on a machine: their numbers are never beyond.
     """
     old, new = ({claim.name: claim for claim in claims} for claims in (reference, made))
-    return [_compare_claim(name, old.get(name), new.get(name)) for name in dict.fromkeys([*old, *new])]
+    names = dict.fromkeys([*old, *new])
+    return [_compare_claim(name, old.get(name), new.get(name), on_machines) for name in names]
 
 
-def _compare_claim(name: str, old: Claim | None, new: Claim | None) -> ClaimComparison:
+def _compare_claim(name: str, old: Verdict | None, new: Verdict | None, on_machines: bool) -> ClaimComparison:
     if old is None or new is None:
-        status: Status = "moved" if old is None else "beyond"
+        status: Status = "moved" if old is None or old.measured is None else "beyond"
         verdicts = (old.verdict if old else "new", new.verdict if new else "missing")
         return ClaimComparison(name, status, *verdicts, None, None, None)
-    numbers = (old.measured, new.measured)
-    machines = old.section == COMPUTATION.section
-    if None in numbers:
-        evaluated = "moved" if machines and new.measured is not None else "beyond"
+    before, after = old.measured, new.measured
+    if before is None or after is None:
+        evaluated: Status = "moved" if on_machines and after is not None else "beyond"
         status = "same" if old.verdict == new.verdict else evaluated
-        return ClaimComparison(name, status, old.verdict, new.verdict, *numbers, None)
-    difference = abs(new.measured - old.measured)
+        return ClaimComparison(name, status, old.verdict, new.verdict, before, after, None)
+    difference = abs(after - before)
     sigmas = difference / old.uncertainty if old.uncertainty else None
     if old.verdict != new.verdict:
-        status = "moved" if machines or (sigmas is not None and sigmas <= CLAIM_SIGMAS) else "beyond"
+        status = "moved" if on_machines or (sigmas is not None and sigmas <= CLAIM_SIGMAS) else "beyond"
     else:
-        status = "same" if difference <= ROUNDING * max(abs(old.measured), abs(new.measured)) else "moved"
-    return ClaimComparison(name, status, old.verdict, new.verdict, *numbers, sigmas)
+        status = "same" if difference <= ROUNDING * max(abs(before), abs(after)) else "moved"
+    return ClaimComparison(name, status, old.verdict, new.verdict, before, after, sigmas)

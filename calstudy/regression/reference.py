@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 import yaml
+from pydantic import ValidationError
 
-from calstudy.claims.statement import Claim
-from calstudy.claims.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.experiment.files import read_mapping
+from calstudy.experiment.model import FIGURES
+from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json
+from calstudy.verdicts.tolerances import Rules
 
 EXPERIMENT, MANIFEST = "experiment.yaml", "manifest.json"
 KEPT = ("png", "npz")
@@ -32,11 +35,17 @@ class Results:
     figures
         Arrays by figure and name.
     claims
-        Evaluated; empty if there are none.
+        Empty if there are none.
+    tolerances
+        Of the figures that the experiment of a reference names, by their label.
+    on_machines
+        Whether a reference is of run times, which are those of a machine.
     """
 
     figures: dict[str, dict[str, np.ndarray]]
-    claims: list[Claim]
+    claims: list[Verdict]
+    tolerances: dict[str, Rules] = field(default_factory=dict)
+    on_machines: bool = False
 
 
 def find_references(folders: Sequence[Path]) -> list[Path]:
@@ -61,8 +70,27 @@ def find_references(folders: Sequence[Path]) -> list[Path]:
 
 
 def read_reference(folder: Path) -> Results:
-    """Read what is kept of a run; raises InputError if an array or claim file is not readable."""
-    return _read(folder, folder)
+    """Read what is kept of a run; raises InputError if an array, claim or experiment file is not readable."""
+    experiment = read_mapping(folder / EXPERIMENT)
+    return replace(
+        _read(folder, folder), tolerances=_tolerances(experiment, folder), on_machines="runtime" in experiment
+    )
+
+
+def _tolerances(experiment: Mapping[str, Any], folder: Path) -> dict[str, Rules]:
+    """Return the tolerances of the figures that an experiment or a collection names; a collection has them on top.
+
+    A figure of one's own that is not there any more has none, so that its arrays may not move at all.
+    """
+    named = experiment.get("figures", (experiment.get("outputs") or {}).get("figures", ()))
+    found = {}
+    for block in named:
+        try:
+            figure = FIGURES.make(block, folder=folder)
+        except (InputError, ValidationError):
+            continue
+        found[figure.label] = figure.tolerances
+    return found
 
 
 def read_run(folder: Path) -> Results:
@@ -98,7 +126,7 @@ def accept(run: Path, reference: Path) -> None:
     run
         Folder of a finished run of an experiment or a collection.
     reference
-        Made if it does not exist. Pictures and arrays of figures that the run does not have are removed.
+        Made if it does not exist. Pictures, arrays and claims that the run does not have are removed.
 
     Raises
     ------
@@ -106,12 +134,14 @@ def accept(run: Path, reference: Path) -> None:
         If the folder cannot be written.
     """
     sources = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
-    sources |= {name: run / name for name in (CLAIMS_JSON, CLAIMS_MARKDOWN, MANIFEST)}
+    sources |= {name: run / name for name in (CLAIMS_JSON, CLAIMS_MARKDOWN, MANIFEST) if (run / name).is_file()}
     description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
     try:
         reference.mkdir(parents=True, exist_ok=True)
-        for stale in [path for ending in KEPT for path in reference.glob(f"*.{ending}") if path.name not in sources]:
-            stale.unlink()
+        kept = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
+        for old in [*kept, reference / CLAIMS_JSON, reference / CLAIMS_MARKDOWN]:
+            if old.name not in sources:
+                old.unlink(missing_ok=True)
         for name, source in sources.items():
             _replace(reference / name, source.read_bytes())
         _replace(reference / EXPERIMENT, description.encode())
@@ -132,11 +162,11 @@ def _experiment(run: Path) -> dict[str, Any]:
         outputs = {key: value for key, value in experiment.get("outputs", {}).items() if key not in ("store", "runs")}
         return {**experiment, "outputs": outputs}
     manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))
-    figures = sorted(path.stem for path in (run / "figures").glob("*.npz"))
+    drawn = sorted(path.stem for path in (run / "figures").glob("*.npz"))
     return {
         "name": manifest["name"],
         "description": manifest["description"],
         "experiments": [f"../{name}/{EXPERIMENT}" for name in manifest["members"]],
-        "figures": figures,
+        "figures": manifest.get("figures", drawn),
         "roles": manifest["roles"],
     }

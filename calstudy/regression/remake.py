@@ -7,26 +7,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from calstudy.errors import InputError
-from calstudy.experiment.collection import Collection, load_study
-from calstudy.experiment.runtime import RuntimeStudy
-from calstudy.experiment.sweep import Sweep
+from calstudy.base.errors import InputError
 from calstudy.regression.reference import EXPERIMENT
-from calstudy.running.collection_runs import run_collection
-from calstudy.running.runs import run
-from calstudy.running.runtime_runs import fit_runtime, run_runtime
-from calstudy.running.studies import fit_study
+from calstudy.studies.load import load_study
+from calstudy.studies.study import Budget, run_study
+from calstudy.studies.sweep import Sweep
 
 
-def remake(
-    reference: Path,
-    overrides: Sequence[str],
-    workers: int | None,
-    max_memory: str | None,
-    scheduler: str | None,
-    console: Console,
-) -> Path:
-    """Run the experiment or collection of a reference folder, and return the run's folder.
+def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
+    """Run the study of a reference folder, and return the run's folder.
 
     Parameters
     ----------
@@ -34,21 +23,15 @@ def remake(
         Folder with ``experiment.yaml``.
     overrides
         ``path=value`` texts, such as ``outputs.store=DIR``.
-    workers, max_memory, scheduler, console
-        As for `calstudy.running.studies.run_study`.
+    budget, console
+        As for `calstudy.studies.study.run_study`.
 
     Raises
     ------
     InputError
         If the experiment is a sweep, or as the run raises it.
     """
-    loaded = load_study(reference / EXPERIMENT, None, overrides)
-    if isinstance(loaded, RuntimeStudy):
-        fit_runtime(loaded, workers, max_memory, scheduler)
-        return run_runtime(loaded, console).folder
-    study, count = fit_study(loaded, workers, max_memory, scheduler)
-    if isinstance(study, Collection):
-        return run_collection(study, count, scheduler, console).folder
+    study = load_study(reference / EXPERIMENT, None, overrides)
     if isinstance(study, Sweep):
         raise InputError(f"{reference}: is a sweep, which has no reference results")
-    return run(study, count, scheduler, console).folder
+    return run_study(study, budget, console).folder

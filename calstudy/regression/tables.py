@@ -8,14 +8,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.regression.comparison import ArrayComparison, ClaimComparison
+from calstudy.verdicts.tables import Table, count
 
 REGRESSION_JSON = "regression.json"
-COLOURS = {"same": "green", "moved": "yellow", "beyond": "bold red"}
+STATUSES = ("same", "moved", "beyond")
 LISTED = 20
 """Arrays that moved within their tolerance are listed up to this number, the farthest first; all are in the JSON."""
 
@@ -32,13 +31,13 @@ class Regression:
     @property
     def holds(self) -> bool:
         """Whether nothing is beyond its tolerance."""
-        return all(item.status != "beyond" for item in (*self.arrays, *self.claims))
+        statuses = [item.status for item in self.arrays] + [item.status for item in self.claims]
+        return "beyond" not in statuses
 
 
-def tally(items: Sequence[ArrayComparison] | Sequence[ClaimComparison]) -> str:
+def tally(items: Sequence[ArrayComparison | ClaimComparison]) -> str:
     """Count the statuses in one line."""
-    statuses = [item.status for item in items]
-    return ", ".join(f"{statuses.count(status)} {status}" for status in COLOURS)
+    return count([item.status for item in items], STATUSES)
 
 
 def write_json(regression: Regression, folder: Path) -> Path:
@@ -62,17 +61,17 @@ def show(regression: Regression, console: Console) -> None:
     console.print(f"  claims: {tally(regression.claims) if regression.claims else 'none in the reference'}")
     arrays = list(_listed(regression.arrays))
     if arrays:
-        console.print(_array_table(arrays))
+        _array_table(arrays).show(console)
         hidden = sum(item.status != "same" for item in regression.arrays) - len(arrays)
         for item in arrays:
             if item.status == "beyond":
-                allowed = item.told or f"allowed: {item.tolerance} ({item.why})"
+                allowed = item.problem or f"allowed: {item.tolerance} ({item.why})"
                 console.print(f"{item.figure}: {item.name}: {allowed}", markup=False)
         if hidden:
             console.print(f"... and {hidden} more that moved within their tolerance")
     claims = [item for item in regression.claims if item.status != "same"]
     if claims:
-        console.print(_claim_table(claims))
+        _claim_table(claims).show(console)
     verdict = "holds" if regression.holds else "DOES NOT HOLD: what is 'beyond' is farther than its tolerance"
     console.print(f"{regression.reference}: {verdict}", markup=False, highlight=False)
 
@@ -88,24 +87,17 @@ def _number(value: float | None) -> str:
 
 
 def _array_table(items: Sequence[ArrayComparison]) -> Table:
-    table = Table(title="what moved", title_justify="left")
-    table.add_column("array", overflow="fold")
-    for heading in ("", "of largest", "largest σ", "rms σ", "mean σ"):
-        table.add_column(heading, no_wrap=True)
+    rows = []
     for item in items:
         deviations = (_number(value) for value in (item.relative, item.largest, item.rms, item.shift))
-        status = f"[{COLOURS[item.status]}]{item.status}[/]"
-        table.add_row(f"{item.figure}: {escape(item.name)}", status, *deviations)
-    return table
+        rows.append((f"{item.figure}: {item.name}", item.status, *deviations))
+    return Table(("array", "", "of largest", "largest σ", "rms σ", "mean σ"), rows, "what moved")
 
 
 def _claim_table(items: Sequence[ClaimComparison]) -> Table:
-    table = Table(title="claims that moved", title_justify="left")
-    table.add_column("claim", overflow="fold")
-    for heading in ("", "was", "is", "σ"):
-        table.add_column(heading)
+    rows = []
     for item in items:
         was = f"{_number(item.reference)} {item.reference_verdict}".strip()
         now = f"{_number(item.measured)} {item.verdict}".strip()
-        table.add_row(item.name, f"[{COLOURS[item.status]}]{item.status}[/]", was, now, _number(item.sigmas))
-    return table
+        rows.append((item.name, item.status, was, now, _number(item.sigmas)))
+    return Table(("claim", "", "was", "is", "σ"), rows, "claims that moved")

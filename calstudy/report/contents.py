@@ -9,30 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from calstudy.errors import InputError
-from calstudy.running.progress import duration
+from calstudy.base.errors import InputError
+from calstudy.run.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
-FIRST_FIGURES = ("sweep", "layout", "wedge", "spherical", "signal-loss", "gains", "model", "data", "baselines")
-CAPTIONS = {
-    "sweep": "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars.",
-    "layout": "The array.",
-    "layouts": "The two arrays.",
-    "gains": "Gains of two antennas: true, recovered, and their ratio.",
-    "model": "Foregrounds of one baseline: true and fitted.",
-    "data": "Data of one baseline, fitted gains times model, and what is left.",
-    "baselines": "RMS over time of delay-transformed visibilities of several baselines.",
-    "wedge": "Cylindrical power spectra; negative values in blue.",
-    "spherical": "Spherical power spectra with 95 % bars; open where negative.",
-    "convergence": "What solvers leave of the foregrounds in even and odd alike, against their steps, over the EoR.",
-    "spherical-excised": "Spherical power spectra outside the wedge with 95 % bars; open where negative.",
-    "spherical-comparison": "Spherical power spectra outside the wedge, of both arrays; below, enlarged.",
-    "signal-loss": "What the calibration leaves of the EoR: T = P^R / P^S, per k and per baseline length and delay.",
-    "expected-loss": "Signal loss expected from the fit alone, against what injection measures.",
-    "reflections": "Delay transform of the true gains.",
-    "runtime-rows": "Run time against the number of antennas, rows of eight: medians, central 95 %, fitted powers.",
-    "runtime-line": "Run time against the longest baseline of a line: medians, central 95 %, fitted powers.",
-}
+CLAIMS_TITLE = "Claims of the paper"
 REGIONS = {"outside-wedge": "outside the wedge", "inside-wedge": "inside the wedge"}
 
 
@@ -119,7 +100,7 @@ def read_contents(folder: Path) -> Contents:
     experiment = folder / EXPERIMENT
     text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
     tables = [
-        _claims(folder),
+        _claims(folder, products),
         _summary(folder),
         _signal_loss(folder),
         _convergence(products),
@@ -132,7 +113,7 @@ def read_contents(folder: Path) -> Contents:
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
         warnings=[f"{label}: {text}" for label, text in _warnings(products)],
-        pictures=_pictures(folder),
+        pictures=_pictures(folder, manifest),
         tables=[table for table in tables if table is not None],
         parts=_parts(manifest),
         experiment=text,
@@ -178,10 +159,15 @@ def _warnings(products: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     ]
 
 
-def _pictures(folder: Path) -> list[Picture]:
-    found = {path.stem: path for path in (folder / "figures").glob("*.png")}
-    order = [name for name in FIRST_FIGURES if name in found] + sorted(set(found) - set(FIRST_FIGURES))
-    return [Picture(name, CAPTIONS.get(name, ""), found[name]) for name in order]
+def _pictures(folder: Path, manifest: Mapping[str, Any]) -> list[Picture]:
+    """Return the pictures in the order of the manifest, with the captions that it has; others follow by name."""
+    found = {path.stem: path for path in sorted((folder / "figures").glob("*.png"))}
+    drawn = [item for item in manifest.get("products", []) if item["stage"] == "figure"]
+    captions = {item["label"]: item.get("notes", {}).get("caption", "") for item in drawn}
+    captions = manifest.get("captions", captions)
+    order = [name for name in captions if name in found]
+    order += [name for name in found if name not in captions]
+    return [Picture(name, captions.get(name, ""), found[name]) for name in order]
 
 
 def _parts(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -191,14 +177,16 @@ def _parts(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
     return points + [(name, f"../{folder}/report.html") for name, folder in manifest.get("members", {}).items()]
 
 
-def _claims(folder: Path) -> Table | None:
+def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None:
+    """Return what became of the papers' statements; without a role in any paper a sentence, without papers nothing."""
     path = folder / CLAIMS
     if not path.is_file():
         return None
     claims = json.loads(path.read_text(encoding="utf-8"))
     evaluated = [claim for claim in claims if claim["measured"] is not None]
     if not evaluated:
-        return None
+        reasons = [text for item in products for text in item.get("notes", {}).get("without_role", [])]
+        return Table(CLAIMS_TITLE, (), (), " ".join(reasons)) if reasons else None
     rows = [
         (
             claim["section"],
@@ -213,7 +201,7 @@ def _claims(folder: Path) -> Table | None:
     others = len(claims) - len(evaluated)
     note = f"{others} further claims were not evaluated; claims.md says why." if others else ""
     columns = ("section", "the paper says", "measured is", "measured", "holds if", "verdict")
-    return Table("Claims of the paper", columns, rows, note, verdicts=5)
+    return Table(CLAIMS_TITLE, columns, rows, note, verdicts=5)
 
 
 def with_error(value: float | None, error: float | None) -> str:
@@ -243,14 +231,15 @@ def _signal_loss(folder: Path) -> Table | None:
         return None
     outside, inside = (_read_csv(path) for path in paths.values())
     rows = [
-        (_band(out), _cell(out, "transfer"), _cell(out, "retained"), _cell(within, "transfer"))
+        (_band(out), _cell(out, "transfer"), _cell(out, "squared coherence"), _cell(within, "transfer"))
         for out, within in zip(outside, inside, strict=True)
     ]
     note = (
         "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR. "
-        "What is retained is the same without the error of the calibration's flux scale. One standard deviation."
+        "The squared coherence of response and EoR is free of the error of the calibration's flux scale; for spectra "
+        "of each baseline with itself it is the fraction of the power that is retained. One standard deviation."
     )
-    columns = ("k (h/Mpc)", "T outside the wedge", "retained outside", "T inside the wedge")
+    columns = ("k (h/Mpc)", "T outside the wedge", "squared coherence outside", "T inside the wedge")
     return Table("Signal loss", columns, rows, note)
 
 

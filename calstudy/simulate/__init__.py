@@ -1,1 +1,1 @@
-"""simulate"""
+"""Visibilities of skies: the engines that compute them, and what limits their accuracy."""

@@ -1,4 +1,4 @@
-"""Common arguments of matvis and fftvis."""
+"""Common arguments of matvis and fftvis, and the polarizations in the matrices of feeds that they return."""
 
 from __future__ import annotations
 
@@ -11,11 +11,37 @@ from pyradiosky import SkyModel
 from pyuvdata import BeamInterface, UVBeam, UVData
 from pyuvdata.analytic_beam import AnalyticBeam
 
-from calstudy.instrument.antenna_beams import split_beams
+from calstudy.base.visibilities import antenna_indices
+from calstudy.instrument.antenna_beams import AntennaBeams, split_beams
 from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.simulate.brightness import is_polarized
 from calstudy.simulate.directions import sky_coordinates
+from calstudy.simulate.interface import BeamSource
 from calstudy.simulate.nodes import integration_times
-from calstudy.visibilities import antenna_indices
+
+# Row and column of a matrix of feeds x and y that hold each polarization number.
+FEED_PAIRS = {-5: (0, 0), -6: (1, 1), -7: (0, 1), -8: (1, 0)}
+
+
+def refusal(engine: str, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+    """Return why an engine for unpolarized skies and feeds x and y does not support a simulation, or None.
+
+    Parameters
+    ----------
+    engine
+        Its name, for the sentence.
+    sky, beam, template
+        As for `calstudy.simulate.interface.Engine.simulate`.
+    """
+    if is_polarized(sky):
+        return f"the {engine} engine supports unpolarized skies only"
+    unknown = [int(number) for number in template.polarization_array if int(number) not in FEED_PAIRS]
+    if unknown:
+        return f"polarization number {unknown[0]} is not linear"
+    beams, _ = split_beams(beam, template)
+    if any(list(item.at(template.freq_array[:1]).feed_array) != ["x", "y"] for item in beams):
+        return f"{engine} needs beams with feeds x and y"
+    return None
 
 
 def common_arguments(sky: SkyModel, template: UVData) -> dict[str, Any]:
@@ -44,7 +70,9 @@ def baseline_pairs(template: UVData) -> np.ndarray:
     return _used(template)[1]
 
 
-def beam_arguments(beam, template: UVData) -> tuple[list[UVBeam | BeamInterface], np.ndarray]:
+def beam_arguments(
+    beam: BeamSource | AntennaBeams, template: UVData
+) -> tuple[list[UVBeam | BeamInterface], np.ndarray]:
     """Return the distinct beams at the template's frequencies, and which each numbered antenna has, (Nants,) int.
 
     Both libraries sum conj(J_ai) J_bj and name it the visibility of feeds j, i: the right one if antennas a and b have
@@ -53,6 +81,30 @@ def beam_arguments(beam, template: UVData) -> tuple[list[UVBeam | BeamInterface]
     """
     beams, index = split_beams(beam, template)
     return [_conjugated(item.at(template.freq_array)) for item in beams], index[_used(template)[0]]
+
+
+def as_splines(beam: UVBeam | BeamInterface) -> UVBeam | BeamInterface:
+    """Return a tabulated beam that is always interpolated by splines, whatever a caller asks for.
+
+    matvis asks for `scipy.ndimage.map_coordinates`, which differs from pyuvsim's splines by 1e-5 of the rms.
+    """
+    if not isinstance(beam, UVBeam):
+        return beam
+    splines = _SplineBeam()
+    for parameter in beam:
+        setattr(splines, parameter, getattr(beam, parameter))
+    return splines
+
+
+class _SplineBeam(UVBeam):
+    def interp(self, **options: Any) -> tuple | UVBeam:
+        return super().interp(**{**options, "interpolation_function": "az_za_simple", "spline_opts": None})
+
+
+def select_polarizations(matrices: np.ndarray, template: UVData) -> np.ndarray:
+    """Return the template's polarizations, (..., Npols), of matrices of feeds, (..., 2, 2)."""
+    rows, columns = np.array([FEED_PAIRS[int(number)] for number in template.polarization_array]).T
+    return matrices[..., rows, columns]
 
 
 def _conjugated(beam: UVBeam | AnalyticBeam) -> UVBeam | BeamInterface:

@@ -8,7 +8,7 @@ from astropy_healpix import nside_to_pixel_area
 from pyradiosky import SkyModel
 from pyradiosky.utils import jy_to_ksr
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 
 
 def is_polarized(sky: SkyModel) -> bool:

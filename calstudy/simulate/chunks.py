@@ -16,6 +16,7 @@ import numpy as np
 
 from calstudy.instrument.telescope import subset_template
 from calstudy.simulate.directions import split_by_horizon
+from calstudy.simulate.interface import BeamSource, Engine, simulate_with
 from calstudy.simulate.nodes import NodeGrid, integration_times, node_grid
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from pyuvdata import UVData
 
     from calstudy.instrument.antenna_beams import AntennaBeams
-    from calstudy.simulate.engine import BeamSource, Engine
     from calstudy.simulate.settings import SimulationSettings
 
 logger = logging.getLogger(__name__)
@@ -111,7 +111,7 @@ def simulate_chunk(
     Parameters
     ----------
     engine
-        Any; see `calstudy.simulate.engine.make_engine`.
+        Any.
     sky
         For a sky given channel by channel, at least the chunk's channels.
     beam
@@ -128,19 +128,19 @@ def simulate_chunk(
     """
     grid, integrations = chunk.grid, integration_times(template)
     if grid.at_integrations:
-        return engine.simulate(sky, beam, subset_template(template, integrations, chunk.frequencies))
+        return simulate_with(engine, sky, beam, subset_template(template, integrations, chunk.frequencies))
     times = np.concatenate([integrations, grid.times_jd])
     always_up, crossing = split_by_horizon(sky, template.telescope.location, times)
     logger.info("%d sources stay up, %d rise or set, of %d", len(always_up), len(crossing), sky.Ncomponents)
     cube = np.zeros((len(integrations), template.Nbls, len(chunk.frequencies), template.Npols), dtype=np.complex128)
     if len(always_up):
         steady = sky.select(component_inds=always_up, inplace=False, run_check=False)
-        nodes = engine.simulate(steady, beam, subset_template(template, grid.times_jd, chunk.frequencies))
+        nodes = simulate_with(engine, steady, beam, subset_template(template, grid.times_jd, chunk.frequencies))
         cube += grid.interpolate_times(nodes)
         del steady
     if len(crossing):
         changing = sky.select(component_inds=crossing, inplace=False, run_check=False)
-        cube += engine.simulate(changing, beam, subset_template(template, integrations, chunk.frequencies))
+        cube += simulate_with(engine, changing, beam, subset_template(template, integrations, chunk.frequencies))
     return cube
 
 
@@ -158,6 +158,21 @@ def simulate_visibilities(
     smooth_in_frequency: bool,
 ) -> np.ndarray:
     """Simulate a complete observation in this process; see `plan_chunks`, `simulate_chunk` and `assemble`.
+
+    Parameters
+    ----------
+    engine
+        What computes the visibilities.
+    sky
+        Components of the sky.
+    beam
+        Of all antennas, or of each.
+    template
+        The observation: antennas, baselines, times, channels, polarizations.
+    settings
+        Nodes and number of chunks.
+    smooth_in_frequency
+        Whether sky and beam are, so that channels may be interpolated between nodes.
 
     Returns
     -------

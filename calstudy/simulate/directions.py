@@ -39,7 +39,7 @@ class SourceTracks:
         Julian dates (UTC) at which directions will be asked for.
     """
 
-    def __init__(self, sky: SkyModel, location: EarthLocation, times_jd: np.ndarray):
+    def __init__(self, sky: SkyModel, location: EarthLocation, times_jd: np.ndarray) -> None:
         use_bundled_earth_orientation()
         bandwidth = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.ptp(times_jd) / 2
         count = chebyshev_count(bandwidth, DIRECTION_TOLERANCE)

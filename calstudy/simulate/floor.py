@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.constants import speed_of_light
 from scipy.signal import windows
 
-from calstudy.visibilities import baseline_vectors, to_cube
+from calstudy.base.visibilities import baseline_vectors, to_cube
+from calstudy.power.delay import horizon_delay
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -82,7 +82,7 @@ def floor_buffers(foregrounds: UVData) -> dict[Taper, float]:
     """
     width = float(np.diff(foregrounds.freq_array).mean())
     resolution = 1 / (width * foregrounds.Nfreqs)
-    horizon = float(np.linalg.norm(baseline_vectors(foregrounds), axis=1).max()) / speed_of_light
+    horizon = horizon_delay(float(np.linalg.norm(baseline_vectors(foregrounds), axis=1).max()))
     found = {taper: max(100e-9, lobe * resolution) for taper, lobe in MAIN_LOBES.items()}
     return {taper: buffer for taper, buffer in found.items() if horizon + buffer + resolution < 0.5 / width}
 
@@ -125,7 +125,7 @@ def delay_floor(
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
     delays, power = delay_profile(foregrounds, taper)
     peak_power = power if peaks is None else delay_profile(peaks, taper)[1]
-    beyond = np.abs(delays) > (lengths / speed_of_light + buffer)[:, None]
+    beyond = np.abs(delays) > (horizon_delay(lengths) + buffer)[:, None]
     if not beyond.any(axis=1).all():
         raise ValueError(f"no delay is beyond the horizon plus {buffer} s: the channels are too wide")
     edges, bins = length_bins(lengths, n_bins)
@@ -136,4 +136,4 @@ def delay_floor(
         outside = beyond[members].all(axis=0)
         ratios = np.array([mean[outside].mean(), mean[outside].max()]) / peak_power[members].mean(axis=0).max()
         levels[:, index] = 5 * np.log10(np.maximum(ratios, np.finfo(float).tiny))
-    return DelayFloor(edges, *levels, buffer, taper)
+    return DelayFloor(edges, levels[0], levels[1], buffer, taper)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.constants import speed_of_light
 from scipy.special import jv
 
-from calstudy.visibilities import baseline_vectors
+from calstudy.base.visibilities import baseline_vectors
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -96,7 +96,15 @@ def chebyshev_count(bandwidth: float, tolerance: float) -> int:
 
 
 def chebyshev_nodes(first: float, last: float, count: int) -> np.ndarray:
-    """Return the `count` Chebyshev nodes of the first kind in the interval, (count,), strictly inside it, ascending."""
+    """Return the `count` Chebyshev nodes of the first kind in the interval, (count,), strictly inside it, ascending.
+
+    Parameters
+    ----------
+    first, last
+        Ends of the interval.
+    count
+        Number of nodes.
+    """
     angles = np.pi * (np.arange(count)[::-1] + 0.5) / count
     return first + 0.5 * (last - first) * (1 + np.cos(angles))
 

@@ -10,7 +10,7 @@ import numpy as np
 from pyuvdata import BeamInterface, UVBeam
 from pyuvdata.analytic_beam import AnalyticBeam
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 
 # Pixels by which pyuvdata extends a beam in azimuth so that its splines see it wrap.
 AZIMUTH_EXTENSION = 3
@@ -34,6 +34,15 @@ class PowerPattern(Pattern, Protocol):
 
 def power_pattern(beam: UVBeam | AnalyticBeam, frequencies: np.ndarray, feeds: list[str]) -> PowerPattern:
     """Return the power pattern of some feeds of an E-field beam at some frequencies.
+
+    Parameters
+    ----------
+    beam
+        E-field beam.
+    frequencies
+        Hz, (Nfreqs,).
+    feeds
+        Such as "x" and "y".
 
     Raises
     ------
@@ -72,7 +81,7 @@ def refusal(beam: UVBeam | AnalyticBeam, feeds: list[str]) -> str | None:
 class AnalyticPattern:
     """Power pattern of a closed-form beam."""
 
-    def __init__(self, beam: AnalyticBeam, frequencies: np.ndarray, feeds: list[str]):
+    def __init__(self, beam: AnalyticBeam, frequencies: np.ndarray, feeds: list[str]) -> None:
         self._beam = BeamInterface(beam, beam_type="efield")
         self._frequencies = frequencies
         self._feeds = [list(beam.feed_array).index(feed) for feed in feeds]
@@ -101,7 +110,7 @@ class SplinePattern:
     (uniform B-splines), so that one set of sixteen weights serves all frequencies, components and feeds of a source.
     """
 
-    def __init__(self, beam: UVBeam, feeds: list[str]):
+    def __init__(self, beam: UVBeam, feeds: list[str]) -> None:
         azimuth, self._zenith_angle = beam.axis1_array, beam.axis2_array
         step = azimuth[1] - azimuth[0]
         pad = AZIMUTH_EXTENSION if np.isclose(abs(azimuth[-1] - azimuth[0]) + step, 2 * np.pi, atol=step) else 0
@@ -146,7 +155,7 @@ class CrossPattern:
         Of the beams, with the same feeds and frequencies.
     """
 
-    def __init__(self, patterns: Sequence[PowerPattern]):
+    def __init__(self, patterns: Sequence[PowerPattern]) -> None:
         self._patterns = patterns
         self.n_weights = len(patterns) ** 2 * patterns[0].n_weights
 

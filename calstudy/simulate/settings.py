@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, SerializeAsAny, model_validator
 
-from calstudy.schema import Section
-from calstudy.units import Length
+from calstudy.base.schema import UNKEYED, Section, fault
+from calstudy.base.units import Length
+from calstudy.simulate.interface import Engine
+
+ENGINES = Engine.registry
 
 
 class Nodes(Section):
@@ -30,11 +34,25 @@ class Nodes(Section):
 class SimulationSettings(Section):
     """How the visibilities are computed."""
 
-    engine: Literal["auto", "dense", "matvis", "fftvis", "pyuvsim"] = Field(
-        "auto", description="auto: the fastest engine that supports the experiment."
+    engine: Annotated[SerializeAsAny[Engine], ENGINES.field("auto")] = Field(
+        default_factory=lambda: ENGINES.make("auto"),
+        description="What computes the visibilities; auto: the fastest engine that supports the experiment.",
     )
-    precision: Literal["single", "double"] = Field("double", description="Precision of the sums over sources.")
     nodes: Nodes = Nodes()
     chunks: int = Field(
-        16, ge=1, description="Independent parts of a simulation, for resuming and for parallel workers."
+        16,
+        ge=1,
+        description="Independent parts of a simulation, for resuming and for parallel workers; changes results by "
+        "rounding only.",
+        json_schema_extra=UNKEYED,
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _precision_is_the_engines(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and "precision" in data:
+            named = data.get("engine", "auto")
+            kind = named if isinstance(named, str) else "auto"
+            sentence = f"is now a setting of the engine: engine: {{kind: {kind}, precision: {data['precision']}}}"
+            raise fault("precision", sentence)
+        return data

@@ -6,6 +6,7 @@ import logging
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy import units
@@ -13,7 +14,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from pyradiosky import SkyModel
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.sky.counts import FREQUENCY, SPECTRAL_INDEX
 from calstudy.sky.settings import PointSources
 
@@ -114,7 +115,9 @@ def read_gleam_table(path: Path) -> Catalogue:
     missing = ["/".join(GLEAM_COLUMNS[key]) for key, name in found.items() if name is None]
     if missing:
         raise InputError(f"sky.foregrounds.path: {path} is not a GLEAM catalogue, it lacks {', '.join(missing)}")
-    columns = {key: np.ma.filled(np.ma.asarray(table[found[key]], dtype=float), np.nan) for key in list(found)[1:]}
+    columns: dict[str, np.ndarray] = {
+        key: np.ma.filled(np.ma.asarray(table[found[key]], dtype=float), np.nan) for key in list(found)[1:]
+    }
     catalogue = Catalogue(
         np.asarray(table[found["name"]]).astype(str),
         np.deg2rad(columns["right_ascension"]),
@@ -131,7 +134,7 @@ def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:
     """Return the sources as point components, with spectra according to the settings."""
     stokes = np.zeros((4, 1, len(catalogue))) * units.Jy
     stokes[0, 0] = catalogue.flux * units.Jy
-    spectrum = {"spectral_type": "flat"}
+    spectrum: dict[str, Any] = {"spectral_type": "flat"}
     if settings.spectrum == "catalogue":
         spectrum = {
             "spectral_type": "spectral_index",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy import units
@@ -34,12 +35,14 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     missing = [name for name in named.values() if name not in table.colnames]
     if missing:
         raise ValueError(f"there is no column {missing[0]}, only {', '.join(table.colnames)}")
-    values = {key: np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan) for key, name in named.items()}
+    values: dict[str, np.ndarray] = {
+        key: np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan) for key, name in named.items()
+    }
     usable = np.isfinite([values[key] for key in ("right_ascension", "declination", "flux")]).all(axis=0)
     values = {key: column[usable] for key, column in values.items()}
     stokes = np.zeros((4, 1, int(usable.sum()))) * units.Jy
     stokes[0, 0] = values["flux"] * units.Jy
-    spectrum = {"spectral_type": "flat"}
+    spectrum: dict[str, Any] = {"spectral_type": "flat"}
     if "spectral_index" in values:
         spectrum = {"spectral_type": "spectral_index", "spectral_index": values["spectral_index"]}
     return SkyModel(

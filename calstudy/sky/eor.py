@@ -11,7 +11,7 @@ from astropy.cosmology import FLRW, Planck15
 from pyradiosky import SkyModel
 from scipy.interpolate import CubicSpline
 
-from calstudy.constants import HYDROGEN_LINE
+from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.sky.settings import Eor
 
 # Nodes of the radial wavenumber integral: per logarithmic interval near zero, per channel beyond.
@@ -190,7 +190,7 @@ def _triangular_root(factor: np.ndarray) -> np.ndarray:
 
     By QR, not Cholesky of the product: steep spectra span more than the 16 digits that the product would keep.
     """
-    upper = np.linalg.qr(factor.T, mode="r")
+    upper = np.asarray(np.linalg.qr(factor.T, mode="r"))
     return upper.T * np.where(np.diag(upper) < 0, -1.0, 1.0)
 
 

@@ -13,8 +13,8 @@ from astropy import units
 from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 
-from calstudy.errors import InputError
-from calstudy.plugins import load_function
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import load_function, user_code
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
 from calstudy.sky.catalogue import Catalogue, brightest, concatenate, read_gleam_table, to_sky_model
@@ -174,7 +174,9 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
 
 
 def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregrounds:
-    sky = load_function(settings)(frequencies.copy(), **settings.options)
+    function = load_function(settings.path, settings.function)
+    with user_code(f"{settings.function} of {settings.path.name}"):
+        sky = function(frequencies.copy(), **settings.options)
     where = f"{settings.function} of {settings.path.name}"
     if not isinstance(sky, SkyModel) or sky.component_type != "point":
         raise InputError(f"sky.foregrounds: {where} must return a pyradiosky SkyModel of points")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from calstudy.plugins import Plugin
-from calstudy.schema import Section, choice, fault
-from calstudy.units import FluxDensity, Frequency, PowerDensity
+from calstudy.base.schema import Section, choice, fault
+from calstudy.base.units import FluxDensity, Frequency, PowerDensity
 
 VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
 
@@ -73,11 +72,7 @@ class FileSources(PointSources):
     kind: Literal["file"]
     path: Path = Field(strict=False)
     votable: VotableColumns | None = Field(None, description="Required for a VOTable (.vot, .votable, .xml), ICRS.")
-
-    # Left out where it is not used, so that catalogues of other kinds are identified as before.
-    csv: CsvColumns | None = Field(
-        None, exclude_if=lambda value: value is None, description="Required for a CSV (.csv)."
-    )
+    csv: CsvColumns | None = Field(None, description="Required for a CSV (.csv).")
 
     @model_validator(mode="after")
     def _csv_has_columns(self) -> FileSources:
@@ -93,7 +88,7 @@ class FileSources(PointSources):
         return self
 
 
-class CodeSources(Plugin):
+class CodeSources(Section):
     """Sources from a user's function.
 
     It is called with the channel frequencies in Hz, (Nfreqs,), and the options, and returns a pyradiosky SkyModel of
@@ -101,6 +96,9 @@ class CodeSources(Plugin):
     """
 
     kind: Literal["code"]
+    path: Path = Field(strict=False, description="Python file; a relative path starts at the experiment file.")
+    function: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="Name of the function in it.")
+    options: dict[str, Any] = Field(default_factory=dict, description="Given to the function as keyword arguments.")
 
 
 class NoSources(Section):

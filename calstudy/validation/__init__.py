@@ -1,1 +1,1 @@
-"""The validation ladder: every stage of the chain proved against something that it cannot fool."""
+"""The validation ladder: every stage of the chain tested against a known answer."""

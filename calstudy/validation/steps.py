@@ -1,4 +1,4 @@
-"""What a step of the ladder says: the file that names its experiments, its rung and its criteria."""
+"""The steps of the validation ladder: each is a file with experiments, a measurement and criteria."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
-from calstudy.claims.statement import Above, Below, Consistent, Threshold, Within
-from calstudy.errors import ExperimentError, InputError
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.package_files import published
+from calstudy.base.schema import Section, fault
 from calstudy.experiment.files import override, parse_override, read_mapping, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
-from calstudy.schema import Section, fault
+from calstudy.validation.measurement import MEASUREMENTS, Measurement
+from calstudy.verdicts.criterion import AtLeast, AtMost, Criterion, Equal, Threshold, Within
 
-LADDER = Path(__file__).resolve().parents[2] / "experiments" / "validation"
-"""Folder of the steps of this checkout."""
+LADDER = published("experiments") / "validation"
+"""Folder of the published steps."""
 SCALES = ("full", "small")
 
 
@@ -39,24 +41,25 @@ class Must(Section):
 
     @property
     def threshold(self) -> Threshold:
-        """The condition, as the claims of the paper have them."""
+        """The condition."""
         if self.at_most is not None:
-            return Below(self.at_most)
+            return AtMost(self.at_most)
         if self.at_least is not None:
-            return Above(self.at_least)
+            return AtLeast(self.at_least)
         if self.within is not None:
             return Within(*self.within)
-        return Consistent(self.equal, self.sigmas)
+        assert self.equal is not None
+        return Equal(self.equal, self.sigmas)
 
 
-class Criterion(Section):
+class StepCriterion(Section):
     """One number that decides about a step."""
 
-    measures: str = Field(description="Name of the finding of the step's rung.")
+    measures: str = Field(description="Name of the finding of the step's measurement.")
     quantity: str = Field(description="What that is, in words.")
     must: Must
     small: Must | None = Field(None, description="What it must be at small scale, where sampling errors are larger.")
-    full_only: bool = Field(False, description="Whether it does not apply at small scale; `why` tells.")
+    full_only: bool = Field(False, description="Whether it does not apply at small scale; `why` gives the reason.")
     why: str = Field(description="Why this threshold.")
 
     def condition(self, scale: str) -> Threshold:
@@ -79,25 +82,34 @@ class StepFile(Section):
     step: str = Field(pattern=r"^-?[0-9]+(\.[0-9]+)?$", description="Its number.")
     title: str
     proves: str
-    rung: str = Field(description="What measures it, a key of `calstudy.validation.rungs.RUNGS`.")
-    parameters: dict[str, Any] = Field(default_factory=dict, description="What the rung is told.")
-    small_parameters: dict[str, Any] = Field(default_factory=dict, description="What it is told at small scale.")
+    measurement: str = Field(description="What is measured: a module of `calstudy.validation.measurements`, or a file.")
+    parameters: dict[str, Any] = Field(default_factory=dict, description="Fields of the measurement.")
+    small_parameters: dict[str, Any] = Field(default_factory=dict, description="Others of these at small scale.")
     experiments: dict[str, StepExperiment] = Field(default_factory=dict)
-    criteria: Annotated[tuple[Criterion, ...], Field(strict=False, min_length=1)]
+    criteria: Annotated[tuple[StepCriterion, ...], Field(strict=False, min_length=1)]
+
+    @model_validator(mode="after")
+    def _one_criterion_per_finding(self) -> StepFile:
+        names = [item.measures for item in self.criteria]
+        if len(set(names)) != len(names):
+            raise fault("criteria", f"names a finding twice: {', '.join(names)}")
+        return self
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step at one scale, its experiments validated.
+    """One step at one scale, its measurement and experiments validated.
 
     Attributes
     ----------
-    name, title, proves, rung, criteria
+    name, title, proves
         As in the file.
-    parameters
-        What the rung is told.
+    measurement
+        With its parameters.
     experiments
         By the names they have in the step.
+    criteria
+        By the findings that they are about.
     scale
         "full" or "small".
     """
@@ -105,10 +117,9 @@ class Step:
     name: str
     title: str
     proves: str
-    rung: str
-    parameters: Mapping[str, Any]
+    measurement: Measurement
     experiments: Mapping[str, Experiment]
-    criteria: Sequence[Criterion]
+    criteria: Mapping[str, Criterion]
     scale: str
 
 
@@ -131,23 +142,36 @@ def load_step(path: Path, scale: str = "full", overrides: Sequence[str] = ()) ->
     ExperimentError
         If fields of the step or of an experiment are unknown, missing, or hold values that are not allowed.
     """
-    from calstudy.validation.rungs import RUNGS
-
     data = read_mapping(path)
     try:
         file = StepFile.model_validate(data)
     except ValidationError as error:
         raise ExperimentError([f"{path}: {sentence}" for sentence in sentences(error, StepFile, data)]) from None
-    if file.rung not in RUNGS:
-        raise ExperimentError([f"{path}: rung = {file.rung!r}: not a rung (allowed: {', '.join(RUNGS)})"])
-    small = scale == "small"
-    experiments = {
-        name: _load_experiment(name, item, path.resolve().parent, small, overrides)
-        for name, item in file.experiments.items()
-    }
+    small, folder = scale == "small", path.resolve().parent
     parameters = {**file.parameters, **(file.small_parameters if small else {})}
-    criteria = tuple(item for item in file.criteria if not (small and item.full_only))
-    return Step(file.step, file.title, file.proves, file.rung, parameters, experiments, criteria, scale)
+    experiments = {
+        name: _load_experiment(name, item, folder, small, overrides) for name, item in file.experiments.items()
+    }
+    criteria = {
+        item.measures: Criterion(
+            f"{file.step} {item.measures}", "", file.proves, item.quantity, item.condition(scale), item.why
+        )
+        for item in file.criteria
+        if not (small and item.full_only)
+    }
+    measurement = _load_measurement(path, file.measurement, parameters)
+    return Step(file.step, file.title, file.proves, measurement, experiments, criteria, scale)
+
+
+def _load_measurement(path: Path, name: str, parameters: Mapping[str, Any]) -> Measurement:
+    block = {**parameters, MEASUREMENTS.tag: name}
+    try:
+        return MEASUREMENTS.make(block, folder=path.resolve().parent)
+    except InputError as error:
+        raise ExperimentError([f"{path}: measurement: {error}"]) from None
+    except ValidationError as error:
+        faults = sentences(error, MEASUREMENTS.find(name), block)
+        raise ExperimentError([f"{path}: parameters.{sentence}" for sentence in faults]) from None
 
 
 def _load_experiment(name: str, item: StepExperiment, base: Path, small: bool, overrides: Sequence[str]) -> Experiment:
@@ -167,16 +191,27 @@ def _load_experiment(name: str, item: StepExperiment, base: Path, small: bool, o
 def load_ladder(
     names: Sequence[str] = (), scale: str = "full", overrides: Sequence[str] = (), folder: Path = LADDER
 ) -> list[Step]:
-    """Read the steps with these names, or all, in the order of their numbers; raises as `load_step`, and
+    """Read the steps with these names, or all, in the order of their numbers.
 
+    Parameters
+    ----------
+    names
+        Of steps; all if there are none.
+    scale, overrides
+        As for `load_step`.
+    folder
+        Of the files of the steps.
+
+    Raises
+    ------
     InputError
-        If the folder holds no steps, or none of a given name.
+        As `load_step`, and if the folder holds no steps, or none of a given name.
     """
     if scale not in SCALES:
         raise InputError(f"--scale {scale}: not a scale of the ladder (allowed: {', '.join(SCALES)})")
     files = {str(read_mapping(path).get("step")): path for path in sorted(folder.glob("*.yaml"))}
     if not files:
-        raise InputError(f"{folder}: holds no steps of the ladder; run in a checkout of calstudy, or give --ladder DIR")
+        raise InputError(f"{folder}: holds no steps of the ladder")
     unknown = [name for name in names if name not in files]
     ordered = sorted(files, key=float)
     if unknown:

@@ -1,4 +1,4 @@
-"""The yardstick is the paper's solver, and the bench measures what it says."""
+"""The calibrator is timed against the paper's solver, and the table has what its rows say."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import tensorflow as tf
 
-from calstudy.bench.calibration import adamax_step, clock_of, measure, use_device
+from calstudy.base.errors import InputError
+from calstudy.bench.calibration import adamax_step, clock_of, time_calibrator, use_device
 from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.bench.paper_step import PaperStep
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.interface import solve
-from calstudy.errors import InputError
 
 SMALL = Case(antennas=5, channels=96, extent=40.0)
 
@@ -43,7 +43,7 @@ def test_cases_drift_and_have_the_noise_they_say():
 
 
 def test_the_table_has_every_ratio():
-    rows = {row.name: row for row in measure(SMALL, 2, 50)}
+    rows = {row.name: row for row in time_calibrator(SMALL, 2, 50)}
     assert "not in 50" in (rows["Adamax 0.01, steps to 0.2 % above the minimum"].value)
     assert rows["that over the default solver, to 0.2 %"].value.startswith("at least")
     assert rows["2 integrations"].note.endswith("converged")

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, from_json, measure_agreement
-from calstudy.calibrate.alignment import align
+from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth, from_json
+from calstudy.calibrate.degeneracy import align
 
 FREQUENCY = 167e6 + 80e3 * np.arange(384)
 ENU = 30.0 * np.array([[0, 0], [1, 0], [0, 1], [2, 1], [1, 3], [3, 0]])
@@ -35,18 +35,18 @@ def truth() -> Truth:
     horizon = LENGTHS / 299792458.0
     foregrounds = np.stack([10 * smooth(rng, len(PAIRS), 0.8 * horizon) for _ in range(N_TIMES)])
     noise = 0.01 * complex_normal(rng, *foregrounds.shape)
-    return Truth(gains, foregrounds, noise, BASELINES.products(gains) * (foregrounds + noise))
+    return Truth(gains, foregrounds, noise, BASELINES.gain_products(gains) * (foregrounds + noise))
 
 
 def fit(truth: Truth, gains: np.ndarray | None = None, model: np.ndarray | None = None) -> Fit:
     """A fit with R = V / (g g*) - F for the given gains (Ntimes, Nants, Nfreqs) and model, the true ones by default."""
     gains = np.repeat(truth.gains[None], N_TIMES, axis=0) if gains is None else gains
     model = truth.foregrounds if model is None else model
-    return Fit(gains, model, truth.data / BASELINES.products(gains) - model)
+    return Fit(gains, model, truth.data / BASELINES.gain_products(gains) - model)
 
 
 def values(truth: Truth, found: Fit) -> dict[str, float]:
-    return {name: item.value for name, item in measure_agreement(truth, found, BASELINES).items()}
+    return {name: item.value for name, item in compare_with_truth(truth, found, BASELINES).items()}
 
 
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(0.1, 10))
@@ -110,7 +110,7 @@ def test_smooth_errors_common_to_gains_and_model_cancel_in_the_product(truth):
     """The paper's degeneracy: 10 % errors of gains and model, none of their product."""
     rng = np.random.default_rng(45)
     error = 1 + 0.1 * smooth(rng, len(ENU), np.full(len(ENU), 30e-9)).real
-    model = truth.foregrounds / BASELINES.products(error)
+    model = truth.foregrounds / BASELINES.gain_products(error)
     found = values(truth, fit(truth, np.repeat((truth.gains * error)[None], N_TIMES, axis=0), model))
     assert 0.05 < found["gains_aligned"] < 0.15
     assert 0.05 < found["model_aligned"] < 0.3
@@ -129,13 +129,13 @@ def test_noise_taken_up_inside_the_wedge_is_seen_there_only(truth):
 
 
 def test_measurements_keep_through_json(truth):
-    found = measure_agreement(truth, fit(truth), BASELINES)
+    found = compare_with_truth(truth, fit(truth), BASELINES)
     assert from_json(as_json(found)) == found
     assert found["model_aligned"].count == len(PAIRS)
 
 
 def test_without_delays_outside_the_wedge_nothing_is_said_of_them(truth):
     wide = Baselines(PAIRS, LENGTHS, FREQUENCY, buffer=1.0)
-    found = measure_agreement(truth, fit(truth), wide)
+    found = compare_with_truth(truth, fit(truth), wide)
     assert "residual_over_noise_outside" not in found
     assert "residual_over_noise_inside" in found

@@ -25,7 +25,8 @@ def redundant_structure(toy):
     groups = redundant_groups(vectors, 0.1)
     lengths = [np.linalg.norm(vectors[groups.index == group], axis=1).max() for group in range(groups.index.max() + 1)]
     basis = make_basis(np.array(lengths), *basis_arguments())
-    assert groups.conjugated.any() and basis.n_models < len(antennas)
+    assert groups.conjugated.any()
+    assert basis.n_models < len(antennas)
     return FitStructure(antennas, len(toy.positions), basis, groups.index, groups.conjugated)
 
 
@@ -68,7 +69,7 @@ def numpy_loss(problem, gains, coefficients):
 
 
 def tensor_problem(problem, gains, coefficients, precision):
-    kernels = first_order.Kernels(problem.structure, first_order.Optimizer(), precision, "sum")
+    kernels = first_order.JointKernels(problem.structure, first_order.Optimizer(), precision, "sum")
     measured = kernels.tensors.load(problem, kernels.dtype)
     target = pairs.to_pair(np.array(problem.prior_target / measured.scale), kernels.dtype)
     data = first_order.FitData(measured.visibilities, measured.weights, target)

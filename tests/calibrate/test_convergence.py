@@ -13,9 +13,10 @@ from calstudy.calibrate.agreement import Baselines
 from calstudy.calibrate.bias import Realization, cross_power, ratio_over_antennas
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
-from calstudy.calibrate.solvers.gauss_newton import GaussNewton, remaining_at
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve, solve_warm
 from calstudy.calibrate.solvers.lbfgs import Lbfgs
+from calstudy.calibrate.solvers.reduced import newton_decrement_at
 from calstudy.calibrate.trace import trace
 
 
@@ -38,7 +39,7 @@ def bias_of(pair, baselines, estimates):
     left = []
     for toy, (gains, model) in zip(pair, estimates, strict=True):
         realization = Realization(toy.visibilities, toy.noise, gain_products(toy.gains, toy.antennas))
-        left.append(realization.left(gain_products(gains, toy.antennas), model))
+        left.append(realization.residual_without_noise(gain_products(gains, toy.antennas), model))
     unit = np.full(left[0].shape, 1.0 + 0j) * np.exp(2j * np.pi * np.random.default_rng(5).random(left[0].shape))
     return ratio_over_antennas(cross_power(*left, baselines), cross_power(unit, unit, baselines), baselines.antennas)
 
@@ -57,7 +58,7 @@ def test_the_distance_from_the_minimum_is_the_bias(pair, baselines, solver, step
     for even, odd in zip(*paths, strict=False):
         if even.n_steps not in steps:
             continue
-        predicted = even.remaining_rms * odd.remaining_rms
+        predicted = even.decrement_rms * odd.decrement_rms
         bias, error = bias_of(pair, baselines, [(even.gains, even.model), (odd.gains, odd.model)])
         # Not all that is left lies beyond the wedge, or is the same in both.
         assert bias - 3 * error < predicted
@@ -77,7 +78,7 @@ def test_what_is_left_is_orthogonal_to_the_minimum(pair):
     going, power = (np.sum(problem.weights * np.abs(part) ** 2) for part in (before - after, before))
     fallen = 1 - late.loss_history[-1] / (power)
     assert going / power == pytest.approx(fallen, rel=0.25)
-    assert early.remaining == pytest.approx(fallen, rel=0.5)
+    assert early.newton_decrement == pytest.approx(fallen, rel=0.5)
 
 
 def test_every_solver_tells_how_far_it_is(pair):
@@ -85,12 +86,12 @@ def test_every_solver_tells_how_far_it_is(pair):
     for solver in (GaussNewton(), Lbfgs(), FirstOrder(Optimizer(max_steps=300))):
         solution = solve(problem, solver)
         # Gauss-Newton judges with the blocks of an earlier step, whose prediction is a little off.
-        assert solution.remaining == pytest.approx(min(remaining_at(problem, solution.gains), 1), rel=0.1)
+        assert solution.newton_decrement == pytest.approx(min(newton_decrement_at(problem, solution.gains), 1), rel=0.1)
         residual = problem.visibilities / gain_products(solution.gains, pair[0].antennas) - solution.model
-        rms = np.sqrt(solution.remaining * np.mean(np.abs(residual) ** 2))
-        assert solution.remaining_rms == pytest.approx(rms, rel=0.2)
+        rms = np.sqrt(solution.newton_decrement * np.mean(np.abs(residual) ** 2))
+        assert solution.decrement_rms == pytest.approx(rms, rel=0.2)
         if solution.status == "converged":
-            assert solution.remaining < solver.tolerance
+            assert solution.newton_decrement < solver.tolerance
 
 
 def test_a_loss_that_stands_still_short_of_the_minimum_has_not_converged(pair):
@@ -119,7 +120,8 @@ def drifting_bias(case, solver, integrations, warm_start):
             assert solution.status == "converged"
             starts[realization] = start if warm_start else None
             truth = Realization(problem.visibilities, noises[-1], products)
-            left.append(truth.left(gain_products(solution.gains, simulation.antennas), solution.model))
+            fitted = gain_products(solution.gains, simulation.antennas)
+            left.append(truth.residual_without_noise(fitted, solution.model))
         power = power + cross_power(*left, baselines)
         reference = reference + cross_power(noises[0], noises[0], baselines)
     return ratio_over_antennas(power, reference, simulation.antennas)

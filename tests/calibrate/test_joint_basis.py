@@ -5,24 +5,35 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tensorflow as tf
+from pydantic import ValidationError
 from test_calamity import SETTINGS, make_uvdata
 from test_calibration_loss import redundant_structure
 from toy import complex_normal
 
+from calstudy.base.errors import InputError
+from calstudy.base.identity import identity
+from calstudy.base.observation import Observation
+from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis
-from calstudy.calibrate.calamity import calibrate
+from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.calamity_redundant import CalamityRedundant
+from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.joint import JointGroup, orthonormal, place_groups, read_joint_groups
 from calstudy.calibrate.problem import FitStructure, gain_products
-from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.calibrate.settings import JointBasisSettings
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
-from calstudy.calibrate.solvers.gauss_newton import GaussNewton, compiled
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.solvers.lbfgs import Lbfgs
+from calstudy.calibrate.solvers.reduced import compiled
 from calstudy.calibrate.structure import make_structure, repeat_structure
-from calstudy.errors import InputError
-from calstudy.graph.tasks import identify
-from calstudy.visibilities import antenna_pairs, to_cube
+
+
+def with_groups(path):
+    """The settings of the other tests with joint groups from a file."""
+    return SETTINGS.model_copy(update={"joint_basis": JointBasisSettings(path=path)})
 
 
 def tied(structure, parts):
@@ -128,7 +139,7 @@ def test_reduced_problem_is_that_of_the_limit(limit):
     for problem in limit:
         kernels = compiled(problem.structure)
         reduced = kernels.reduce(problem, gains)
-        projection = kernels.project(reduced.gains, *reduced.measured)
+        projection = kernels.project(reduced.gains, *reduced.data)
         product = kernels.projector.hessian_product(eta, projection).numpy()
         model = kernels.tensors.unload(projection.model, 1.0)
         found.append((float(projection.loss), model, projection.descent.numpy(), product))
@@ -177,25 +188,23 @@ def saved(tmp_path, quiet):
     return data, baselines, group, path
 
 
-def test_files_and_arrays_give_the_same_structure_and_turned_baselines_are_conjugated(saved):
-    data, baselines, group, path = saved
-    settings = CalibrationSettings(**{**SETTINGS.model_dump(), "joint_basis": {"path": str(path)}})
-    structure, _ = make_structure(data, settings)
-    assert structure == make_structure(data, SETTINGS, [group])[0]
+def test_a_file_gives_joint_models_and_turned_baselines_are_conjugated(saved):
+    data, baselines, _, path = saved
+    structure = make_structure(Observation(data), with_groups(path))
     assert np.array_equal(np.flatnonzero(structure.conjugated), np.sort(baselines[:2]))
     joint = [bucket for bucket in structure.basis.buckets if bucket.joint]
     assert [bucket.members.size for bucket in joint] == [4]
     assert structure.basis.n_models == len(structure.antennas)
-    redundant = settings.model_copy(update={"calibrator": "calamity-redundant"})
-    assert sum(bucket.joint for bucket in make_structure(data, redundant)[0].basis.buckets) == 1
+    redundant = CalamityRedundant(basis=SETTINGS.basis, joint_basis=JointBasisSettings(path=path))
+    assert sum(bucket.joint for bucket in make_structure(Observation(data), redundant).basis.buckets) == 1
 
 
 def test_calibration_with_joint_groups_recovers_foregrounds(quiet, saved):
-    data, baselines, group, _ = saved
-    structure, _ = make_structure(data, SETTINGS, [group])
+    data, baselines, group, path = saved
+    structure = make_structure(Observation(data), with_groups(path))
     foregrounds = drawn(structure)
     data.data_array[:] = (gain_products(quiet.gains, quiet.antennas) * foregrounds)[:, :, None]
-    result = calibrate(data, SETTINGS, joint=[group])
+    result = run_calibrator(with_groups(path), data)
     assert result.solutions[0].status == "converged"
     rms = np.sqrt(np.mean(np.abs(foregrounds) ** 2))
     assert np.abs(to_cube(result.residual)).max() < 1e-5 * rms
@@ -206,20 +215,20 @@ def test_calibration_with_joint_groups_recovers_foregrounds(quiet, saved):
     assert np.abs(seen.ravel() - vectors @ (vectors.T @ seen.ravel())).max() < 1e-9 * rms
 
 
-def test_all_baselines_may_be_joint(toy):
+def test_all_baselines_may_be_joint(toy, tmp_path):
     data = make_uvdata(toy, 1)
     everything = np.arange(len(toy.antennas))
-    group = JointGroup(antenna_pairs(data), mixtures(toy.structure, everything, 30))
-    structure, _ = make_structure(data, SETTINGS, [group])
+    path = tmp_path / "all.npz"
+    np.savez(path, antennas_all=antenna_pairs(data), vectors_all=mixtures(toy.structure, everything, 30))
+    structure = make_structure(Observation(data), with_groups(path))
     assert structure.basis.n_coefficients == 30
 
 
 def test_the_default_is_no_part_of_the_settings(saved):
-    assert "joint_basis" not in identify(CalibrationSettings().model_dump(mode="json"))
-    settings = CalibrationSettings(joint_basis={"path": str(saved[3])})
-    assert identify(settings.model_dump(mode="json"))["joint_basis"]["path"].startswith("sha256:")
-    with pytest.raises(ValueError, match="calamity and calamity-redundant, not sky-based"):
-        CalibrationSettings(calibrator="sky-based", joint_basis={"path": str(saved[3])})
+    assert "joint_basis" not in identity(Calamity())
+    assert identity(with_groups(saved[3]))["joint_basis"]["path"].startswith("sha256:")
+    with pytest.raises(ValidationError, match="joint_basis"):
+        SkyBased(joint_basis={"path": str(saved[3])})
 
 
 @pytest.mark.parametrize(

@@ -6,18 +6,25 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from calstudy.base.errors import InputError
 from calstudy.bench.calibration_case import Case, Simulation
-from calstudy.bench.solve_size import measure_solve, plan_solve
+from calstudy.bench.solve_memory import measure_solve, plan_solve
 from calstudy.calibrate.basis import make_basis
-from calstudy.calibrate.memory import LEAST_MODELS, LIBRARIES, Dimensions, fit_models_at_once, solve_memory
-from calstudy.calibrate.settings import CalibrationSettings
-from calstudy.commands.bench import bench_app
-from calstudy.errors import InputError
-from calstudy.graph.solve_estimates import baseline_lengths, dimensions_of, memory_of, seconds_of
+from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.cost import (
+    LEAST_MODELS,
+    TENSORFLOW_MEMORY,
+    Dimensions,
+    dimensions_of,
+    fit_models_at_once,
+    solve_memory,
+)
+from calstudy.cli.bench import bench_app
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.size import Size, baseline_lengths
 
-DEFAULT = CalibrationSettings()
+DEFAULT = Calamity()
 LARGE = Dimensions(antennas=350, baselines=61_075, models=61_075, channels=384, widest=53, coefficients=1.95e6)
 
 
@@ -38,7 +45,7 @@ def test_350_antennas_are_planned_within_16_gb():
 
 @pytest.mark.parametrize("solver", ["gauss-newton", "lbfgs", "adamax"])
 def test_memory_grows_with_the_number_of_visibilities(solver):
-    settings = CalibrationSettings.model_validate({"solver": solver})
+    settings = Calamity.model_validate({"solver": solver})
     sizes = [Dimensions(n, n * (n - 1) // 2, n * (n - 1) // 2, 384, 53, 16 * n * (n - 1)) for n in (100, 200, 400)]
     small, middle, large = (solve_memory(size, settings) for size in sizes)
     # Baselines grow as the square of the antennas, blocks of antennas as their number.
@@ -65,24 +72,25 @@ def test_plans_without_a_layout_are_those_with_it(layout):
     frequencies = channels.first + channels.width * np.arange(channels.count)
     basis = make_basis(lengths, frequencies, DEFAULT.basis)
     widest = max(bucket.vectors.shape[1] for bucket in basis.buckets)
-    sections = instrument.model_dump(mode="json")
-    guessed = dimensions_of(sections, DEFAULT, len(enu))
+    size = Size.of(instrument)
+    guessed = dimensions_of(size, DEFAULT)
     exact = Dimensions(len(enu), len(lengths), len(lengths), channels.count, widest, basis.n_coefficients)
-    assert baseline_lengths(sections["layout"])[0] == pytest.approx(lengths.max(), rel=0.6)
+    assert baseline_lengths(instrument.layout)[0] == pytest.approx(lengths.max(), rel=0.6)
     assert guessed.coefficients == pytest.approx(exact.coefficients, rel=0.3)
-    planned = memory_of(sections, DEFAULT.model_dump(mode="json"), len(enu)) - LIBRARIES
-    assert planned == pytest.approx(solve_memory(exact, DEFAULT) - LIBRARIES, rel=0.5)
+    planned = DEFAULT.cost(size).memory - TENSORFLOW_MEMORY
+    assert planned == pytest.approx(solve_memory(exact, DEFAULT) - TENSORFLOW_MEMORY, rel=0.5)
 
 
 def test_every_solver_has_its_own_time():
-    samples = 630 * 384
-    found = {
-        name: seconds_of(CalibrationSettings.model_validate({"solver": name}).solver.model_dump(), 56, samples)
-        for name in ("gauss-newton", "lbfgs", "adamax")
-    }
+    size = Size.of(InstrumentSettings())
+
+    def seconds(solver) -> float:
+        return Calamity.model_validate({"solver": solver}).cost(size).seconds
+
+    found = {name: seconds(name) for name in ("gauss-newton", "lbfgs", "adamax")}
     assert found["gauss-newton"] < found["lbfgs"] < found["adamax"]
     cold = {"name": "gauss-newton", "warm_start": False, "max_steps": 100}
-    assert seconds_of(cold, 56, samples) > 3 * found["gauss-newton"]
+    assert seconds(cold) > 3 * found["gauss-newton"]
 
 
 def test_what_cannot_fit_is_refused_before_it_starts():

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.constants import speed_of_light
 
-from calstudy.calibrate.calamity import calibrate
-from calstudy.calibrate.settings import CalibrationSettings
+from calstudy.base.visibilities import antenna_indices, from_cube, to_cube
+from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
 from calstudy.power.delay import delay_transform
-from calstudy.visibilities import antenna_indices, from_cube, to_cube
 
 INSTRUMENT = {
     "layout": {"kind": "hex", "side": 2, "spacing": "14 m"},
@@ -46,7 +46,7 @@ def window_rms():
         gains = rough if chromatic else np.ones_like(rough)
         measured = gains[first] * gains[second].conj() * (foregrounds + noise)
         data, sky = (from_cube(template, cube[None, :, :, None]) for cube in (measured, foregrounds))
-        residual = calibrate(data, CalibrationSettings(calibrator=calibrator), sky).residual
+        residual = run_calibrator(CALIBRATORS.make(calibrator), data, sky).residual
         far = np.abs(np.arange(96) - 48) > 24
         left, thermal = (
             delay_transform(cube, frequencies, "blackman-harris")[:, far]

@@ -7,10 +7,10 @@ import pytest
 from pyuvdata import UVData
 from test_calamity import make_uvdata
 
-from calstudy.calibrate.reading import match_sky_model, prepare, read_visibilities
-from calstudy.calibrate.selection import Selection, parse_selection, select
-from calstudy.errors import InputError
-from calstudy.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
+from calstudy.observed.reading import match_sky_model, prepare, read_visibilities
+from calstudy.observed.selection import Selection, parse_selection, select
 
 
 @pytest.fixture
@@ -47,7 +47,8 @@ def test_missing_samples_are_flagged(data):
     prepared.check()
     assert notes == ["3 of 84 samples of a baseline at a time were missing and are flagged."]
     flags = flag_cube(prepared).reshape(84, 64)
-    assert flags[[3, 40, 41]].all() and not np.delete(flags, [3, 40, 41], 0).any()
+    assert flags[[3, 40, 41]].all()
+    assert not np.delete(flags, [3, 40, 41], 0).any()
     present = np.delete(np.arange(84), [3, 40, 41])
     assert np.array_equal(to_cube(prepared).reshape(84, -1)[present], to_cube(data).reshape(84, -1)[present])
     assert np.array_equal(prepared.time_array, data.time_array)
@@ -86,7 +87,8 @@ def test_phased_data_are_unphased(data):
     phased = data.copy()
     phased.phase(ra=0.3, dec=-0.4, cat_name="field", phase_frame="icrs")
     prepared, notes = prepare(phased)
-    assert len(notes) == 1 and "drift scan" in notes[0]
+    assert len(notes) == 1
+    assert "drift scan" in notes[0]
     assert np.abs(to_cube(prepared) - to_cube(data)).max() < 1e-6 * np.abs(to_cube(data)).max()
 
 
@@ -117,7 +119,8 @@ def test_selections_are_read_and_applied(data):
     assert selection.times == (1, None)
     part = select(data, selection)
     assert (part.Nants_data, part.Ntimes, part.Npols) == (3, 2, 1)
-    assert part.freq_array.min() >= 165e6 and part.freq_array.max() <= 170e6
+    assert part.freq_array.min() >= 165e6
+    assert part.freq_array.max() <= 170e6
 
 
 @pytest.mark.parametrize(

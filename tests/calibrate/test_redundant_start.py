@@ -9,11 +9,12 @@ import pytest
 from test_calamity import SETTINGS, make_uvdata
 from toy import FREQUENCIES, HEX, make_toy, scattered
 
-from calstudy.calibrate.calamity import calibrate
-from calstudy.calibrate.measured import measure
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Observation
+from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.preparation import prepare
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.settings import RedundantStart
-from calstudy.errors import InputError
 from calstudy.instrument.layouts import redundant_groups
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
@@ -32,7 +33,7 @@ def start_of(toy, delays, change=None):
     if change is not None:
         change(data)
     settings = SETTINGS.model_copy(update={"initial_gains": RedundantStart(kind="redundant", delays=delays)})
-    return data, settings, measure(data, settings).start[..., 0, 0]
+    return data, settings, prepare(Observation(data), settings).start[..., 0, 0]
 
 
 def test_gains_are_right_up_to_what_redundancy_cannot_know(hexagon):
@@ -48,7 +49,7 @@ def test_gains_are_right_up_to_what_redundancy_cannot_know(hexagon):
 
 def test_long_cables_are_within_reach_of_the_fit_from_there_but_not_from_unity(hexagon):
     data, settings, _ = start_of(hexagon, delays=True)
-    near, far = calibrate(data, settings).solutions[0], calibrate(data, SETTINGS).solutions[0]
+    near, far = run_calibrator(settings, data).solutions[0], run_calibrator(SETTINGS, data).solutions[0]
     assert near.status == "converged"
     assert near.loss_history[0] < 0.1 * far.loss_history[0]
     assert near.loss_history[-1] < 0.1 * far.loss_history[-1]

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calstudy.claims.study import Study
-from calstudy.power.spherical import SphericalSpectrum
+from calstudy.claims.results import RunResults
+from calstudy.experiment.files import validate
+from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import save_spectrum
-from calstudy.power.wedge import WedgeSpectrum
 
 SIGNAL = 1e7
 EDGES = 0.04 * np.arange(85)
@@ -94,7 +94,7 @@ def spherical(world: World, rng: np.random.Generator, kind: str, modes: str) -> 
     )
 
 
-def wedge(world: World, rng: np.random.Generator, kind: str) -> WedgeSpectrum:
+def wedge(world: World, rng: np.random.Generator, kind: str) -> CylindricalSpectrum:
     shape = (LENGTHS.size, DELAY.size)
     horizon = LENGTHS / 299792458.0
     noise, signal = SIGNAL * rng.normal(size=shape), np.full(shape, SIGNAL)
@@ -107,7 +107,7 @@ def wedge(world: World, rng: np.random.Generator, kind: str) -> WedgeSpectrum:
         "residual": world.recovered * signal + noise,
         "residual_without_eor": noise,
     }[kind]
-    return WedgeSpectrum(
+    return CylindricalSpectrum(
         baseline_length=LENGTHS,
         bin_edges=np.column_stack([LENGTHS - 2, LENGTHS + 2]),
         k_perp=5.5e-4 * LENGTHS,
@@ -123,10 +123,10 @@ KINDS = ("eor", "noise", "uncorrupted", "uncalibrated", "residual", "residual_wi
 
 
 @pytest.fixture
-def make_study(tmp_path) -> Callable[..., Study]:
+def make_study(tmp_path) -> Callable[..., RunResults]:
     """Return a maker of studies: `make(name, kinds, **facts of World)`."""
 
-    def make(name: str = "run", kinds: tuple[str, ...] = KINDS, seed: int = 1, **truth: Any) -> Study:
+    def make(name: str = "run", kinds: tuple[str, ...] = KINDS, seed: int = 1, **truth: Any) -> RunResults:
         world = World(**truth)
         folder = tmp_path / name
         folder.mkdir(parents=True)
@@ -142,7 +142,7 @@ def make_study(tmp_path) -> Callable[..., Study]:
         }
         agreement = {"measurements": measurements, "redundant_fraction": world.redundant_fraction}
         Path(folder / "agreement.json").write_text(json.dumps(agreement))
-        facts = {"name": name, "calibration": {}, "corruption": {}, "power": {}} | world.facts
-        return Study.of(facts, [folder])
+        experiment = validate({"name": name, "papers": ["calamity2022"], **world.facts}, tmp_path)
+        return RunResults(experiment, (folder,))
 
     return make

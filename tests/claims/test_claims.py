@@ -1,20 +1,26 @@
 """Claims: PASS where the sentence is true by construction, FAIL where it is false, a reason where it cannot be told."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from tiny import tiny
 
-from calstudy.claims.bins import bias_extent, difference_error, fraction_within, recovered
-from calstudy.claims.evaluation import STATEMENTS, evaluate, roles_of
+from calstudy.base.errors import InputError
+from calstudy.claims.evaluation import evaluate_members, evaluate_run, refusals_of_run
 from calstudy.claims.folders import evaluate_folder
-from calstudy.claims.statement import Above, Below, Consistent, Finding, Within
-from calstudy.claims.tables import from_json, tally, to_json, to_markdown
-from calstudy.errors import InputError
+from calstudy.experiment.files import dump, override, validate
+from calstudy.experiment.model import PAPERS
+from calstudy.papers.calamity2022.bins import bias_extent, difference_error, fraction_within, recovered
+from calstudy.studies.load import load_study
+from calstudy.verdicts.tables import from_json
 
-REFLECTION = {"corruption": {"gains": {"kind": "reflection"}}}
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+PAPER = PAPERS.make("calamity2022")
+LOW_SNR_FACTS = {"corruption": {"effects": [{"kind": "reflection-gains"}], "noise": {"kind": "times-foregrounds"}}}
+ADAMAX = {"calibration": {"solver": {"name": "adamax"}}}
+GROUPS = {"calibration": {"calibrator": "calamity-redundant"}}
 
 
 def verdicts(claims) -> dict[str, str]:
@@ -26,16 +32,22 @@ def failing(claims) -> set[str]:
 
 
 def alone(study):
-    return evaluate(dict.fromkeys(roles_of(study), study))
+    return evaluate_run([PAPER], study).verdicts
+
+
+def roles_of(study) -> tuple[str, ...]:
+    return tuple(role for role, refusal in refusals_of_run(PAPER, study).items() if refusal is None)
 
 
 BIAS_CLAIM = "positive-bias-at-small-k"
 
 
 def test_names_are_unique_and_every_statement_says_what_and_why():
-    names = [statement.name for statement in STATEMENTS]
+    statements = PAPER.statements()
+    names = [statement.name for statement in statements]
     assert len(set(names)) == len(names) >= 40
-    assert all(item.sentence and item.quantity and item.why and item.section for item in STATEMENTS)
+    assert all(item.sentence and item.quantity and item.why and item.section for item in statements)
+    assert {role for item in statements for role in item.roles} == set(PAPER.roles)
 
 
 def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(make_study):
@@ -107,12 +119,11 @@ def test_residuals_of_noise_alone_show_no_bias_and_the_claim_of_one_fails(make_s
 
 
 def test_the_papers_solver_is_held_to_its_own_claim(make_study):
-    adamax = {"calibration": {"solver": {"name": "adamax"}}}
-    biased = alone(make_study("biased", without_eor_bias=0.1, facts=adamax))
-    clean = alone(make_study("clean", facts=adamax))
+    biased = alone(make_study("biased", without_eor_bias=0.1, facts=ADAMAX))
+    clean = alone(make_study("clean", facts=ADAMAX))
     name = f"{BIAS_CLAIM}-with-papers-solver"
     assert (verdicts(biased)[name], verdicts(clean)[name]) == ("PASS", "FAIL")
-    assert verdicts(alone(make_study("own")))[name] == "not evaluated"
+    assert name not in verdicts(alone(make_study("own")))
 
 
 def test_a_strong_residual_without_eor_is_neither_low_nor_at_the_noise(make_study):
@@ -126,9 +137,9 @@ def compare(make_study, **redundant):
         "minimally_redundant": make_study("minimal", without_eor_bias=0.03),
         "redundant": make_study("redundant", seed=2, **(truth | redundant)),
     }
-    studies["redundant_modelling"] = make_study("groups", seed=2, **truth)
+    studies["redundant_modelling"] = make_study("groups", seed=2, facts=GROUPS, **truth)
     section = "Performance on a Redundant Array"
-    return [claim for claim in evaluate(studies) if claim.section == section]
+    return [claim for claim in evaluate_members([PAPER], studies).verdicts if claim.section == section]
 
 
 def test_claims_on_the_redundant_array_hold_in_the_papers_world(make_study):
@@ -154,7 +165,7 @@ def test_claims_on_the_redundant_array_fail_where_they_are_false(make_study, tru
     assert fail <= failing(compare(make_study, **({"recovered": 0.96} | truth)))
 
 
-LOW_SNR = {"facts": REFLECTION, "noise": 1000.0, "leakage": 0.0}
+LOW_SNR = {"facts": LOW_SNR_FACTS, "noise": 1000.0, "leakage": 0.0}
 
 
 def low_snr(study):
@@ -191,14 +202,128 @@ def test_claims_at_low_snr_fail_where_they_are_false(make_study, truth, fail):
     [
         ({}, 0.02, ("minimally_redundant",)),
         ({}, 0.9, ("redundant",)),
-        ({"calibration": {"calibrator": "calamity-redundant"}}, 0.9, ("redundant_modelling",)),
-        ({"calibration": {"solver": {"name": "adamax"}}}, 0.02, ("minimally_redundant", "paper_solver")),
-        (REFLECTION, 0.02, ("low_snr",)),
-        ({"corruption": {"gains": "unity"}}, 0.02, ()),
+        (GROUPS, 0.9, ("redundant_modelling",)),
+        (GROUPS, 0.02, ()),
+        (ADAMAX, 0.02, ("minimally_redundant", "paper_solver")),
+        (ADAMAX, 0.9, ("redundant",)),
+        (LOW_SNR_FACTS, 0.02, ("low_snr",)),
     ],
 )
 def test_a_run_plays_the_role_that_it_was_made_for(make_study, facts, fraction, roles):
     assert roles_of(make_study(redundant_fraction=fraction, facts=facts)) == roles
+
+
+def changed(experiment: dict, changes: dict) -> dict:
+    for path, value in changes.items():
+        experiment = override(experiment, path, value)
+    return experiment
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"calibration.calibrator": "sky-based"}, "calibration.calibrator is 'sky-based'"),
+        ({"calibration.calibrator": "calamity-redundant"}, "calibration.calibrator is 'calamity-redundant'"),
+        ({"calibration.gain_delay": "400 ns"}, "calibration.gain_delay is 4e-07 s"),
+        ({"calibration.basis": {"buffer": "200 ns"}}, "calibration.basis.buffer is 2e-07 s"),
+        ({"calibration.prior": "none"}, "calibration.prior is none"),
+        ({"calibration.integrations_per_solve": 2}, "calibration.integrations_per_solve is 2"),
+        ({"calibration.solver": {"name": "adamax", "max_steps": 1}}, "calibration.solver.max_steps is 1"),
+        (
+            {"corruption.noise": "none", "variants": {"residual": {"components": ["foregrounds"]}}},
+            "corruption.noise is 'none'",
+        ),
+        ({"corruption.noise": "times-foregrounds"}, "corruption.noise is 'times-foregrounds'"),
+        ({"corruption.noise": {"factor": 1}}, "corruption.noise.factor is 1"),
+        ({"corruption.effects": []}, "corruption.effects is empty"),
+        ({"corruption.effects": [{"kind": "per-channel-gains", "sigma": 0}]}, "corruption.effects.0.sigma is 0.0"),
+        ({"corruption.effects": [{"kind": "per-channel-gains", "sigma": 0.2}]}, "corruption.effects.0.sigma is 0.2"),
+        ({"corruption.effects": [{"kind": "reflection-gains"}]}, "corruption.effects is reflection-gains"),
+        (
+            {"corruption.effects": [{"kind": "per-channel-gains"}, {"kind": "reflection-gains", "seed": 8}]},
+            "corruption.effects is per-channel-gains, reflection-gains",
+        ),
+        ({"corruption.eor_level": "-30 dB"}, "corruption.eor_level is not -40 dB"),
+        (
+            {"variants": {"residual": {"components": ["eor"], "calibrate": True}}},
+            "variants.residual is not the paper's",
+        ),
+    ],
+)
+@pytest.mark.parametrize("role", ["minimally_redundant", "redundant", "paper_solver"])
+def test_what_is_not_the_papers_study_plays_no_role_of_it(tmp_path, changes, reason, role):
+    data = changed({"name": "changed", "outputs": {"figures": []}}, changes)
+    assert PAPER.refusal(role, validate(data, tmp_path)).startswith(reason)
+
+
+@pytest.mark.parametrize(
+    ("role", "changes", "reason"),
+    [
+        ("low_snr", {"calibration.calibrator": "sky-based"}, "calibration.calibrator is 'sky-based'"),
+        ("low_snr", {"corruption.noise": {"kind": "times-eor", "factor": 10}}, "corruption.noise is 'times-eor'"),
+        (
+            "low_snr",
+            {"corruption.effects": [{"kind": "reflection-gains", "amplitude": 0.1}]},
+            "corruption.effects.0.amplitude is 0.1",
+        ),
+        ("redundant_modelling", {}, "calibration.calibrator is 'calamity', not 'calamity-redundant'"),
+        ("redundant_modelling", {"calibration.calibrator": "sky-based"}, "calibration.calibrator is 'sky-based'"),
+        ("paper_solver", {}, "calibration.solver is not the paper's"),
+        (
+            "paper_solver",
+            {"calibration.solver": {"name": "adamax", "learning_rate": 0.1}},
+            "calibration.solver is not the paper's",
+        ),
+        ("run_time", {}, "an experiment measures no run times"),
+    ],
+)
+def test_a_role_needs_the_settings_that_its_sentences_are_about(tmp_path, role, changes, reason):
+    facts = LOW_SNR_FACTS if role == "low_snr" else {}
+    data = changed({"name": "changed", "outputs": {"figures": []}, **facts}, changes)
+    assert PAPER.refusal(role, validate(data, tmp_path)).startswith(reason)
+
+
+def test_a_users_calibrator_plays_no_role(make_study):
+    study = make_study()
+    own = study.experiment.calibration.model_copy(update={"calibrator": "/somewhere/mine.py"})
+    experiment = study.experiment.model_copy(update={"calibration": own})
+    assert {PAPER.refusal(role, experiment) is None for role in PAPER.roles} == {False}
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [
+        *(
+            (name, scale)
+            for name in ("minredundant", "redundant", "lowsnr", "convergence")
+            for scale in (None, "small")
+        ),
+        ("quickstart", None),
+    ],
+)
+def test_a_published_experiment_plays_its_role_at_every_scale(name, scale):
+    experiment = load_study(EXPERIMENTS / f"{name}.yaml", scale).experiment
+    role = {"redundant": "redundant", "lowsnr": "low_snr"}.get(name, "minimally_redundant")
+    assert PAPER.refusal(role, experiment) is None
+    assert [paper.reference for paper in experiment.papers] == ([] if name == "quickstart" else ["calamity2022"])
+
+
+def test_the_experiment_of_other_tests_differs_from_the_paper_in_scale_alone(tmp_path):
+    assert PAPER.refusal("redundant", validate(tiny(tmp_path), tmp_path)) is None
+
+
+def test_a_run_without_a_role_has_no_claims_and_says_why_in_a_sentence(make_study):
+    found = evaluate_run([PAPER], make_study(facts={"calibration": {"calibrator": "sky-based"}}))
+    assert found.verdicts == []
+    (sentence,) = found.without_role
+    assert sentence.startswith("The run plays no role in calamity2022: calibration.calibrator is 'sky-based', not ")
+    assert sentence.count("'calamity' (minimally_redundant, redundant, low_snr, paper_solver)") == 1
+
+
+def test_a_run_is_held_to_the_statements_about_its_role_alone(make_study):
+    groups = evaluate_run([PAPER], make_study(redundant_fraction=0.9, facts=GROUPS))
+    assert set(verdicts(groups.verdicts)) == {"redundant-modelling-same-visibilities", "redundant-modelling-same-power"}
+    assert {claim.reason for claim in groups.verdicts} == {f"needs {PAPER.roles['redundant']}"}
 
 
 def test_what_a_run_lacks_is_said(make_study):
@@ -240,44 +365,44 @@ def test_the_bias_ends_where_it_was_made_to(make_study, edge):
     assert found.value == pytest.approx(edge, abs=1e-9)
 
 
-@given(st.floats(-10, 10), st.floats(1e-3, 3), st.floats(-5, 5))
-def test_thresholds_are_what_they_say(value, uncertainty, bound):
-    finding = Finding(value, uncertainty)
-    assert Above(bound).holds(finding) == (value >= bound)
-    assert Below(bound).holds(finding) == (value <= bound)
-    assert Within(bound, bound + 1).holds(finding) == (bound <= value <= bound + 1)
-    assert Above(bound, 2).holds(finding) <= Above(bound).holds(finding)
-    assert not (Above(bound, 2).holds(finding) and Below(bound, 2).holds(finding))
-    assert Consistent(bound).holds(finding) == (abs(value - bound) <= 2 * uncertainty)
-
-
 def test_half_of_the_values_within_their_bars_is_a_half():
     found = fraction_within(np.array([0.0, 1.9, 2.0, -5.0]), np.ones(4))
     assert found.value == 0.5
     assert found.uncertainty == pytest.approx(np.sqrt(0.95 * 0.05 / 4))
 
 
-def test_json_reads_back_and_markdown_tells_everything(make_study):
-    claims = alone(make_study())
-    assert from_json(to_json(claims)) == claims
-    text = to_markdown(claims, "run", ["small | scale"])
-    assert all(claim.name in text for claim in claims)
-    assert tally(claims) in text
-    rows = [line for line in text.splitlines() if line.startswith("| ")]
-    assert {line.replace("\\|", "").count("|") for line in rows} == {7}
+def run_folder(study, folder: Path) -> Path:
+    """Make the folder of a study's tables that of a finished run."""
+    (folder / "manifest.json").write_text(json.dumps({"name": study.name, "stand_ins": ["a small sky"]}))
+    (folder / "experiment.yaml").write_text(dump(study.experiment))
+    return folder
 
 
 def test_a_run_folder_is_evaluated_and_written(make_study, tmp_path):
     study = make_study("tables")
-    folder = tmp_path
-    (folder / "manifest.json").write_text(json.dumps({"name": "kept", "stand_ins": ["a small sky"]}))
-    (folder / "experiment.yaml").write_text("{name: kept, calibration: {}, corruption: {}, power: {}}")
+    folder = run_folder(study, tmp_path)
     evaluated = evaluate_folder(folder)
     assert verdicts(evaluated.claims) == verdicts(alone(study))
     assert from_json((folder / "claims.json").read_text()) == evaluated.claims
     assert "Stand-in: a small sky." in (folder / "claims.md").read_text()
 
 
-def test_a_folder_of_no_run_is_refused(tmp_path):
+def test_claims_md_says_why_there_are_none(make_study, tmp_path):
+    folder = run_folder(make_study("tables", facts={"calibration": {"calibrator": "sky-based"}}), tmp_path)
+    evaluated = evaluate_folder(folder)
+    assert evaluated.claims == from_json((folder / "claims.json").read_text()) == []
+    assert (folder / "claims.md").read_text().endswith(f"\n{evaluated.without_role[0]}\n")
+
+
+def test_folders_that_cannot_be_evaluated_are_told(make_study, tmp_path):
     with pytest.raises(InputError, match="not the folder of a finished run"):
         evaluate_folder(tmp_path)
+    folder = run_folder(make_study("tables", facts={"papers": []}), tmp_path)
+    with pytest.raises(InputError, match=r"names no papers; give one with --paper \(calamity2022, or a file\.py\)"):
+        evaluate_folder(folder)
+    assert evaluate_folder(folder, ["calamity2022"]).claims
+    with pytest.raises(InputError, match="'calamity' is not a paper"):
+        evaluate_folder(folder, ["calamity"])
+    (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "points": []}))
+    with pytest.raises(InputError, match="is the folder of a sweep; give that of one of its points"):
+        evaluate_folder(folder)

@@ -1,23 +1,60 @@
 """Corruption: levels, noise and gains are what the paper says."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from pyuvdata.utils import uvcalibrate
 
-from calstudy.corrupt.gains import draw_reflection_gains, make_gains, per_channel_gains, reflection_gain
+from calstudy.base.errors import InputError
+from calstudy.base.gains import gains_for, make_uvcal
+from calstudy.base.observation import Observation
+from calstudy.base.visibilities import antenna_indices, from_cube, to_cube
+from calstudy.corrupt.effects.file_gains import FileGains
+from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
+from calstudy.corrupt.effects.reflection_gains import ReflectionGains, reflection_gain
+from calstudy.corrupt.interface import GainEffect, apply_effect, draw_truth
 from calstudy.corrupt.levels import rms, set_levels
-from calstudy.corrupt.measure import corrupt_by_gains
 from calstudy.corrupt.noise import thermal_noise
-from calstudy.corrupt.settings import CorruptionSettings, FileGains, ReflectionGains, UnityGains
-from calstudy.errors import InputError
-from calstudy.gains import gains_for, make_uvcal
-from calstudy.visibilities import antenna_indices, from_cube, to_cube
+from calstudy.corrupt.settings import CorruptionSettings
+from calstudy.experiment.model import Variant
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.telescope import make_template
 
 
 def complex_normal(rng, shape):
     return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+
+def observation(antennas: int, channels: int, polarizations: tuple[str, ...] = ("xx",)):
+    """Return a line of antennas without data."""
+    settings = {
+        "layout": {"kind": "linear", "count": antennas},
+        "channels": {"first": "167.075 MHz", "count": channels},
+        "times": {"count": 1},
+        "polarizations": polarizations,
+    }
+    return Observation(make_template(InstrumentSettings.model_validate(settings)))
+
+
+class Given(GainEffect):
+    """Gains from a test."""
+
+    def gains(self, observation, random):
+        return self._gains
+
+    def __init__(self, gains: np.ndarray) -> None:
+        super().__init__()
+        object.__setattr__(self, "_gains", gains)
+
+
+def corrupted(effect, uvd):
+    """Return visibilities after an effect."""
+    observed = Observation(uvd)
+    return apply_effect(effect, to_cube(uvd).copy(), observed, draw_truth(effect, observed))
 
 
 def test_noise_has_the_asked_variance_in_both_parts_and_is_white():
@@ -35,11 +72,23 @@ def test_noise_depends_on_its_seed_only():
 
 
 def test_per_channel_gains_scatter_about_unity_by_sigma_in_each_part():
-    gains = per_channel_gains(100, 1000, sigma=0.1, seed=5)
+    gains = draw_truth(PerChannelGains(sigma=0.1, seed=5), observation(100, 1000))["gains"][:, :, 0, 0]
     assert np.mean(gains) == pytest.approx(1, abs=2e-3)
     assert np.std(gains.real) == pytest.approx(0.1, rel=0.01)
     assert np.std(gains.imag) == pytest.approx(0.1, rel=0.01)
     assert abs(np.mean((gains[:, 1:] - 1) * (gains[:, :-1] - 1).conj())) < 4 * 0.02 / np.sqrt(1e5)
+
+
+def test_draws_are_those_of_the_published_experiments_to_the_bit():
+    """One stream for all polarizations: antennas, then channels, of one after the other."""
+    observed = observation(4, 8, ("xx", "yy"))
+    real, imaginary = np.random.default_rng(5).standard_normal((2, 8, 8))
+    expected = (1 + 0.1 * (real + 1j * imaginary)).reshape(2, 4, 8)
+    assert np.array_equal(draw_truth(PerChannelGains(), observed)["gains"][:, :, 0].transpose(2, 0, 1), expected)
+    random = np.random.default_rng(5)
+    drawn = random.exponential(0.01, 8), random.normal(1200e-9, 100e-9, 8), random.uniform(0, 2 * np.pi, 8)
+    expected = reflection_gain(observed.frequencies, *(values[:, None] for values in drawn)).reshape(2, 4, 8)
+    assert np.array_equal(draw_truth(ReflectionGains(), observed)["gains"][:, :, 0].transpose(2, 0, 1), expected)
 
 
 @given(r=st.floats(0, 0.3), tau=st.floats(-2e-6, 2e-6), phi=st.floats(-3, 3))
@@ -50,18 +99,20 @@ def test_a_reflection_gain_is_the_sum_of_its_echoes(r, tau, phi):
 
 
 def test_reflections_peak_at_their_delay_with_their_amplitude():
-    nu = 167e6 + 80e3 * np.arange(384)
-    gains = draw_reflection_gains(2000, nu, ReflectionGains(kind="reflection", seed=3))
+    observed = observation(300, 384)
+    nu = observed.frequencies
+    draws = [draw_truth(ReflectionGains(seed=seed), observed)["gains"][:, :, 0, 0] for seed in range(7)]
+    gains = np.concatenate(draws)
     spectrum = np.abs(np.fft.fft(gains - gains.mean(axis=1, keepdims=True), axis=1)) / nu.size
     delay = np.abs(np.fft.fftfreq(nu.size, 80e3))[spectrum.argmax(axis=1)]
     assert np.mean(delay) == pytest.approx(1200e-9, abs=20e-9)
-    # The mean of r over 2000 antennas is known to 0.01 / sqrt(2000); scalloping loses up to 36 % of a peak.
+    # The mean of r over 2100 antennas is known to 0.01 / sqrt(2100); scalloping loses up to 36 % of a peak.
     assert 0.007 < spectrum.max(axis=1).mean() < 0.0105
 
 
 def test_a_reflection_that_does_not_decay_is_refused():
-    with pytest.raises(InputError, match=r"corruption\.gains\.amplitude = 0\.9"):
-        draw_reflection_gains(100, np.ones(3), ReflectionGains(kind="reflection", amplitude=0.9))
+    with pytest.raises(InputError, match=r"corruption\.effects: amplitude = 0\.9: drew a reflection of"):
+        draw_truth(ReflectionGains(amplitude=0.9), observation(100, 8))
 
 
 def test_levels_put_the_eor_40_db_below_in_amplitude_and_the_noise_10_times_above():
@@ -87,25 +138,22 @@ def test_rms_is_over_complex_samples():
     assert rms(np.array([3.0, 4.0j])) == pytest.approx(np.sqrt(12.5))
 
 
-def test_corruption_multiplies_by_g_a_and_conjugate_g_b(template, rng):
+def test_gains_multiply_by_g_a_and_conjugate_g_b(template, rng):
     cube = complex_normal(rng, (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols))
     gains = complex_normal(rng, (template.Nants_telescope, template.Nfreqs, 1, template.Npols))
-    data = corrupt_by_gains(from_cube(template, cube), make_uvcal(template, gains))
     a, b = antenna_indices(template).T
     expected = gains[a, :, 0] * gains[b, :, 0].conj() * cube
-    assert to_cube(data) == pytest.approx(expected, rel=1e-13)
-    assert data.vis_units == template.vis_units
+    assert corrupted(Given(gains), from_cube(template, cube)) == pytest.approx(expected, rel=1e-13)
 
 
 def test_gains_read_from_a_file_are_those_written(template, rng, tmp_path):
     gains = complex_normal(rng, (template.Nants_telescope, template.Nfreqs, 1, template.Npols))
     make_uvcal(template, gains).write_calh5(tmp_path / "g.calh5")
-    back = make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template)
-    assert np.array_equal(gains_for(back, template), gains)
+    assert np.array_equal(draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))["gains"], gains)
 
 
 def test_gains_of_other_channels_or_antennas_are_refused(template, tmp_path):
-    unity = make_gains(UnityGains(kind="unity"), template)
+    unity = make_uvcal(template, np.ones((template.Nants_telescope, template.Nfreqs, 1, template.Npols), complex))
     shifted = unity.copy()
     shifted.freq_array = shifted.freq_array + 5e6
     with pytest.raises(InputError, match="no channel at 167"):
@@ -113,8 +161,8 @@ def test_gains_of_other_channels_or_antennas_are_refused(template, tmp_path):
     with pytest.raises(InputError, match=r"no solution for antenna\(s\) 6"):
         gains_for(unity.select(antenna_nums=list(range(6)), inplace=False), template)
     (tmp_path / "noise.calh5").write_bytes(b"no gains")
-    with pytest.raises(InputError, match=r"corruption\.gains\.path"):
-        make_gains(FileGains(kind="file", path=tmp_path / "noise.calh5"), template)
+    with pytest.raises(InputError, match=r"corruption\.effects: path = '.*noise.calh5': not a readable CalH5"):
+        draw_truth(FileGains(path=tmp_path / "noise.calh5"), Observation(template))
 
 
 @pytest.mark.parametrize("convention", ["divide", "multiply"])
@@ -124,8 +172,7 @@ def test_a_gain_file_corrupts_as_pyuvdata_understands_it(template, rng, tmp_path
     cal.gain_convention = convention
     cal.write_calh5(tmp_path / "g.calh5")
     sky = from_cube(template, np.ones((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), complex))
-    data = corrupt_by_gains(sky, make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template))
-    raw = data.copy()
+    raw = from_cube(template, corrupted(FileGains(path=tmp_path / "g.calh5"), sky))
     raw.vis_units, raw.pol_convention = "uncalib", None
     calibrated = uvcalibrate(raw, cal, inplace=False, time_check=False)
     assert to_cube(calibrated) == pytest.approx(1, rel=1e-12)
@@ -135,7 +182,7 @@ def test_flagged_gains_of_a_file_count_as_unity(template, tmp_path):
     cal = make_uvcal(template, np.full((template.Nants_telescope, template.Nfreqs, 1, template.Npols), 5 + 0j))
     cal.flag_array[2, 3] = True
     cal.write_calh5(tmp_path / "g.calh5")
-    gains = gains_for(make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template), template)
+    gains = draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))["gains"]
     assert gains[2, 3] == 1
     assert np.count_nonzero(gains != 5) == 1
 
@@ -143,9 +190,47 @@ def test_flagged_gains_of_a_file_count_as_unity(template, tmp_path):
 def test_gains_that_change_in_time_or_are_delays_are_refused(template, tmp_path):
     shape = (template.Nants_telescope, template.Nfreqs, template.Ntimes, template.Npols)
     make_uvcal(template, np.ones(shape, complex)).write_calh5(tmp_path / "g.calh5")
-    with pytest.raises(InputError, match="holds 3 times"):
-        make_gains(FileGains(kind="file", path=tmp_path / "g.calh5"), template)
+    with pytest.raises(InputError, match="'file-gains': its gains vary in time, which is not supported yet"):
+        draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))
     delays = make_uvcal(template, np.ones((*shape[:2], 1, shape[3]), complex))
     delays.cal_type = "delay"
     with pytest.raises(InputError, match="holds delay solutions"):
         gains_for(delays, template)
+
+
+@pytest.mark.parametrize(
+    ("gains", "told"),
+    [
+        (np.ones((3, 2, 1, 1), complex), r"of shape \(3, 2, 1, 1\), expected complex of shape"),
+        (0.0, "zero or not finite"),
+        (np.nan, "zero or not finite"),
+    ],
+)
+def test_gains_that_are_none_are_refused(template, gains, told):
+    shape = (template.Nants_telescope, template.Nfreqs, 1, template.Npols)
+    with pytest.raises(InputError, match=told):
+        draw_truth(Given(np.full(shape, gains, complex) if np.isscalar(gains) else gains), Observation(template))
+
+
+def test_two_effects_with_one_seed_are_refused():
+    with pytest.raises(ValidationError, match="would not be independent"):
+        CorruptionSettings.model_validate({"effects": ["per-channel-gains", "reflection-gains"]})
+    both = {"effects": ["per-channel-gains", {"kind": "reflection-gains", "seed": 6}]}
+    settings = CorruptionSettings.model_validate(both)
+    assert settings.gains == PerChannelGains()
+    assert CorruptionSettings(effects=()).gains is None
+
+
+@pytest.mark.parametrize(
+    ("block", "told"),
+    [
+        ({"kind": "reflection", "delay": "800 ns"}, "effects: [{kind: reflection-gains, delay: 800 ns}]"),
+        ({"sigma": 0.2}, "effects: [{kind: per-channel-gains, sigma: 0.2}]"),
+        ("unity", "effects: []"),
+    ],
+)
+def test_the_former_field_is_answered_with_the_new_one(block, told):
+    with pytest.raises(ValidationError, match=re.escape(f"is now corruption.effects, a list: {told}")):
+        CorruptionSettings.model_validate({"gains": block})
+    with pytest.raises(ValidationError, match="is now 'effects'"):
+        Variant.model_validate({"components": ["eor"], "gains": True})

@@ -117,14 +117,15 @@ def missing_files(folder: Path) -> Iterator[Broken]:
         ("instrument.beam", {"kind": "mwa-embedded-element"}),
         ("sky.foregrounds", {"kind": "file"}),
         ("sky.foregrounds", {"kind": "gleam"}),
-        ("corruption.gains", {"kind": "file"}),
+        ("corruption.effects", {"kind": "file-gains"}),
         ("calibration.initial_gains", {"kind": "file"}),
         ("calibration.weights", {"kind": "file"}),
     ):
         for file in ("no-such-file.dat", ".", "/dev/null/x", "~nobody-of-that-name/x", "a\x00b"):
             section, field = path.split(".")
             changed = copy.deepcopy(data)
-            changed.setdefault(section, {})[field] = {**block, "path": file}
+            named = {**block, "path": file}
+            changed.setdefault(section, {})[field] = [named] if field == "effects" else named
             text = yaml.safe_dump(changed, sort_keys=False).encode()
             yield Broken(f"{path}: {block['kind']} at {file!r}", text, (field,))
 
@@ -183,7 +184,7 @@ TEXTS = {
     "deep": b"name: " + b"[" * 3000 + b"]" * 3000,
     "deep blocks": b"name: " + b"{a: " * 2000 + b"x" + b"}" * 2000,
     "system": b"name: !!python/object/apply:os.system ['touch pwned']\n",
-    "object": b"name: !!python/object:calstudy.errors.InputError {}\n",
+    "object": b"name: !!python/object:calstudy.base.errors.InputError {}\n",
     "module": b"name: !!python/module:os\n",
     "python name": b"name: !!python/name:os.system\n",
     "python tuple": b"name: x\nsweep: !!python/tuple [1, 2]\n",

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from calstudy.errors import InputError
-from calstudy.experiment.collection import Collection, load_study
+from calstudy.base.errors import InputError
 from calstudy.experiment.files import (
     apply_scale,
     dump,
@@ -18,6 +17,13 @@ from calstudy.experiment.files import (
     validate,
 )
 from calstudy.experiment.model import Experiment
+from calstudy.studies.collection import Collection
+from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.load import load_study
+from calstudy.studies.preflight import require_calibration
+from calstudy.studies.runtime import RuntimeStudy
+from calstudy.studies.study import Study
+from calstudy.studies.sweep import Sweep
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 HERE = Path(__file__).parent
@@ -32,11 +38,22 @@ def faults_of(text: str) -> list[str]:
     return str(caught.value).splitlines()
 
 
+def scales_of(study: Study) -> set[str]:
+    """Return the names of the scales of a file, or of all members of a collection."""
+    if isinstance(study, Collection):
+        return set.intersection(*(set(experiment.scales) for experiment in study.members.values()))
+    if isinstance(study, RuntimeStudy):
+        return set(study.file.scales)
+    if isinstance(study, Sweep):
+        return set(study.base.scales)
+    assert isinstance(study, ExperimentStudy)
+    return set(study.experiment.scales)
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_shipped_files_are_valid_at_every_scale(path):
     study = load_study(path)
-    members = study.members.values() if isinstance(study, Collection) else [study]
-    for scale in set.intersection(*(set(experiment.scales) for experiment in members)):
+    for scale in scales_of(study):
         assert load_study(path, scale).name == study.name
 
 
@@ -48,7 +65,7 @@ def test_the_defaults_are_the_papers_numbers():
     assert experiment.sky.eor.amplitude == 12482.356
     assert experiment.corruption.eor_level == -40
     assert experiment.corruption.noise.factor == 10
-    assert experiment.corruption.gains.sigma == 0.1
+    assert [effect.sigma for effect in experiment.corruption.effects] == [0.1]
     assert experiment.power.wedge_buffer == 1e-7
 
 
@@ -94,7 +111,10 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
             "outputs.store = '~nobody-here/x': there is no such",
         ),
         ("{name: a, corruption: {noise: none}}", "asks for noise, but corruption.noise is 'none'"),
-        ("{name: a, corruption: {gains: {sigma: .nan}}}", "corruption.gains.sigma = nan: must be a finite number"),
+        (
+            "{name: a, corruption: {effects: [{kind: per-channel-gains, sigma: .nan}]}}",
+            "corruption.effects.0.sigma = nan: must be a finite number",
+        ),
         (
             "{name: a, sky: {foregrounds: {kind: file, path: no.skyh5}}}",
             "sky.foregrounds.path = 'no.skyh5': no such file",
@@ -107,22 +127,39 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ("{name: a, outputs: {inspect: {antennas: [1, 1]}}}", "outputs.inspect: names an antenna twice in a pair"),
         ("{name: a, outputs: {inspect: {baselines: [[0, -1]]}}}", "must be at least 0"),
         ("{name: a, outputs: {inspect: {integration: 56}}}", "outputs.inspect.integration: 56 is not among the 56"),
-        ("{name: a, outputs: {figures: [gain]}}", "outputs.figures.0 = 'gain': not a choice, did you mean 'gains'?"),
+        ("{name: a, outputs: {figures: [gain]}}", "outputs.figures.0: 'gain' is not a figure, did you mean 'gains'?"),
         (
             "{name: a, outputs: {figures: [gains]}, variants: {eor: {components: [eor]}, residual: {components: "
             "[foregrounds]}}}",
-            "variants.residual: must have foregrounds, gains: true and calibrate: true for the figure 'gains'",
+            "outputs.figures: asks for 'gains', which needs variants.residual to have foregrounds, effects: true and",
         ),
         ("{}", "name: missing, and it has no default"),
         ("{name: a b}", "name = 'a b': must match"),
         (
-            "{name: a, calibration: {basis: {buffer: 10 us}}}",
-            "calibration.basis.buffer: with min_delay makes a half-width of 10100 ns",
+            "{name: a, calibration: {solver: {max_steps: 0}, basis: {bufer: 3}}}",
+            "calibration.solver.max_steps = 0: must be at least 1",
+        ),
+        (
+            "{name: a, calibration: {calibrator: sky-based, basis: {buffer: 10 ns}}}",
+            "calibration.basis: unknown key (allowed: autos, calibrator,",
         ),
     ],
 )
 def test_a_fault_names_path_value_and_what_is_allowed(text, told):
     assert any(sentence.startswith(told) or told in sentence for sentence in faults_of(text)), faults_of(text)
+
+
+@pytest.mark.parametrize(
+    ("calibration", "told"),
+    [
+        ({"basis": {"buffer": "10 us"}}, "calibration.basis: a delay half-width of 1[0-9]+ ns fills all 384 channels"),
+        ({"autos": True}, "calibration.autos: is true, but the data hold no autocorrelations"),
+    ],
+)
+def test_what_the_calibrator_refuses_is_told_before_anything_is_made(calibration, told):
+    experiment = validate({"name": "a", "calibration": calibration}, HERE)
+    with pytest.raises(InputError, match=told):
+        require_calibration(experiment)
 
 
 def test_all_faults_are_told_at_once():

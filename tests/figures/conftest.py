@@ -10,31 +10,30 @@ from matplotlib.figure import Figure
 
 from calstudy.bench.scaling import summarize_runtime
 from calstudy.figures.baselines import BaselineSpectra, draw_baselines
-from calstudy.figures.comparison import Visibilities, VisibilityComparison, compare_visibilities
 from calstudy.figures.data import draw_data
-from calstudy.figures.domains import in_two_domains
 from calstudy.figures.gains import compare_gains, draw_gains
-from calstudy.figures.layouts import LayoutPanel, draw_layouts
+from calstudy.figures.layout import LayoutPanel, draw_layouts
 from calstudy.figures.model import draw_model
 from calstudy.figures.reflections import draw_reflections
 from calstudy.figures.runtime import draw_runtime
 from calstudy.figures.spherical import SphericalColumn, draw_spherical
 from calstudy.figures.spherical_comparison import draw_spherical_comparison
 from calstudy.figures.wedge import WedgePanels, draw_wedge
+from calstudy.plotting.domains import in_two_domains
+from calstudy.plotting.visibility_comparison import Visibilities, VisibilityComparison, compare_visibilities
 from calstudy.power.delay import delays
-from calstudy.power.spherical import SphericalSpectrum
-from calstudy.power.wedge import WedgeSpectrum
+from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 
 FREQUENCY = 167.075e6 + 80e3 * np.arange(64)
 
 
 @pytest.fixture
-def make_wedge_spectrum() -> Callable[..., WedgeSpectrum]:
+def make_wedge_spectrum() -> Callable[..., CylindricalSpectrum]:
     """Return a maker of wedge spectra: power (Nb, Nd), bin edges (Nb, 2) in m."""
 
-    def make(power: np.ndarray, bin_edges: np.ndarray, delay: np.ndarray) -> WedgeSpectrum:
+    def make(power: np.ndarray, bin_edges: np.ndarray, delay: np.ndarray) -> CylindricalSpectrum:
         length = bin_edges.mean(axis=1)
-        return WedgeSpectrum(
+        return CylindricalSpectrum(
             baseline_length=length,
             bin_edges=bin_edges,
             k_perp=5.55e-4 * length,

@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 from calstudy.bench.scaling import summarize_runtime
 from calstudy.figures.baselines import draw_baselines
 from calstudy.figures.data import draw_data
-from calstudy.figures.domains import horizon_delay, in_two_domains
 from calstudy.figures.gains import compare_gains, draw_gains
 from calstudy.figures.model import draw_model
 from calstudy.figures.reflections import draw_reflections
 from calstudy.figures.runtime import draw_runtime
+from calstudy.plotting.domains import in_two_domains
+from calstudy.power.delay import horizon_delay
 
 C = 299792458.0
 FREQUENCY = 167.075e6 + 80e3 * np.arange(384)

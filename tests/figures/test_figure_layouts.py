@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calstudy.figures.layouts import LayoutPanel, draw_layouts
+from calstudy.figures.layout import LayoutPanel, draw_layouts
 
 
 @pytest.fixture
@@ -39,7 +39,8 @@ def test_a_metre_is_as_long_east_as_north(panels):
         assert east[0] - origin[0] == pytest.approx(north[1] - origin[1], rel=1e-6)
         low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
         positions = np.concatenate([line.get_xydata() for line in axes.get_lines()])
-        assert (positions > low).all() and (positions < high).all()
+        assert (positions > low).all()
+        assert (positions < high).all()
 
 
 @pytest.mark.parametrize(("spacing", "extent"), [(14.0, 60.0), (7.72, 165.0)])

@@ -7,6 +7,7 @@ import pytest
 
 from calstudy.figures.signal_loss import SignalLoss, draw_signal_loss
 from calstudy.figures.sweep import SweepPanel, draw_sweep
+from calstudy.plotting.save import figure_arrays
 from calstudy.power.transfer import TransferFunction, TransferMap
 
 
@@ -18,10 +19,10 @@ def function(transfer: list[float], edges: list[float], error: float = 0.02) -> 
         bin_edges=limits,
         transfer=values,
         transfer_error=errors,
-        coherence=values - 0.01,
-        coherence_error=errors,
-        retained=values - 0.02,
-        retained_error=errors,
+        cross_transfer=values - 0.01,
+        cross_transfer_error=errors,
+        squared_coherence=values - 0.02,
+        squared_coherence_error=errors,
         signal=np.ones(values.size),
         n_samples=np.full(values.size, 9),
     )
@@ -44,8 +45,8 @@ def loss() -> SignalLoss:
             k_parallel=5.4e5 * delay,
             transfer=transfer,
             transfer_error=0.1 * transfer,
-            coherence=transfer,
-            coherence_error=0.1 * transfer,
+            cross_transfer=transfer,
+            cross_transfer_error=0.1 * transfer,
             horizon_delay=length / 3e8,
         ),
     )
@@ -72,10 +73,18 @@ def test_points_and_95_percent_bars_are_those_of_the_transfer_functions(loss):
     assert halves == pytest.approx([0, 0])
 
 
-def test_what_is_retained_is_the_line(loss):
+def test_published_arrays_keep_their_names(loss):
+    arrays = figure_arrays(loss)
+    assert np.array_equal(arrays["outside.coherence"], loss.outside.cross_transfer, equal_nan=True)
+    assert np.array_equal(arrays["inside.retained_error"], loss.inside.squared_coherence_error, equal_nan=True)
+    assert np.array_equal(arrays["map.coherence_error"], loss.map.cross_transfer_error, equal_nan=True)
+    assert not any("squared" in name or "cross" in name for name in arrays)
+
+
+def test_the_squared_coherence_is_the_line(loss):
     figure = draw_signal_loss(loss)
     line = next(item for item in figure.axes[0].lines if "flux scale" in str(item.get_label()))
-    assert line.get_ydata() == pytest.approx(loss.outside.retained, nan_ok=True)
+    assert line.get_ydata() == pytest.approx(loss.outside.squared_coherence, nan_ok=True)
 
 
 def test_the_map_has_a_cell_per_bin_and_none_where_there_are_no_baselines(loss):

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from calstudy.figures import style
+from calstudy.plotting import style
 
 DIMENSIONLESS = {r"Re $g_{0}$", r"Re $g_{1}$", "Re residual", r"$|\widetilde{g}(\tau)|$", "number of antennas"}
 
@@ -43,8 +43,10 @@ def test_text_is_inside_the_page_and_large_enough_to_read(draw_all):
         with style.journal_style():
             figure.draw_without_rendering()
             used = figure.get_tightbbox()
-        assert used.x0 >= 0 and used.y0 >= 0, name
-        assert used.x1 <= figure.get_figwidth() and used.y1 <= figure.get_figheight(), name
+        assert used.x0 >= 0, name
+        assert used.y0 >= 0, name
+        assert used.x1 <= figure.get_figwidth(), name
+        assert used.y1 <= figure.get_figheight(), name
         texts = [text for text in figure.findobj(Text) if text.get_text()]
         assert min(text.get_fontsize() for text in texts) >= 5, name
 

@@ -10,8 +10,14 @@ from scipy.constants import speed_of_light
 from scipy.signal.windows import blackmanharris
 from scipy.special import j1
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
+from calstudy.instrument.beam_models.airy import AiryBeam
+from calstudy.instrument.beam_models.beamfits import FileBeam
+from calstudy.instrument.beam_models.gaussian import GaussianBeam
+from calstudy.instrument.beam_models.mwa_analytic import MwaAnalyticBeam
+from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
+from calstudy.instrument.beam_models.short_dipole import DipoleBeam
 from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, integrate_power, make_beam
 
 CHANNELS = 167.075e6 + 320e3 * np.arange(96)
@@ -20,7 +26,7 @@ BAND = np.array([167.075e6, 182e6, 197.715e6])
 
 @pytest.fixture(scope="module")
 def embedded():
-    return make_beam(section.MwaEmbeddedBeam())
+    return make_beam(MwaEmbeddedBeam())
 
 
 def power(beam, azimuth, zenith_angle, frequencies, feed=0):
@@ -42,7 +48,7 @@ def half_width(values, zenith_angle):
 
 def test_solid_angles_of_a_short_dipole():
     """∫(1 − sin²θ cos²φ) dΩ = 4π/3 and ∫(...)² dΩ = 16π/15 over the hemisphere."""
-    beam = make_beam(section.DipoleBeam(kind="short-dipole"))
+    beam = make_beam(DipoleBeam(kind="short-dipole"))
     for polarization in ("xx", "yy"):
         omega_p, omega_pp = beam.solid_angles(BAND, polarization)
         np.testing.assert_allclose(omega_p, 4 * np.pi / 3, rtol=1e-7)
@@ -51,7 +57,7 @@ def test_solid_angles_of_a_short_dipole():
 
 def test_solid_angles_of_a_narrow_gaussian():
     """exp(−θ²/s²) has Ω_p = πs²(1 − s²/6 + ...), from sin θ = θ − θ³/6, and half of s² for the square."""
-    beam = make_beam(section.GaussianBeam(kind="gaussian", fwhm_deg=6.0, reference_frequency="182 MHz"))
+    beam = make_beam(GaussianBeam(kind="gaussian", fwhm_deg=6.0, reference_frequency="182 MHz"))
     omega_p, omega_pp = beam.solid_angles(BAND, "xx")
     squared = (np.deg2rad(3.0) ** 2 / np.log(2)) * (182e6 / BAND) ** 2
     np.testing.assert_allclose(omega_p, np.pi * squared * (1 - squared / 6), rtol=1e-5)
@@ -59,7 +65,7 @@ def test_solid_angles_of_a_narrow_gaussian():
 
 
 def test_gaussian_width_is_the_power_fwhm_and_shrinks_with_frequency():
-    beam = make_beam(section.GaussianBeam(kind="gaussian", fwhm_deg=20.0, reference_frequency="160 MHz"))
+    beam = make_beam(GaussianBeam(kind="gaussian", fwhm_deg=20.0, reference_frequency="160 MHz"))
     frequencies = np.array([160e6, 200e6])
     values = power(beam, 0.3, np.deg2rad([10.0, 8.0]), frequencies)
     assert values[0, 0] == pytest.approx(0.5)
@@ -67,7 +73,7 @@ def test_gaussian_width_is_the_power_fwhm_and_shrinks_with_frequency():
 
 
 def test_airy_beam():
-    beam = make_beam(section.AiryBeam(kind="airy", diameter="6 m"))
+    beam = make_beam(AiryBeam(kind="airy", diameter="6 m"))
     angle = np.deg2rad(np.array([3.0, 12.0, 30.0]))
     argument = np.pi * 6.0 * np.sin(angle) * 182e6 / speed_of_light
     values = power(beam, 1.0, angle, np.array([182e6]))
@@ -75,7 +81,7 @@ def test_airy_beam():
 
 
 def test_ideal_tile_is_a_dipole_times_a_sum_over_its_sixteen_dipoles_and_their_images():
-    beam = make_beam(section.MwaAnalyticBeam(kind="mwa-analytic"))
+    beam = make_beam(MwaAnalyticBeam(kind="mwa-analytic"))
     generator = np.random.default_rng(7)
     azimuth, zenith_angle = generator.uniform(0, 2 * np.pi, 50), generator.uniform(0, np.pi / 2, 50)
     frequency = 180e6
@@ -97,7 +103,7 @@ def test_ideal_tile_is_a_dipole_times_a_sum_over_its_sixteen_dipoles_and_their_i
 def test_x_is_the_east_west_dipole(embedded):
     """A dipole is blind along its axis: far from zenith, feed x sees less to the east than to the north."""
     angle = np.deg2rad(np.arange(70.0, 86.0))
-    for beam in (embedded, make_beam(section.DipoleBeam(kind="short-dipole"))):
+    for beam in (embedded, make_beam(DipoleBeam(kind="short-dipole"))):
         east, north = (power(beam, azimuth, angle, BAND[1:2])[0].sum() for azimuth in (0, np.pi / 2))
         assert east < 0.5 * north
         east, north = (power(beam, azimuth, angle, BAND[1:2], feed=1)[0].sum() for azimuth in (0, np.pi / 2))
@@ -117,7 +123,7 @@ def test_width_of_the_embedded_element_beam(embedded, megahertz, east, north):
 
 def test_ideal_and_embedded_tile_have_nearly_the_same_width(embedded):
     angle = np.deg2rad(np.arange(0, 20, 0.1))
-    ideal = make_beam(section.MwaAnalyticBeam(kind="mwa-analytic"))
+    ideal = make_beam(MwaAnalyticBeam(kind="mwa-analytic"))
     for azimuth in (0, np.pi / 2):
         widths = [
             np.rad2deg(half_width(power(beam, azimuth, angle, BAND[1:2])[0], angle)) for beam in (embedded, ideal)
@@ -157,7 +163,7 @@ def test_smooth_fit_is_smooth_where_tabulated_steps_are_not(embedded):
         spectrum = np.abs(np.fft.fft(values * taper[:, None, None], axis=0)) / taper.sum()
         return np.sqrt(np.mean(spectrum[(delays > low) & (delays < high)] ** 2))
 
-    point_to_point = {kind: make_beam(section.MwaEmbeddedBeam(interpolation=kind)) for kind in ("cubic", "nearest")}
+    point_to_point = {kind: make_beam(MwaEmbeddedBeam(interpolation=kind)) for kind in ("cubic", "nearest")}
     assert beyond_wedge(embedded, 200e-9, 400e-9) < 1e-6
     assert beyond_wedge(embedded, 200e-9, 400e-9) < 0.1 * beyond_wedge(point_to_point["cubic"], 200e-9, 400e-9)
     assert beyond_wedge(embedded, 700e-9, 860e-9) < 1e-7
@@ -166,7 +172,7 @@ def test_smooth_fit_is_smooth_where_tabulated_steps_are_not(embedded):
 
 @pytest.mark.parametrize("interpolation", ["cubic", "linear", "nearest"])
 def test_point_to_point_interpolation_passes_through_the_table(interpolation):
-    beam = make_beam(section.MwaEmbeddedBeam(interpolation=interpolation))
+    beam = make_beam(MwaEmbeddedBeam(interpolation=interpolation))
     assert beam.fit_error < 1e-12
 
 
@@ -177,7 +183,7 @@ def test_beam_does_not_depend_on_which_frequencies_are_asked_for_together(embedd
 
 
 def test_fewer_channels_keep_the_same_beam(embedded):
-    few = make_beam(section.MwaEmbeddedBeam(), section.Channels(first="180 MHz", count=48))
+    few = make_beam(MwaEmbeddedBeam(), section.Channels(first="180 MHz", count=48))
     np.testing.assert_allclose(
         few.at(np.array([182e6])).data_array, embedded.at(np.array([182e6])).data_array, atol=4e-5
     )
@@ -185,7 +191,7 @@ def test_fewer_channels_keep_the_same_beam(embedded):
 
 def test_band_between_two_tabulated_frequencies(embedded):
     """Eight channels span 0.56 MHz, less than the table's 1.28 MHz."""
-    narrow = make_beam(section.MwaEmbeddedBeam(), section.Channels(first="182.1 MHz", count=8))
+    narrow = make_beam(MwaEmbeddedBeam(), section.Channels(first="182.1 MHz", count=8))
     assert 0 < narrow.fit_error < 4e-4
     frequency = np.array([182.3e6])
     np.testing.assert_allclose(narrow.at(frequency).data_array, embedded.at(frequency).data_array, atol=4e-5)
@@ -194,23 +200,23 @@ def test_band_between_two_tabulated_frequencies(embedded):
 def test_few_tabulated_frequencies_limit_the_interpolation(tmp_path, embedded):
     path = tmp_path / "beam.beamfits"
     embedded.at(np.array([166e6, 182.5e6, 199e6])).write_beamfits(path)
-    assert make_beam(section.FileBeam(kind="beamfits", path=path, interpolation="linear")).fit_error < 1e-12
+    assert make_beam(FileBeam(kind="beamfits", path=path, interpolation="linear")).fit_error < 1e-12
     with pytest.raises(InputError, match="cubic needs 4 tabulated frequencies"):
-        make_beam(section.FileBeam(kind="beamfits", path=path, interpolation="cubic"))
+        make_beam(FileBeam(kind="beamfits", path=path, interpolation="cubic"))
 
 
 def test_frequencies_outside_the_band_are_refused(embedded):
     with pytest.raises(InputError, match="outside the band"):
         embedded.at(np.array([150e6]))
     with pytest.raises(InputError, match="not within"):
-        make_beam(section.MwaEmbeddedBeam(), section.Channels(first="310 MHz"))
+        make_beam(MwaEmbeddedBeam(), section.Channels(first="310 MHz"))
 
 
 def test_beamfits_round_trip(tmp_path, embedded):
     path = tmp_path / "beam.beamfits"
     frequencies = np.arange(166e6, 199.5e6, 1e6)
     embedded.at(frequencies).write_beamfits(path)
-    beam = make_beam(section.FileBeam(kind="beamfits", path=path))
+    beam = make_beam(FileBeam(kind="beamfits", path=path))
     # A fit to samples of the fit, over a narrower band: the same but for the order's own truncation.
     np.testing.assert_allclose(beam.at(BAND).data_array, embedded.at(BAND).data_array, atol=3e-5)
     assert "beam.beamfits" in beam.stand_in
@@ -219,15 +225,15 @@ def test_beamfits_round_trip(tmp_path, embedded):
 
 def test_unusable_beam_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="there is no file"):
-        make_beam(section.MwaEmbeddedBeam(path=tmp_path / "none.h5"))
+        make_beam(MwaEmbeddedBeam(path=tmp_path / "none.h5"))
     wrong = tmp_path / "wrong.h5"
     wrong.write_text("not a beam")
     with pytest.raises(InputError, match="cannot be read"):
-        make_beam(section.MwaEmbeddedBeam(path=wrong))
+        make_beam(MwaEmbeddedBeam(path=wrong))
     with pytest.raises(InputError, match="cannot be read"):
-        make_beam(section.FileBeam(kind="beamfits", path=wrong))
+        make_beam(FileBeam(kind="beamfits", path=wrong))
     with pytest.raises(InputError, match="there is no file"):
-        make_beam(section.FileBeam(kind="beamfits", path=tmp_path / "none.fits"))
+        make_beam(FileBeam(kind="beamfits", path=tmp_path / "none.fits"))
 
 
 def test_power_beam_files_are_refused(tmp_path):
@@ -237,7 +243,7 @@ def test_power_beam_files_are_refused(tmp_path):
     assert isinstance(dipole, UVBeam)
     dipole.write_beamfits(tmp_path / "power.beamfits")
     with pytest.raises(InputError, match="power beam"):
-        make_beam(section.FileBeam(kind="beamfits", path=tmp_path / "power.beamfits"))
+        make_beam(FileBeam(kind="beamfits", path=tmp_path / "power.beamfits"))
 
 
 def test_integral_of_an_isotropic_beam_is_the_hemisphere():

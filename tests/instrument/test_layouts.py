@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
 from calstudy.instrument.layouts import GOLOMB_MARKS, make_layout, redundant_groups
 

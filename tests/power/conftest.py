@@ -71,7 +71,7 @@ def observe():
 @pytest.fixture(scope="session")
 def white():
     """Return a function that fills an observation with white complex noise of a standard deviation in Jy."""
-    from calstudy.visibilities import from_cube
+    from calstudy.base.visibilities import from_cube
 
     def fill(template, rng, sigma=1.0):
         shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)

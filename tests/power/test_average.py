@@ -7,9 +7,9 @@ from astropy import units as u
 from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
 
+from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.instrument.settings import GolombLayout, MwaLayout
 from calstudy.power.average import fringe_stop_and_average
-from calstudy.visibilities import baseline_vectors, from_cube, to_cube
 
 
 def drifting_source(template, position):

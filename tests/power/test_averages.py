@@ -9,16 +9,16 @@ from hera_pspec import grouping
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.settings import HexLayout, MwaLayout
 from calstudy.power import cosmology as c
 from calstudy.power import delay, errors
+from calstudy.power.cylindrical import cylindrical_average
 from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
-from calstudy.power.spectra import DelaySpectra, delay_spectra
-from calstudy.power.spherical import make_bin_edges, outside_wedge, spherical_average
+from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, delay_spectra, outside_wedge
+from calstudy.power.spherical import make_bin_edges, spherical_average
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
-from calstudy.power.wedge import WedgeSpectrum, cylindrical_average
-from calstudy.visibilities import baseline_vectors
 
 SETTINGS = PowerSettings(bins=KBins(max="2.0 h/Mpc", width="0.1 h/Mpc"))
 FREQUENCY, WIDTH, OMEGA_PP = 182e6, 80e3, 0.07
@@ -139,7 +139,8 @@ def test_the_wedge_mask_is_the_horizon_plus_the_buffer():
 
 def test_bins_reach_the_maximum():
     edges = make_bin_edges(KBins())
-    assert edges.size == 86 and edges[-1] == pytest.approx(3.4)
+    assert edges.size == 86
+    assert edges[-1] == pytest.approx(3.4)
     with pytest.raises(ValueError, match=r"max \(0.5 h/Mpc\) must be larger than min \(1.0 h/Mpc\)"):
         KBins(min="1.0 h/Mpc", max="0.5 h/Mpc")
     assert make_bin_edges(KBins(max="1.0 h/Mpc", width="0.3 h/Mpc"))[-1] == pytest.approx(1.2)
@@ -151,7 +152,8 @@ def test_folding_averages_opposite_delays(n_delays):
     power = rng.normal(size=(6, n_delays)) + 1j * rng.normal(size=(6, n_delays))
     spectra = make_spectra(power, rng.normal(size=(6, 3)) * 20)
     flat, folded = (cylindrical_average(spectra, SETTINGS, f) for f in (False, True))
-    assert folded.delay[0] == 0 and folded.k_parallel[0] == 0
+    assert folded.delay[0] == 0
+    assert folded.k_parallel[0] == 0
     zero = n_delays // 2
     np.testing.assert_allclose(folded.power[:, 0], flat.power[:, zero])
     np.testing.assert_allclose(folded.power[:, 3], (flat.power[:, zero + 3] + flat.power[:, zero - 3]) / 2)
@@ -203,7 +205,7 @@ def test_sample_variance_equals_the_scatter(n):
 
 
 @pytest.mark.parametrize("n", [1, 5])
-@pytest.mark.parametrize("noise,low,high", [(0.0, 0.98, 1.02), (1e3, 0.98, 1.02), (1.0, 1.02, 1.25)])
+@pytest.mark.parametrize(("noise", "low", "high"), [(0.0, 0.98, 1.02), (1e3, 0.98, 1.02), (1.0, 1.02, 1.25)])
 def test_the_sum_of_errors_is_right_in_the_limits_and_conservative_between(n, noise, low, high):
     """One mode of signal power 1 and noise power `noise`, of a baseline or of a group of n."""
     rng, n_trials = np.random.default_rng(23), 50000
@@ -282,10 +284,11 @@ def test_tables_come_back(tmp_path):
             np.testing.assert_array_equal(getattr(back, item.name), getattr(spectrum, item.name))
         assert type(back) is type(spectrum)
     assert load_spectrum(tmp_path / "s.h5", type(spherical)).wedge_excluded is True
-    with pytest.raises(ValueError, match="holds 'SphericalSpectrum', expected 'WedgeSpectrum'"):
-        load_spectrum(tmp_path / "s.h5", WedgeSpectrum)
+    with pytest.raises(ValueError, match="holds 'SphericalSpectrum', expected 'CylindricalSpectrum'"):
+        load_spectrum(tmp_path / "s.h5", CylindricalSpectrum)
     write_csv(tmp_path / "s.csv", spherical)
     lines = (tmp_path / "s.csv").read_text().splitlines()
-    assert lines[0].startswith("k [h/Mpc],power real [mK2 h-3 Mpc3]") and len(lines) == spherical.k.size + 1
+    assert lines[0].startswith("k [h/Mpc],power real [mK2 h-3 Mpc3]")
+    assert len(lines) == spherical.k.size + 1
     row = np.array(lines[5].split(","), dtype=float)
     np.testing.assert_array_equal(row[:2], [spherical.k[4], spherical.power.real[4]])

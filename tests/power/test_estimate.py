@@ -7,6 +7,7 @@ from astropy import units as u
 from hera_pspec import PSpecData, UVPSpec
 from hera_pspec.pspecbeam import PSpecBeamFromArray
 
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube
 from calstudy.instrument.settings import GolombLayout, HexLayout, MwaLayout
 from calstudy.power import cosmology as c
 from calstudy.power.delay import delay_transform, delays, make_taper
@@ -15,7 +16,6 @@ from calstudy.power.optimal import DiagonalPSpecData
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import delay_spectra
 from calstudy.power.spherical import spherical_average
-from calstudy.visibilities import antenna_pairs, baseline_vectors, from_cube
 
 GOLOMB = GolombLayout(kind="golomb", count=5, spacing="14 m")
 
@@ -134,7 +134,7 @@ def test_flat_power_comes_back_within_one_percent(observe, beam, tabulate):
     assert np.mean(estimates) / expected == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize("taper,tolerance", [("blackman-harris", 5e-4), ("none", 5e-3)])
+@pytest.mark.parametrize(("taper", "tolerance"), [("blackman-harris", 5e-4), ("none", 5e-3)])
 def test_normalization_is_exact_over_the_whole_band(observe, beam, tabulate, taper, tolerance):
     """Visibilities of the variance that flat P(k) gives at each frequency, with beam and scales evolving.
 

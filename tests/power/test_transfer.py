@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calstudy.power.delay import delay_transform, delays
-from calstudy.power.spectra import DelaySpectra
-from calstudy.power.spherical import SphericalSpectrum
+from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 from calstudy.power.tables import load_spectrum, save_spectrum, write_transfer_csv
 from calstudy.power.transfer import (
     Injection,
@@ -65,14 +64,14 @@ def low_delays_removed(spectra: np.ndarray, edge: np.ndarray) -> np.ndarray:
 
 
 @given(st.floats(0.01, 3.0))
-def test_a_signal_scaled_by_a_factor_has_the_squared_factor_as_transfer_and_itself_as_coherence(factor):
+def test_a_signal_scaled_by_a_factor_has_the_squared_factor_as_transfer_and_itself_as_cross_transfer(factor):
     signal = noise(np.random.default_rng(1))
     found = spherical_transfer(inject(signal, factor * signal, factor * signal), ONE_BIN, BUFFER, inside=False)
     assert found.transfer == pytest.approx([factor**2])
-    assert found.coherence == pytest.approx([factor])
+    assert found.cross_transfer == pytest.approx([factor])
     assert found.transfer_error == pytest.approx([0], abs=1e-9)
-    assert found.retained == pytest.approx([1])
-    assert found.retained_error == pytest.approx([0], abs=1e-6)
+    assert found.squared_coherence == pytest.approx([1])
+    assert found.squared_coherence_error == pytest.approx([0], abs=1e-6)
 
 
 def test_no_loss_is_one_in_every_bin_and_cell(rng):
@@ -115,8 +114,8 @@ def test_gains_that_absorb_some_of_all_baselines_lose_their_share_at_all_delays(
     pooled = pool(found)
     for value, error in (
         (pooled.transfer / scale**2, pooled.transfer_error),
-        (pooled.coherence / scale, pooled.coherence_error),
-        (pooled.retained, pooled.retained_error),
+        (pooled.cross_transfer / scale, pooled.cross_transfer_error),
+        (pooled.squared_coherence, pooled.squared_coherence_error),
     ):
         assert value[0] == pytest.approx(1 - lost / BASELINES, abs=4 * error[0])
         assert error[0] < 0.02
@@ -124,7 +123,7 @@ def test_gains_that_absorb_some_of_all_baselines_lose_their_share_at_all_delays(
 
 def test_noise_that_both_residuals_share_cancels(template, rng, white):
     """The difference of powers scatters by the noise; the power of the difference does not see it."""
-    from calstudy.visibilities import from_cube, to_cube
+    from calstudy.base.visibilities import from_cube, to_cube
 
     signal, common = (to_cube(white(template, rng, sigma)) for sigma in (1.0, 30.0))
     without = from_cube(template, common)
@@ -146,8 +145,8 @@ def test_noise_that_is_left_in_the_response_scatters_but_gives_no_bias():
         pulls.append(
             [
                 (found.transfer[0] - 0.64) / found.transfer_error[0],
-                (found.coherence[0] - 0.8) / found.coherence_error[0],
-                (found.retained[0] - 1) / found.retained_error[0],
+                (found.cross_transfer[0] - 0.8) / found.cross_transfer_error[0],
+                (found.squared_coherence[0] - 1) / found.squared_coherence_error[0],
             ]
         )
     assert np.mean(pulls, axis=0) == pytest.approx([0, 0, 0], abs=4 / np.sqrt(200))

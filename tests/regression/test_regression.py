@@ -12,18 +12,19 @@ from rich.console import Console
 from tiny import tiny
 from typer.testing import CliRunner
 
-from calstudy.claims.statement import Claim
-from calstudy.cli import app
-from calstudy.errors import InputError
-from calstudy.experiment.collection import load_study
+from calstudy.base.errors import InputError
+from calstudy.cli.main import app
 from calstudy.experiment.files import load, override
 from calstudy.regression.comparison import compare_array, compare_claims, compare_figures
 from calstudy.regression.reference import accept, find_references, read_reference, read_run
 from calstudy.regression.remake import remake
 from calstudy.regression.tables import Regression, show
-from calstudy.running.runs import run
+from calstudy.studies.load import load_study
+from calstudy.studies.study import Budget, run_study
+from calstudy.verdicts.criterion import Verdict
 
 QUIET = Console(quiet=True)
+FIGURES_FOLDER = Path(__file__).parents[2] / "figures"
 FIGURES = ["layout", "gains", "data", "wedge", "spherical"]
 
 
@@ -41,8 +42,9 @@ def places(folder) -> list[str]:
 def finished(folder) -> Path:
     """The folder of a finished run of the tiny experiment."""
     path = folder / "tiny.yaml"
-    path.write_text(yaml.safe_dump(override(tiny(folder), "outputs.figures", FIGURES)))
-    return run(load(path)).folder
+    data = {**tiny(folder), "papers": ["calamity2022"]}
+    path.write_text(yaml.safe_dump(override(data, "outputs.figures", FIGURES)))
+    return run_study(load_study(path), Budget(workers=1)).folder
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +68,14 @@ def test_a_reference_is_small_and_names_no_place_of_the_machine(reference, finis
 
 
 def test_made_again_from_the_store_nothing_moves(reference, finished, places):
-    assert remake(reference, places, 1, None, None, QUIET) == finished
+    assert remake(reference, places, Budget(workers=1), QUIET) == finished
     assert set(statuses(reference, finished).values()) == {"same"}
     claims = compare_claims(read_reference(reference).claims, read_run(finished).claims)
     assert {item.status for item in claims} == {"same"}
 
 
 def test_another_draw_of_the_noise_moves_what_is_drawn_by_its_error_bars(reference, places):
-    again = remake(reference, [*places, "corruption.noise.seeds=[13,14]"], 1, None, None, QUIET)
+    again = remake(reference, [*places, "corruption.noise.seeds=[13,14]"], Budget(workers=1), QUIET)
     found = compare_figures(read_reference(reference).figures, read_run(again).figures)
     assert not [item for item in found if item.status == "beyond"]
     moved = {f"{item.figure}: {item.name}": item for item in found if item.status == "moved"}
@@ -86,7 +88,7 @@ def test_another_draw_of_the_noise_moves_what_is_drawn_by_its_error_bars(referen
 
 def test_another_beam_is_caught(reference, places):
     changed = [*places, "instrument.beam={kind: airy, diameter: 10 m}"]
-    found = statuses(reference, remake(reference, changed, 1, None, None, QUIET))
+    found = statuses(reference, remake(reference, changed, Budget(workers=1), QUIET))
     for name in ("data: reference.values", "spherical: all_modes.uncalibrated.power", "wedge: uncorrupted.power"):
         assert found[name] == "beyond", name
     assert found["gains: true.values"] == "same"
@@ -121,13 +123,13 @@ def test_a_small_loss_at_all_scales_shows_in_the_mean():
 def test_what_is_missing_new_or_of_another_shape_is_told():
     reference = {"data": {"a": np.zeros(3), "b": np.zeros(3)}, "wedge": {"c": np.array("title")}}
     made = {"data": {"a": np.zeros(4), "new": np.zeros(2)}, "wedge": {"c": np.array("heading")}}
-    found = {item.name: (item.status, item.told) for item in compare_figures(reference, made)}
+    found = {item.name: (item.status, item.problem) for item in compare_figures(reference, made)}
     assert found["a"] == ("beyond", "shape (4,), was (3,)")
     assert found["b"] == ("beyond", "missing")
     assert found["new"][0] == "moved"
     assert found["c"] == ("beyond", "different")
     nan = compare_array("layout", "enu", {"enu": np.array([1.0, np.nan])}, np.array([np.nan, 1.0]))
-    assert (nan.status, nan.told) == ("beyond", "finite in other places")
+    assert (nan.status, nan.problem) == ("beyond", "finite in other places")
 
 
 def test_times_of_a_machine_are_told_and_never_too_far():
@@ -150,7 +152,7 @@ def test_times_of_a_machine_are_told_and_never_too_far():
 )
 def test_a_verdict_may_change_with_a_number_that_moved_within_its_error(uncertainty, measured, verdict, status):
     texts = {"section": "", "sentence": "", "quantity": "", "threshold": "", "why": "", "reason": "", "runs": ()}
-    old = Claim(name="claim", measured=1.0, uncertainty=uncertainty, verdict="PASS", **texts)
+    old = Verdict(name="claim", measured=1.0, uncertainty=uncertainty, verdict="PASS", **texts)
     new = dataclasses.replace(old, measured=measured, verdict=verdict)
     assert [item.status for item in compare_claims([old], [new])] == [status]
     assert [item.status for item in compare_claims([old], [])] == ["beyond"]
@@ -158,15 +160,22 @@ def test_a_verdict_may_change_with_a_number_that_moved_within_its_error(uncertai
 
 
 def test_verdicts_on_run_time_may_be_others_on_another_machine():
-    texts = dict.fromkeys(("sentence", "quantity", "threshold", "why", "reason"), "")
-    old = Claim(
-        name="claim", section="Computational Runtime", measured=1.0, uncertainty=0.0, verdict="PASS", runs=(), **texts
-    )
+    texts = dict.fromkeys(("section", "sentence", "quantity", "threshold", "why", "reason"), "")
+    old = Verdict(name="claim", measured=1.0, uncertainty=0.0, verdict="PASS", runs=(), **texts)
     slower = dataclasses.replace(old, measured=2.0, verdict="FAIL")
     gone = dataclasses.replace(old, measured=None, verdict="not evaluated")
-    assert [item.status for item in compare_claims([old], [slower])] == ["moved"]
-    assert [item.status for item in compare_claims([gone], [slower])] == ["moved"]
-    assert [item.status for item in compare_claims([old], [gone])] == ["beyond"]
+    assert [item.status for item in compare_claims([old], [slower], on_machines=True)] == ["moved"]
+    assert [item.status for item in compare_claims([old], [slower])] == ["beyond"]
+    assert [item.status for item in compare_claims([gone], [slower], on_machines=True)] == ["moved"]
+    assert [item.status for item in compare_claims([old], [gone], on_machines=True)] == ["beyond"]
+    assert read_reference(FIGURES_FOLDER / "runtime").on_machines
+    assert not read_reference(FIGURES_FOLDER / "minredundant").on_machines
+
+
+def test_a_claim_that_could_not_be_evaluated_need_not_be_listed_any_more():
+    texts = dict.fromkeys(("section", "sentence", "quantity", "threshold", "why", "reason"), "")
+    never = Verdict(name="claim", measured=None, uncertainty=None, verdict="not evaluated", runs=(), **texts)
+    assert [item.status for item in compare_claims([never], [])] == ["moved"]
 
 
 def test_the_command_answers_with_its_exit_status_and_overwrites_only_if_told(tmp_path, finished):
@@ -207,14 +216,15 @@ def test_the_table_lists_what_is_beyond_first():
     assert "DOES NOT HOLD" in text.getvalue()
 
 
-@pytest.mark.parametrize("name", ["minredundant", "redundant", "redundant-modelling", "lowsnr", "paper"])
+@pytest.mark.parametrize(
+    "name", ["minredundant", "redundant", "redundant-modelling", "lowsnr", "paper", "convergence", "runtime"]
+)
 def test_the_published_references_can_be_read_and_made_again(name):
-    kept = Path(__file__).parents[2] / "figures" / name
-    if not kept.exists():
-        pytest.skip("not published yet")
+    kept = FIGURES_FOLDER / name
     results = read_reference(kept)
     assert results.figures
-    assert results.claims
+    assert bool(results.claims) == (name != "convergence")
     study = load_study(kept / "experiment.yaml")
     assert study.name == name
-    assert {item.status for item in compare_figures(results.figures, results.figures)} == {"same"}
+    compared = compare_figures(results.figures, results.figures, results.tolerances)
+    assert {item.status for item in compared} == {"same"}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from calstudy.errors import InputError
+from calstudy.base.errors import InputError
 from calstudy.report.contents import read_contents, with_error
 from calstudy.report.page import write_report
 
@@ -48,7 +48,7 @@ MANIFEST = {
         product("simulate", "foregrounds", interpolation={"max_error": 1.5e-11},
                 delay_floor={"hann": {"worst_db": -55.5}}),
         product("simulate", "eor", interpolation=None),
-        product("figure", "wedge"),
+        product("figure", "wedge", caption="The <wedge>."),
         product("figure", "spherical"),
     ],
 }  # fmt: skip
@@ -113,7 +113,17 @@ def test_figures_are_in_the_page_as_they_are_in_the_folder(folder):
     page = page_of(folder)
     images = [value.split(",")[1] for tag, name, value in page.attributes if (tag, name) == ("img", "src")]
     assert [base64.b64decode(image) for image in images] == [PNG] * 3
-    assert page.words.index("wedge") < page.words.index("spherical") < page.words.index("zebra")
+    assert page.words.index("wedge: The <wedge>.") < page.words.index("spherical") < page.words.index("zebra")
+
+
+def test_captions_and_their_order_are_those_of_the_manifest(folder):
+    captions = {"zebra": "Stripes & all.", "wedge": "", "gone": "Not drawn."}
+    (folder / "manifest.json").write_text(json.dumps({**MANIFEST, "captions": captions}))
+    found = [(picture.name, picture.caption) for picture in read_contents(folder).pictures]
+    assert found == [("zebra", "Stripes & all."), ("wedge", ""), ("spherical", "")]
+    (folder / "manifest.json").write_text(json.dumps({"name": "old"}))
+    found = [(picture.name, picture.caption) for picture in read_contents(folder).pictures]
+    assert found == [("spherical", ""), ("wedge", ""), ("zebra", "")]
 
 
 def test_text_of_a_run_is_text_and_not_markup(folder):
@@ -149,10 +159,19 @@ def test_claims_are_a_table_if_there_are_any(folder):
     assert "1 further claims were not evaluated" in page.words
 
 
+def test_a_run_without_a_role_has_a_sentence_in_place_of_the_table(folder):
+    told = product("claims", "claims", verdicts="", failed=[], without_role=["The run plays no role in mine: small."])
+    (folder / "manifest.json").write_text(json.dumps({**MANIFEST, "products": [told]}))
+    (folder / "claims.json").write_text("[]")
+    assert "The run plays no role in mine: small." in page_of(folder).words
+    (folder / "manifest.json").write_text(json.dumps({**MANIFEST, "products": []}))
+    assert "Claims of the paper" not in page_of(folder).words
+
+
 def transfer_csv(path: Path, values: list[float]) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        names = ("transfer", "transfer error", "retained", "retained error")
+        names = ("transfer", "transfer error", "squared coherence", "squared coherence error")
         writer.writerow(["k from [h/Mpc]", "k to [h/Mpc]", *names])
         for index, value in enumerate(values):
             writer.writerow([0.1 * (index + 1), 0.1 * (index + 2), value, 0.01, value, 0.02])

@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import pytest
 
-from calstudy.instrument import settings as instrument
+from calstudy.instrument.beam_models.gaussian import GaussianBeam
+from calstudy.instrument.beam_models.mwa_analytic import MwaAnalyticBeam
+from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
+from calstudy.instrument.beam_models.short_dipole import DipoleBeam
 from calstudy.instrument.beams import make_beam
 
 
 @pytest.fixture(scope="session")
 def embedded_beam():
-    return make_beam(instrument.MwaEmbeddedBeam())
+    return make_beam(MwaEmbeddedBeam())
 
 
 @pytest.fixture(scope="session")
 def tile_beam():
-    return make_beam(instrument.MwaAnalyticBeam(kind="mwa-analytic"))
+    return make_beam(MwaAnalyticBeam(kind="mwa-analytic"))
 
 
 @pytest.fixture(scope="session")
 def dipole_beam():
     """A beam that does not vanish at the horizon."""
-    return make_beam(instrument.DipoleBeam(kind="short-dipole"))
+    return make_beam(DipoleBeam(kind="short-dipole"))
 
 
 @pytest.fixture(scope="session")
 def gaussian_beam():
-    return make_beam(instrument.GaussianBeam(kind="gaussian"))
+    return make_beam(GaussianBeam(kind="gaussian"))

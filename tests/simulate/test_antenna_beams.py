@@ -8,24 +8,23 @@ import numpy as np
 import pytest
 from simulation_cases import observe, random_sky, relative_error
 
-from calstudy.errors import ExperimentError
+from calstudy.base.errors import ExperimentError
+from calstudy.base.visibilities import antenna_indices, to_cube
 from calstudy.experiment.files import validate
-from calstudy.graph.tasks import Graph
 from calstudy.instrument.antenna_beams import AntennaBeams, make_beams
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
-from calstudy.simulate.dense import DenseEngine
-from calstudy.simulate.engine import make_engine
-from calstudy.simulate.matvis_engine import MatvisEngine
-from calstudy.simulate.nufft import FftvisEngine
-from calstudy.simulate.reference import PyuvsimEngine
+from calstudy.papers.calamity2022.substitutions import substitutions
+from calstudy.products import corruption, simulation
+from calstudy.products.files import read_visibilities
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job
+from calstudy.simulate.engines.dense import DenseEngine
+from calstudy.simulate.engines.fftvis import FftvisEngine
+from calstudy.simulate.engines.matvis import MatvisEngine
+from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.foregrounds import make_foregrounds
-from calstudy.stages.files import read_visibilities
-from calstudy.stages.registry import Job
-from calstudy.stages.simulation import assemble_product, simulate_chunk_product
-from calstudy.standins import footnotes
-from calstudy.visibilities import antenna_indices, to_cube
 
 SMALL = {
     "name": "several",
@@ -61,7 +60,7 @@ def expected(sky, beams, template):
     return PyuvsimEngine().simulate(sky, beams, template)
 
 
-@pytest.mark.parametrize("engine", [DenseEngine(), MatvisEngine(), FftvisEngine()], ids=lambda engine: engine.name)
+@pytest.mark.parametrize("engine", [DenseEngine(), MatvisEngine(), FftvisEngine()], ids=lambda engine: engine.label)
 def test_engines_agree_with_pyuvsim(engine, sky, beams, template, expected):
     assert engine.refusal(sky, beams, template) is None
     assert relative_error(engine.simulate(sky, beams, template), expected) < 1e-10
@@ -74,7 +73,7 @@ def test_cross_hands_of_different_beams_go_to_an_engine_that_has_them(sky, beams
     assert relative_error(expected[..., 0], expected[..., 1]) > 0.1
     assert relative_error(MatvisEngine().simulate(sky, beams, crossed), expected) < 1e-10
     assert "confuses" in FftvisEngine().refusal(sky, beams, crossed)
-    assert make_engine(SimulationSettings()).choose(sky, beams, crossed).name == "matvis"
+    assert SimulationSettings().engine.choose(sky, beams, crossed).label == "matvis"
 
 
 def test_only_the_baselines_of_other_antennas_change(sky, beams, template, expected, embedded_beam):
@@ -87,7 +86,7 @@ def test_only_the_baselines_of_other_antennas_change(sky, beams, template, expec
 
 
 @pytest.mark.parametrize(
-    "engine", [DenseEngine(), MatvisEngine(), FftvisEngine(), PyuvsimEngine()], ids=lambda engine: engine.name
+    "engine", [DenseEngine(), MatvisEngine(), FftvisEngine(), PyuvsimEngine()], ids=lambda engine: engine.label
 )
 def test_the_same_beam_given_to_each_antenna_changes_nothing(engine, sky, gaussian_beam):
     template = observe(count=4, channels=1, times=1)
@@ -108,19 +107,19 @@ def test_beams_that_are_the_same_are_one():
 
 
 def test_auto_takes_the_fastest(sky, beams, template):
-    assert make_engine(SimulationSettings()).choose(sky, beams, template).name == "dense"
+    assert SimulationSettings().engine.choose(sky, beams, template).label == "dense"
 
 
 def test_an_experiment_simulates_them(tmp_path: Path):
     groups = {"damaged": {"antennas": [2, 5], "beam": WIDE}}
     experiment = validate({**SMALL, "instrument": {**SMALL["instrument"], "antenna_beams": groups}}, tmp_path)
-    task = Graph(experiment).foregrounds
-    (piece,) = task.inputs.values()
+    task = simulation.foregrounds(Graph(experiment))
+    (piece,) = task.pieces.values()
     chunk, whole = tmp_path / "chunk", tmp_path / "whole"
     chunk.mkdir()
     whole.mkdir()
-    simulate_chunk_product(Job(settings=piece.settings, inputs={}, output=chunk))
-    assemble_product(Job(settings=task.settings, inputs={"chunk000": chunk}, output=whole))
+    simulation.simulate_chunk(Job(settings=piece.settings, inputs={}, output=chunk))
+    simulation.assemble(Job(settings=task.settings, inputs={"chunk000": chunk}, output=whole))
     template = make_template(experiment.instrument)
     made = make_beams(experiment.instrument, 7)
     assert made.index.tolist() == [0, 0, 1, 0, 0, 1, 0]
@@ -134,14 +133,13 @@ def test_an_array_of_like_antennas_is_identified_as_before(tmp_path: Path):
         validate({**SMALL, "instrument": {**SMALL["instrument"], **extra}}, tmp_path)
         for extra in ({}, {"antenna_beams": {}})
     )
-    assert "antenna_beams" not in plain.model_dump(mode="json")["instrument"]
-    assert Graph(plain).foregrounds.key == Graph(with_field).foregrounds.key
+    assert simulation.foregrounds(Graph(plain)).key == simulation.foregrounds(Graph(with_field)).key
     groups = {"antenna_beams": {"odd": {"antennas": [1], "beam": WIDE}}}
     other = validate({**SMALL, "instrument": {**SMALL["instrument"], **groups}}, tmp_path)
-    assert Graph(other).foregrounds.key != Graph(plain).foregrounds.key
-    assert "antennas with another: 1" in " ".join(footnotes(other))
+    assert simulation.foregrounds(Graph(other)).key != simulation.foregrounds(Graph(plain)).key
+    assert "antennas with another: 1" in " ".join(substitutions(other))
     # What does not look through the beams stays the same.
-    assert Graph(other).gains.key == Graph(plain).gains.key
+    assert corruption.gains(Graph(other)).key == corruption.gains(Graph(plain)).key
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,10 @@ from simulation_cases import healpix_sky, observe, random_sky, relative_error
 
 from calstudy.instrument.telescope import subset_template
 from calstudy.simulate.chunks import assemble, check_interpolation, plan_chunks, simulate_chunk, simulate_visibilities
-from calstudy.simulate.dense import DenseEngine
 from calstudy.simulate.directions import split_by_horizon
+from calstudy.simulate.engines.dense import DenseEngine
+from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
 from calstudy.simulate.nodes import integration_times, node_grid
-from calstudy.simulate.reference import PyuvsimEngine
 from calstudy.simulate.settings import Nodes, SimulationSettings
 
 

@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 from astropy import units
 from astropy.coordinates import SkyCoord
+from pydantic import ValidationError
 from pyradiosky import SkyModel
 from pyuvdata.analytic_beam import UniformBeam
 from scipy.constants import speed_of_light
 from simulation_cases import healpix_sky, local_coordinates, observe, point_sky, random_sky, relative_error
 
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.beams import ExactBeam
-from calstudy.simulate.dense import DenseEngine
-from calstudy.simulate.engine import FastestEngine, make_engine
-from calstudy.simulate.matvis_engine import MatvisEngine
-from calstudy.simulate.nufft import FftvisEngine
-from calstudy.simulate.reference import PyuvsimEngine
+from calstudy.simulate.engines.auto import FastestEngine
+from calstudy.simulate.engines.dense import DenseEngine
+from calstudy.simulate.engines.fftvis import FftvisEngine
+from calstudy.simulate.engines.matvis import MatvisEngine
+from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.interface import simulate_with
 from calstudy.simulate.settings import SimulationSettings
-from calstudy.visibilities import baseline_vectors
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +62,12 @@ def test_fftvis_agrees_with_pyuvsim(name, request, sky, template):
 def test_matvis_agrees_with_pyuvsim(name, request, sky, template):
     beam, expected = pyuvsim_visibilities(name, request, sky, template)
     assert relative_error(MatvisEngine().simulate(sky, beam, template), expected) < 1e-11
-    assert 1e-7 < relative_error(MatvisEngine("single").simulate(sky, beam, template), expected) < 1e-3
+    assert 1e-7 < relative_error(MatvisEngine(precision="single").simulate(sky, beam, template), expected) < 1e-3
 
 
 def test_single_precision_is_single(sky, template, tile_beam):
     double = DenseEngine().simulate(sky, tile_beam, template)
-    error = relative_error(DenseEngine("single").simulate(sky, tile_beam, template), double)
+    error = relative_error(DenseEngine(precision="single").simulate(sky, tile_beam, template), double)
     assert 1e-9 < error < 1e-5
 
 
@@ -95,7 +98,7 @@ def test_a_source_at_zenith_gives_half_its_flux_with_the_phase_of_the_heights(ga
     np.testing.assert_allclose(cube, expected, rtol=1e-7)
 
 
-@pytest.mark.parametrize("engine", [DenseEngine(), PyuvsimEngine()], ids=lambda engine: engine.name)
+@pytest.mark.parametrize("engine", [DenseEngine(), PyuvsimEngine()], ids=lambda engine: engine.label)
 def test_a_source_anywhere_gives_the_power_of_a_short_dipole_and_the_phase_of_its_direction(engine, dipole_beam):
     template = observe(times=1)
     altitude, azimuth = np.deg2rad(35.0), np.deg2rad(110.0)
@@ -149,34 +152,37 @@ def test_arguments_are_not_changed(sky, template, embedded_beam):
     sky_before, template_before = sky.copy(), template.copy()
     for engine in (DenseEngine(), PyuvsimEngine(), FftvisEngine(), MatvisEngine()):
         engine.simulate(sky, embedded_beam, template)
-        assert sky == sky_before, engine.name
-        assert template == template_before, engine.name
+        assert sky == sky_before, engine.label
+        assert template == template_before, engine.label
 
 
 def test_auto_takes_the_fastest_that_can(sky, template, tile_beam):
-    auto = make_engine(SimulationSettings())
+    auto = SimulationSettings().engine
     assert isinstance(auto, FastestEngine)
-    assert auto.choose(sky, tile_beam, template).name == "dense"
+    assert auto.choose(sky, tile_beam, template).label == "dense"
     polarized = point_sky(sky.skycoord[:2], [1.0, 1.0], stokes_q=0.3)
-    assert auto.choose(polarized, tile_beam, template).name == "pyuvsim"
+    assert auto.choose(polarized, tile_beam, template).label == "pyuvsim"
     expected = PyuvsimEngine().simulate(polarized, tile_beam, template)
     assert relative_error(auto.simulate(polarized, tile_beam, template), expected) < 1e-12
-    with pytest.raises(ValueError, match="polarized sky"):
-        DenseEngine().simulate(polarized, tile_beam, template)
+    with pytest.raises(InputError, match=r"simulation\.engine = 'dense': .*polarized sky"):
+        simulate_with(DenseEngine(), polarized, tile_beam, template)
 
 
 def test_engines_are_chosen_by_name():
     for name in ("dense", "matvis", "fftvis", "pyuvsim"):
-        assert make_engine(SimulationSettings(engine=name)).name == name
+        assert SimulationSettings(engine=name).engine.label == name
+    with pytest.raises(ValidationError, match=r"engine: \{kind: dense, precision: single"):
+        SimulationSettings.model_validate({"engine": "dense", "precision": "single"})
+    assert SimulationSettings(engine={"precision": "single"}).engine == FastestEngine(precision="single")
 
 
 @pytest.mark.parametrize("name", ["tile_beam", "embedded_beam"])
 def test_cross_hands_go_to_an_engine_that_has_them(name, request, sky):
     crossed = observe(channels=1, times=1, polarizations=("xx",))
     crossed.polarization_array = np.array([-7])
-    auto = make_engine(SimulationSettings())
+    auto = SimulationSettings().engine
     beam, expected = pyuvsim_visibilities(name, request, sky, crossed)
-    assert auto.choose(sky, beam, crossed).name == "matvis"
+    assert auto.choose(sky, beam, crossed).label == "matvis"
     for engine in (auto, FftvisEngine()):
         assert relative_error(engine.simulate(sky, beam, crossed), expected) < 1e-10
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from simulation_cases import observe, random_sky
 
-from calstudy.simulate.dense import DenseEngine
+from calstudy.base.visibilities import baseline_vectors, from_cube
+from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.floor import delay_floor
-from calstudy.visibilities import baseline_vectors, from_cube
 
 
 @pytest.fixture(scope="module")

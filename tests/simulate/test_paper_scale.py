@@ -7,8 +7,8 @@ import pytest
 from simulation_cases import observe, relative_error
 
 from calstudy.instrument.telescope import subset_template
-from calstudy.simulate.dense import DenseEngine
-from calstudy.simulate.reference import PyuvsimEngine
+from calstudy.simulate.engines.dense import DenseEngine
+from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import SyntheticSources
 

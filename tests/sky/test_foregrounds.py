@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from pyradiosky import SkyModel
 from scipy.integrate import quad
 
-from calstudy import downloads
-from calstudy.errors import InputError
+from calstudy.base import downloads
+from calstudy.base.errors import InputError
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
 from calstudy.sky.counts import differential_counts

@@ -1,53 +1,57 @@
-"""``calstudy validate``: exit status, table, and what is kept of failures, with a rung that costs nothing."""
+"""``calstudy validate``: exit status, table, and what is kept of failures, with a measurement of one's own."""
 
 from __future__ import annotations
 
 import json
 import sys
-import types
 from pathlib import Path
 
 import pytest
 import yaml
 
-from calstudy import cli
-from calstudy.claims.statement import Finding
-from calstudy.errors import InputError
-from calstudy.validation import rungs
-from calstudy.validation.evidence import Evidence, Measurement
+from calstudy.cli.main import main as cli
 
+OWN = """
+from calstudy.base.errors import InputError
+from calstudy.validation.measurement import Findings, Measurement
+from calstudy.verdicts.criterion import Finding
 
-def measure(evidence: Evidence) -> Measurement:
-    value = evidence.parameters["value"]
-    if value == "broken":
-        raise InputError("this rung cannot measure")
-    return Measurement({"number": Finding(value, 0.1)}, ("a remark",))
+class Pretended(Measurement):
+    value: float
+    broken: str = ""
+
+    def measure(self, inputs):
+        if self.broken == "refused":
+            raise InputError("this measurement cannot be made")
+        if self.broken == "error":
+            return [][0]
+        if self.broken == "wrong":
+            return {"number": 1.0}
+        return Findings({"number": Finding(self.value, 0.1)}, ("a remark",))
+"""
 
 
 @pytest.fixture
 def ladder(tmp_path, monkeypatch) -> Path:
-    module = types.ModuleType("calstudy.validation.pretended")
-    module.measure = measure
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(rungs, "RUNGS", {**rungs.RUNGS, "pretended": rungs.Rung("pretended", rungs._nothing)})
-    monkeypatch.setattr("calstudy.graph.validation.RUNGS", rungs.RUNGS)
-    monkeypatch.setattr("calstudy.stages.validation.RUNGS", rungs.RUNGS)
+    """A folder of steps beside a measurement of one's own."""
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "ladder"
     folder.mkdir()
+    (folder / "pretended.py").write_text(OWN)
     return folder
 
 
-def step(folder: Path, name: str, value: object) -> None:
+def step(folder: Path, name: str, value: float, broken: str = "") -> None:
     criterion = {"measures": "number", "quantity": "a number", "must": {"at_most": 1}, "why": "because"}
-    content = {"step": name, "title": "x", "proves": "y", "rung": "pretended", "parameters": {"value": value}}
+    content = {"step": name, "title": "x", "proves": "y", "measurement": "pretended.py"}
+    content["parameters"] = {"value": value, "broken": broken}
     (folder / f"{name}.yaml").write_text(yaml.safe_dump({**content, "criteria": [criterion]}))
 
 
 def validate(monkeypatch, capsys, *arguments: str) -> tuple[int, str, str]:
     monkeypatch.setattr(sys, "argv", ["calstudy", "validate", *arguments])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        cli()
     written = capsys.readouterr()
     return end.value.code or 0, written.out, written.err
 
@@ -70,12 +74,19 @@ def test_passing_is_0_failing_is_1_and_failures_are_kept(ladder, monkeypatch, ca
 
 def test_a_step_that_cannot_be_measured_fails_alone(ladder, monkeypatch, capsys):
     step(ladder, "0.0", 0.5)
-    step(ladder, "1.0", "broken")
+    broken = {
+        "refused": "this measurement cannot be made",
+        "error": "pretended.py line 14, in measure: IndexError: list index out of range",
+        "wrong": "pretended: its measure returned a dict, expected Findings",
+    }
+    for number, name in enumerate(broken, 1):
+        step(ladder, f"{number}.0", 0.5, name)
     status, _, _ = validate(monkeypatch, capsys, "--ladder", str(ladder))
     assert status == 1
     steps = {item["step"]: item for item in json.loads(Path("validation/validation.json").read_text())["steps"]}
-    assert steps["0.0"]["passed"] and not steps["1.0"]["passed"]
-    assert "this rung cannot measure" in steps["1.0"]["criteria"][0]["reason"]
+    assert {name for name, found in steps.items() if found["passed"]} == {"0.0"}
+    for number, reason in enumerate(broken.values(), 1):
+        assert reason in steps[f"{number}.0"]["criteria"][0]["reason"]
 
 
 @pytest.mark.parametrize(

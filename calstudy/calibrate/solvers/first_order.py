@@ -20,8 +20,8 @@ from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.loss import foreground_model, likelihood, sum_prior
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, Prior
 from calstudy.calibrate.projection import Projector
-from calstudy.calibrate.solvers.gauss_newton import remaining_at
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
+from calstudy.calibrate.solvers.reduced import newton_decrement_at
 from calstudy.calibrate.tensors import FitTensors
 
 Method = Literal["adamax", "adam", "sgd"]
@@ -151,7 +151,7 @@ def update(
     return moved, (first, second)
 
 
-class Kernels:
+class JointKernels:
     """Loss, gradient and the compiled descent for one fit structure and one setting of the optimizer."""
 
     def __init__(self, structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> None:
@@ -167,9 +167,10 @@ class Kernels:
         """Return gains with the foregrounds that fit best, in weighted least squares, the data, and their unit."""
         exact = self.tensors.load(problem, tf.float64)
         start = pairs.to_pair(gains, tf.float64)
-        coefficients, model = (), None
-        if problem.frozen:
-            model = self.tensors.load_model(problem.sky_model, exact.scale, self.dtype)
+        coefficients: tuple[tf.Tensor, ...] = ()
+        model = None
+        if (frozen := problem.frozen_model) is not None:
+            model = self.tensors.load_model(frozen, exact.scale, self.dtype)
         else:
             best = self.projector.project(start, exact.visibilities, exact.weights).model
             parts = zip(self.tensors.slices, self.tensors.bases, strict=True)
@@ -177,8 +178,8 @@ class Kernels:
                 tf.cast(_coefficients(best[:, first:last], basis), self.dtype) for (first, last), basis in parts
             )
         target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
-        measured = (exact.visibilities, exact.weights)
-        data = FitData(*(tf.cast(part, self.dtype) for part in measured), pairs.to_pair(target, self.dtype), model)
+        visibilities, weights = (tf.cast(part, self.dtype) for part in (exact.visibilities, exact.weights))
+        data = FitData(visibilities, weights, pairs.to_pair(target, self.dtype), model)
         return Parameters(self.space.reduce(tf.cast(start, self.dtype)), coefficients), data, exact.scale
 
     def loss(self, parameters: Parameters, data: FitData) -> tf.Tensor:
@@ -192,7 +193,17 @@ class Kernels:
         return value + sum_prior(self.tensors, model, data.weights, data.target) if self._with_prior else value
 
     def estimate(self, parameters: Parameters, data: FitData, scale: float) -> Estimate:
-        """Return gains and model in the problem's order and unit."""
+        """Return gains and model in the problem's order and unit.
+
+        Parameters
+        ----------
+        parameters
+            Of the descent.
+        data
+            What it fits; holds the model if it is frozen.
+        scale
+            Unit of the visibilities in `data`, in the problem's unit.
+        """
         model = data.model
         if model is None:
             model = tf.stack(foreground_model(parameters.coefficients, self.bases))
@@ -226,16 +237,28 @@ class Kernels:
 
 
 @lru_cache(maxsize=4)
-def compiled(structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> Kernels:
-    """Return the kernels of a structure and setting, compiled once for all its integrations."""
-    return Kernels(structure, optimizer, precision, prior)
+def compiled(structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> JointKernels:
+    """Return the kernels of a structure and setting, compiled once for all its integrations.
+
+    Parameters
+    ----------
+    structure
+        Of the fit.
+    optimizer
+        How a gradient becomes a step.
+    precision
+        Of all that the descent computes.
+    prior
+        Of the overall scale; only ``sum`` is part of the loss.
+    """
+    return JointKernels(structure, optimizer, precision, prior)
 
 
 @dataclass(frozen=True, eq=False)
 class FirstOrderState:
     """One point of the descent; losses are in units of the data's mean square."""
 
-    kernels: Kernels
+    kernels: JointKernels
     data: FitData
     scale: float
     descent: Descent
@@ -306,9 +329,9 @@ class FirstOrder:
         """Return the best gains and foregrounds seen."""
         return state.kernels.estimate(state.descent.best, state.data, state.scale)
 
-    def remaining(self, state: FirstOrderState, problem: CalibrationProblem) -> float:
-        """Return what a Gauss-Newton step would still bring."""
-        return remaining_at(problem, self.estimate(state).gains)
+    def newton_decrement(self, state: FirstOrderState, problem: CalibrationProblem) -> float:
+        """Return the relative Newton decrement at the estimate."""
+        return newton_decrement_at(problem, self.estimate(state).gains)
 
     def memory(self, state: FirstOrderState) -> None:
         """Return nothing: only the gains carry over."""

@@ -1,6 +1,6 @@
 """The default solver: foregrounds eliminated exactly, damped Gauss-Newton on the gains.
 
-Each step solves the damped normal equations of the reduced problem (see `calstudy.calibrate.projection`) by
+Each step solves the damped normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`) by
 preconditioned conjugate gradients, with the damping tied to the loss, so that it vanishes towards the minimum. The
 first two steps use the antenna blocks of each channel as preconditioner, later ones the channel blocks of each antenna,
 which also predict how much the loss can still fall: the criterion of convergence. Where baselines share models, the
@@ -12,193 +12,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import NamedTuple
 
-import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.frozen import FrozenForegrounds
-from calstudy.calibrate.gain_space import GainSpace
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure
-from calstudy.calibrate.projection import Projection, Projector
-from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
+from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.projection import Projection
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
-from calstudy.calibrate.solvers.preconditioners import (
-    AntennaBlocks,
-    Inverse,
-    antenna_blocks,
-    antenna_degrees,
-    antenna_inverse,
-    channel_inverse,
-    coordinate_inverse,
+from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, Inverse
+from calstudy.calibrate.solvers.reduced import (
+    PRECONDITIONER_DAMPING,
+    ROUNDING_LOSS,
+    ReducedKernels,
+    compiled,
+    damping_at,
+    newton_decrement_at,
 )
-from calstudy.calibrate.tensors import FitTensors
 
-# Damping, relative to the diagonal, is this times the loss relative to the data, within the two bounds.
-DAMPING_PER_LOSS = 10.0
-DAMPING_BOUNDS = (1e-6, 1e-2)
-# The blocks of float32 numbers cannot be inverted with less.
-PRECONDITIONER_DAMPING = 1e-5
+# Accepted steps before the antenna blocks are made.
 CHANNEL_STEPS = 2
-CG_TOLERANCE = 1e-3
-CG_CHANNEL_ITERATIONS = 300
-CG_ANTENNA_ITERATIONS = 60
 # With more than this on the damping, no step is small enough to lower the loss.
 MAX_BOOST = 1e6
 # Antenna blocks that need more iterations than this are out of date.
 CG_REFRESH = 15
-# Loss relative to the data below which a residual is rounding: 3e-8 of the visibilities, float32's resolution.
-ROUNDING_LOSS = 1e-15
-
-
-class Reduced(NamedTuple):
-    """A problem for the gains alone.
-
-    Attributes
-    ----------
-    gains
-        Where to start, (2, Nants, Nfreqs), float64.
-    measured
-        Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) whose sum is one, and the model if it is frozen; float64.
-    scale
-        Unit of the visibilities, their weighted rms.
-    loss_unit
-        Unit of the loss, in the unit of the data squared.
-    """
-
-    gains: tf.Tensor
-    measured: tuple[tf.Tensor, ...]
-    scale: float
-    loss_unit: float
-
-
-class NormalEquations(NamedTuple):
-    """The damped Gauss-Newton equations at one point, and what preconditions them.
-
-    Attributes
-    ----------
-    projection
-        The reduced problem there.
-    gains
-        (2, Nants, Nfreqs), float32 or float64.
-    damping
-        Relative to the diagonal, scalar, float32.
-    inverse
-        Preconditioner.
-    """
-
-    projection: Projection
-    gains: tf.Tensor
-    damping: tf.Tensor
-    inverse: Inverse
-
-
-class Kernels:
-    """The compiled pieces of the solver for one fit structure.
-
-    Attributes
-    ----------
-    by_channel
-        Whether the antenna blocks of each channel are the preconditioner throughout: couplings between antennas remain
-        the strong ones where baselines share models or coefficients, and are the only ones where the foregrounds are
-        frozen.
-    """
-
-    def __init__(self, structure: FitStructure, frozen: bool = False) -> None:
-        self.tensors = FitTensors(structure)
-        self.frozen = frozen
-        self.by_channel = (self.tensors.coupled or frozen) and structure.gain_vectors is None
-        self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(self.tensors)
-        self.space = GainSpace(structure.gain_vectors, tf.float32)
-        self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
-        self.project = self.projector.project
-        self.channel_step = tf.function(self._channel_step)
-        self.antenna_step = tf.function(self._antenna_step)
-        self.blocks = tf.function(self._blocks)
-        self.inverse = tf.function(self._inverse)
-        self.predicted_decrease = tf.function(self._predicted_decrease)
-
-    def reduce(self, problem: CalibrationProblem, gains: np.ndarray) -> Reduced:
-        """Return a problem, and gains (Nants, Nfreqs) as close as their space allows, as tensors."""
-        data = self.tensors.load(problem, tf.float64)
-        total = float(tf.reduce_sum(data.weights))
-        measured = (data.visibilities, data.weights / total)
-        if problem.frozen:
-            measured += (self.tensors.load_model(problem.sky_model, data.scale, tf.float64),)
-        start = self.exact_space.expand(self.exact_space.reduce(pairs.to_pair(gains, tf.float64)))
-        return Reduced(start, measured, data.scale, total * data.scale**2)
-
-    def _channel_step(
-        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor
-    ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta, and the decrease of the loss that its quadratic model promises."""
-        inverse = channel_inverse(self.tensors, projection, damping)
-        descent = tf.cast(projection.descent, tf.float32)
-        equations = NormalEquations(projection, gains, damping, inverse)
-        eta, _ = self.solve(equations, descent, CG_TOLERANCE, CG_CHANNEL_ITERATIONS)
-        return eta, pairs.inner_product(descent, eta)
-
-    def _antenna_step(
-        self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
-    ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta, and the iterations it took."""
-        descent = tf.cast(projection.descent, tf.float32)
-        equations = NormalEquations(projection, gains, damping, inverse)
-        return self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)
-
-    def solve(
-        self, equations: NormalEquations, descent: tf.Tensor, tolerance: float, iterations: int
-    ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta for a descent direction, both (2, Nants, Nfreqs), float32, and the iterations it took.
-
-        Parameters
-        ----------
-        equations
-            What is solved.
-        descent
-            Minus half the gradient in eta.
-        tolerance, iterations
-            See `calstudy.calibrate.solvers.conjugate_gradients.conjugate_gradients`.
-        """
-        projection = equations.projection
-        diagonal = equations.damping * antenna_degrees(self.tensors, projection)
-        gains = tf.cast(equations.gains, tf.float32)
-
-        def operator(coordinates: tf.Tensor) -> tf.Tensor:
-            eta = self.space.expand_relative(coordinates, gains)
-            image = self.projector.hessian_product(eta, projection) + diagonal * eta
-            return self.space.reduce_relative(image, gains)
-
-        coordinates, count = conjugate_gradients(
-            operator,
-            equations.inverse.apply,
-            self.space.reduce_relative(descent, gains),
-            tf.constant(tolerance),
-            tf.constant(iterations),
-        )
-        return self.space.expand_relative(coordinates, gains), count
-
-    def _blocks(self, projection: Projection) -> AntennaBlocks:
-        if self.frozen:
-            return AntennaBlocks(antenna_degrees(self.tensors, projection))
-        return antenna_blocks(self.projector, projection)
-
-    def _inverse(self, blocks: AntennaBlocks, damping: tf.Tensor, gains: tf.Tensor) -> Inverse:
-        if self.space.vectors is None:
-            return antenna_inverse(blocks, damping)
-        return coordinate_inverse(blocks, self.space.columns(tf.cast(gains, tf.float32)), damping)
-
-    def _predicted_decrease(self, projection: Projection, gains: tf.Tensor, inverse: Inverse) -> tf.Tensor:
-        descent = self.space.reduce_relative(tf.cast(projection.descent, tf.float32), tf.cast(gains, tf.float32))
-        return pairs.inner_product(descent, inverse.apply(descent))
-
-
-@lru_cache(maxsize=4)
-def compiled(structure: FitStructure, frozen: bool = False) -> Kernels:
-    """Return the kernels of a structure, compiled once for all its integrations."""
-    return Kernels(structure, frozen)
 
 
 class AntennaPreconditioner(NamedTuple):
@@ -217,7 +54,7 @@ class GaussNewtonState:
     ----------
     scale
         Unit of the visibilities, their weighted rms.
-    measured
+    data
         Visibilities, weights whose sum is one, and the model if it is frozen.
     boost
         Factor on the damping; grows tenfold whenever a step did not lower the loss.
@@ -229,9 +66,9 @@ class GaussNewtonState:
         Decrease of the loss that is predicted for the next step; infinite while unknown.
     """
 
-    kernels: Kernels
+    kernels: ReducedKernels
     scale: float
-    measured: tuple[tf.Tensor, ...]
+    data: tuple[tf.Tensor, ...]
     loss_unit: float
     gains: tf.Tensor
     projection: Projection
@@ -245,11 +82,10 @@ class GaussNewtonState:
     @property
     def damping(self) -> float:
         """Damping of the next step, relative to the diagonal of the Gauss-Newton matrix."""
-        low, high = DAMPING_BOUNDS
-        return min(max(DAMPING_PER_LOSS * self.history[-1], low), high) * self.boost
+        return damping_at(self.history[-1]) * self.boost
 
     @property
-    def outlook(self) -> float:
+    def decrease_to_come(self) -> float:
         """Decrease of the loss by all steps to come, over the loss: a geometric series, from the last step to the next.
 
         Before the first step it is that of the next step alone.
@@ -279,11 +115,11 @@ class GaussNewton:
         """Project at the first gains, and take over the preconditioner of the warm start."""
         kernels = compiled(problem.structure, problem.frozen)
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
-        projection = kernels.project(reduced.gains, *reduced.measured)
+        projection = kernels.project(reduced.gains, *reduced.data)
         state = GaussNewtonState(
             kernels,
             reduced.scale,
-            reduced.measured,
+            reduced.data,
             reduced.loss_unit,
             reduced.gains,
             projection,
@@ -304,7 +140,7 @@ class GaussNewton:
             if iterations > CG_REFRESH:
                 preconditioner = None
         gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))
-        trial = kernels.project(gains, *state.measured)
+        trial = kernels.project(gains, *state.data)
         loss = float(trial.loss)
         # Refused as well: a loss that is not a number, and no step at all, from blocks that are singular to float32.
         if not loss < state.history[-1]:
@@ -338,7 +174,7 @@ class GaussNewton:
         if loss < ROUNDING_LOSS:
             return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
-        if fall < self.tolerance and min(state.outlook, state.gained / loss) < self.tolerance:
+        if fall < self.tolerance and min(state.decrease_to_come, state.gained / loss) < self.tolerance:
             return Verdict("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.boost > MAX_BOOST:
             hint = f", though {fall:.1e} of itself is predicted" if math.isfinite(fall) else ""
@@ -357,13 +193,13 @@ class GaussNewton:
         model = state.kernels.tensors.unload(state.projection.model, state.scale)
         return Estimate(pairs.to_complex(state.gains), model)
 
-    def remaining(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
+    def newton_decrement(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
         """Return the predicted decrease that convergence is judged by; looked up anew if the iteration has none yet."""
         if state.history[-1] < ROUNDING_LOSS:
             return 0.0
         if math.isfinite(state.predicted):
             return state.predicted / state.history[-1]
-        return remaining_at(problem, pairs.to_complex(state.gains))
+        return newton_decrement_at(problem, pairs.to_complex(state.gains))
 
     def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
         """Return the antenna blocks, which hardly change from one integration to the next."""
@@ -388,24 +224,3 @@ class GaussNewton:
             return state
         fall = kernels.predicted_decrease(state.projection, state.gains, preconditioner.inverse)
         return replace(state, predicted=float(fall))
-
-
-def remaining_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
-    """Return by how much of itself a Gauss-Newton step from these gains would lower the loss at the best foregrounds.
-
-    Parameters
-    ----------
-    problem
-        Data and weights.
-    gains
-        Where any solver stopped, (Nants, Nfreqs).
-    """
-    solver = GaussNewton()
-    state = solver.init(problem, WarmStart(gains, None))
-    loss = state.history[-1]
-    if loss < ROUNDING_LOSS:
-        return 0.0
-    if state.kernels.by_channel:
-        _, promised = state.kernels.channel_step(state.projection, state.gains, tf.constant(state.damping, tf.float32))
-        return float(promised) / loss
-    return solver._prepared(replace(state, n_accepted=CHANNEL_STEPS)).predicted / loss

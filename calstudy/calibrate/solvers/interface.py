@@ -71,8 +71,8 @@ class Solver(Protocol):
     def estimate(self, state: Any) -> Estimate:
         """Return the best gains and model so far."""
 
-    def remaining(self, state: Any, problem: CalibrationProblem) -> float:
-        """Return the predicted decrease of the loss that is left at the estimate, over the loss; NaN if unknown."""
+    def newton_decrement(self, state: Any, problem: CalibrationProblem) -> float:
+        """Return the relative Newton decrement at the estimate (see `Solution`); NaN if unknown."""
 
     def memory(self, state: Any) -> Any:
         """Return what the next solve can reuse, or None."""
@@ -85,6 +85,15 @@ def solve_warm(
 
     The solution has its degeneracies fixed (see `calstudy.calibrate.degeneracy`). Not converging is a status, not an
     error; after a failed solve there is no warm start.
+
+    Parameters
+    ----------
+    problem
+        What is fitted.
+    solver
+        Its settings; all that changes is in its states.
+    warm
+        Of an earlier solve with the same structure; None to start from the problem's initial gains.
     """
     solution, state = _solve(problem, solver, warm)
     return solution, WarmStart(solution.gains, solver.memory(state)) if solution.usable else None
@@ -98,15 +107,15 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
         state = solver.step(state)
     losses = np.array(solver.losses(state), float)
     gains, model = solver.estimate(state)
-    remaining = rms = math.nan
+    newton_decrement = rms = math.nan
     if verdict.status != "failed":
-        remaining = float(np.clip(solver.remaining(state, problem), 0, 1))
-        if verdict.status == "converged" and remaining > max(STILL, solver.tolerance):
-            told = f"{verdict.message}, but a Gauss-Newton step would lower it by {remaining:.1e} of itself"
-            verdict = Verdict("stalled", told)
+        newton_decrement = float(np.clip(solver.newton_decrement(state, problem), 0, 1))
+        if verdict.status == "converged" and newton_decrement > max(STILL, solver.tolerance):
+            message = f"{verdict.message}, but a Gauss-Newton step would lower it by {newton_decrement:.1e} of itself"
+            verdict = Verdict("stalled", message)
         try:
             gains, model = fix_degeneracies(gains, model, problem)
-            rms = remaining_rms(gains, model, problem, remaining)
+            rms = decrement_rms(gains, model, problem, newton_decrement)
         except ValueError as error:
             verdict = Verdict("failed", str(error))
     seconds = time.perf_counter() - started
@@ -118,18 +127,28 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
         verdict.message,
         losses.size - 1,
         seconds,
-        remaining,
+        newton_decrement,
         rms,
     )
     logger.debug("%s after %d steps, %.2f s: %s", solution.status, solution.n_steps, seconds, solution.message)
     return solution, state
 
 
-def remaining_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem, remaining: float) -> float:
-    """Return the rms of the part of V / (g g*) - F whose share of the weighted residual's power is `remaining`."""
+def decrement_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem, newton_decrement: float) -> float:
+    """Return the rms of the part of the residual that is left because the iteration stopped, in the unit of the data.
+
+    Parameters
+    ----------
+    gains, model
+        The estimate, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
+    problem
+        What was fitted.
+    newton_decrement
+        Relative: the share of this part in the weighted power of V / (g_a g_b*) - F.
+    """
     products = gain_products(gains, problem.structure.antennas)
     loss = np.sum(problem.weights * np.abs(problem.visibilities - products * model) ** 2)
-    return float(np.sqrt(remaining * loss / np.sum(problem.weights * np.abs(products) ** 2)))
+    return float(np.sqrt(newton_decrement * loss / np.sum(problem.weights * np.abs(products) ** 2)))
 
 
 def solve(problem: CalibrationProblem, solver: Solver) -> Solution:

@@ -17,13 +17,13 @@ from scipy.optimize import OptimizeResult, minimize
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
-from calstudy.calibrate.solvers.gauss_newton import Kernels, Reduced, compiled, remaining_at
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.solvers.preconditioners import antenna_degrees
+from calstudy.calibrate.solvers.reduced import ReducedData, ReducedKernels, compiled, newton_decrement_at
 
-# Steps between looks at what a Gauss-Newton step would still bring, which costs as much as several steps here.
+# Steps between evaluations of the Newton decrement, which costs as much as several steps here.
 WINDOW = 10
-# Decrease over as many steps, relative to the loss, above which there is no need to look.
+# Decrease over as many steps, relative to the loss, above which it is not evaluated.
 FAST = 1e-2
 
 
@@ -37,33 +37,33 @@ class LbfgsState:
         Of the gains in their space, times `unit`, float64.
     unit
         Scale of each antenna's coordinates, (1, Nants, 1), float64.
-    remaining
-        What a Gauss-Newton step would still bring, relative to the loss; infinite while unknown.
+    newton_decrement
+        Relative Newton decrement (see `Solution`); infinite while unknown.
     message
         What scipy said at the end; None before.
     """
 
     problem: CalibrationProblem
-    kernels: Kernels
-    reduced: Reduced
+    kernels: ReducedKernels
+    reduced: ReducedData
     coordinates: np.ndarray
     unit: np.ndarray
     history: tuple[float, ...]
-    remaining: float = math.inf
+    newton_decrement: float = math.inf
     message: str | None = None
 
     def gains(self, coordinates: np.ndarray) -> tf.Tensor:
         """Return the gains with these coordinates, (2, Nants, Nfreqs)."""
         return self.kernels.exact_space.expand(tf.constant(coordinates / self.unit))
 
-    def remaining_at(self, coordinates: np.ndarray) -> float:
-        """Return what a Gauss-Newton step would bring from there."""
-        return remaining_at(self.problem, pairs.to_complex(self.gains(coordinates)))
+    def newton_decrement_at(self, coordinates: np.ndarray) -> float:
+        """Return the relative Newton decrement there."""
+        return newton_decrement_at(self.problem, pairs.to_complex(self.gains(coordinates)))
 
     def project(self, coordinates: np.ndarray) -> tuple[tf.Tensor, Projection]:
         """Return the gains with these coordinates, and the foregrounds eliminated there."""
         gains = self.gains(coordinates)
-        return gains, self.kernels.project(gains, *self.reduced.measured)
+        return gains, self.kernels.project(gains, *self.reduced.data)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Lbfgs:
         """Project at the first gains."""
         kernels = compiled(problem.structure, problem.frozen)
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
-        projection = kernels.project(reduced.gains, *reduced.measured)
+        projection = kernels.project(reduced.gains, *reduced.data)
         degrees = antenna_degrees(kernels.tensors, projection).numpy().mean(axis=1)
         unit = np.sqrt(degrees / degrees.mean())[None, :, None].astype(np.float64)
         coordinates = kernels.exact_space.reduce(reduced.gains).numpy() * unit
@@ -97,7 +97,7 @@ class Lbfgs:
     def step(self, state: LbfgsState) -> LbfgsState:
         """Take all steps: the memory of the method lives within one call."""
         history, shape = list(state.history), state.coordinates.shape
-        looked, remaining = len(history), math.inf
+        looked, newton_decrement = len(history), math.inf
         # The loss is small, and scipy's line search has absolute tolerances.
         first = max(history[0], np.finfo(float).tiny)
 
@@ -108,12 +108,12 @@ class Lbfgs:
             return float(projection.loss) / first, np.ravel(slope) / first
 
         def judge(intermediate_result: OptimizeResult) -> None:
-            nonlocal looked, remaining
+            nonlocal looked, newton_decrement
             history.append(intermediate_result.fun * first)
             if len(history) >= looked + WINDOW and history[-1 - WINDOW] - history[-1] < FAST * history[-1]:
                 looked = len(history)
-                remaining = state.remaining_at(intermediate_result.x.reshape(shape))
-                if remaining < self.tolerance:
+                newton_decrement = state.newton_decrement_at(intermediate_result.x.reshape(shape))
+                if newton_decrement < self.tolerance:
                     raise StopIteration
 
         options = {"maxiter": self.max_steps, "maxfun": 10 * self.max_steps, "maxcor": self.memory_size}
@@ -126,25 +126,27 @@ class Lbfgs:
             options=options | {"ftol": 0.0, "gtol": 0.0},
         )
         if len(history) > looked:
-            remaining = state.remaining_at(found.x.reshape(shape))
+            newton_decrement = state.newton_decrement_at(found.x.reshape(shape))
         return replace(
             state,
             coordinates=found.x.reshape(shape),
             history=tuple(history),
-            remaining=remaining,
+            newton_decrement=newton_decrement,
             message=str(found.message).strip(),
         )
 
     def terminate(self, state: LbfgsState) -> Verdict | None:
-        """Judge by what a Gauss-Newton step would still bring."""
+        """Judge by the Newton decrement."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
             return Verdict("failed", f"the loss is not finite after {n_steps} steps")
         if state.message is None:
             return None
-        if state.remaining < self.tolerance:
-            return Verdict("converged", f"a Gauss-Newton step would lower the loss by {state.remaining:.1e} of itself")
-        hint = f"{state.remaining:.1e} of the loss is predicted to go"
+        if state.newton_decrement < self.tolerance:
+            return Verdict(
+                "converged", f"a Gauss-Newton step would lower the loss by {state.newton_decrement:.1e} of itself"
+            )
+        hint = f"{state.newton_decrement:.1e} of the loss is predicted to go"
         if n_steps >= self.max_steps:
             return Verdict("max-steps", f"not converged after {n_steps} steps: {hint}")
         return Verdict("stalled", f"no step lowers the loss any more after {n_steps} steps ({state.message}): {hint}")
@@ -158,10 +160,10 @@ class Lbfgs:
         gains, projection = state.project(state.coordinates)
         return Estimate(pairs.to_complex(gains), state.kernels.tensors.unload(projection.model, state.reduced.scale))
 
-    def remaining(self, state: LbfgsState, problem: CalibrationProblem) -> float:
-        """Return what a Gauss-Newton step would still bring."""
+    def newton_decrement(self, state: LbfgsState, problem: CalibrationProblem) -> float:
+        """Return the relative Newton decrement at the estimate."""
         del problem
-        return state.remaining
+        return state.newton_decrement
 
     def memory(self, state: LbfgsState) -> None:
         """Return nothing: only the gains carry over."""

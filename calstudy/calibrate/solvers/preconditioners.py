@@ -65,6 +65,15 @@ def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Ten
 
     Foregrounds are held fixed in these blocks, so that real and imaginary parts of eta decouple: the blocks are the
     degree plus and minus the coupling matrix.
+
+    Parameters
+    ----------
+    tensors
+        Of the fit.
+    projection
+        The reduced problem at the gains in question.
+    damping
+        Relative to the diagonal, scalar, float32.
     """
     power = tf.transpose(projection.curvature * pairs.squared_modulus(projection.baseline_model))
     index = tf.stack([tensors.first, tensors.second], axis=1)

@@ -1,0 +1,1 @@
+"""What every part builds on: errors, units, schema, data cubes, gains, this machine."""

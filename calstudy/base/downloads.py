@@ -1,0 +1,61 @@
+"""Files that are downloaded once and kept for later runs."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pooch
+import requests
+
+from calstudy.base.errors import InputError
+
+
+def default_directory() -> Path:
+    """Return where downloads are kept on this machine."""
+    return Path(pooch.os_cache("calstudy"))
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def download(url: str, path: Path, instead: str, known_hash: str | None = None, progress: bool = True) -> None:
+    """Download a file, whole or not at all.
+
+    Parameters
+    ----------
+    url
+        Where it is.
+    path
+        Where it goes; folders are made. A file that is there already is kept if it has the hash, and else replaced.
+    instead
+        What the user can do if it cannot be had, for the error message.
+    known_hash
+        SHA-256 that it must have, if that is known.
+    progress
+        Whether to show a progress bar.
+
+    Raises
+    ------
+    InputError
+        If the server cannot be reached or has no such file, the folder cannot be written, or the hash is another.
+    """
+    host = urlsplit(url).hostname
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if known_hash is None:
+            # pooch takes a file without a known hash as it is.
+            path.unlink(missing_ok=True)
+        pooch.retrieve(url, known_hash=known_hash, fname=path.name, path=path.parent, progressbar=progress)
+    except (requests.ConnectionError, requests.Timeout):
+        raise InputError(f"{path.name}: there is no connection to {host}; {instead}") from None
+    except requests.HTTPError as error:
+        raise InputError(f"{path.name}: {host} refused it ({error.response.status_code}); {instead}") from None
+    except ValueError:
+        raise InputError(f"{path.name}: what {host} sent is not the file, its SHA-256 is another; {instead}") from None
+    except OSError as error:
+        raise InputError(f"{path.name} cannot be downloaded to {path.parent} ({error.strerror or error})") from None

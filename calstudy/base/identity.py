@@ -1,0 +1,59 @@
+"""What decides a product: the fields of its settings that differ from their defaults, and the content of files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from calstudy.base.plugins import Plugin, digest_file
+
+
+def digest_json(value: Any) -> str:
+    """Return a 32-digit key of any JSON-able value; equal values have equal keys, whatever the order of their keys."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def identity(value: Any) -> Any:
+    """Return settings as JSON that is the same for settings that give the same result.
+
+    Fields of sections are left out where they have their default, so that a field that comes later leaves the keys of
+    earlier products alone; a default that changes must raise the version of the stages that read it. The tag of a
+    choice between blocks is always there unless it is the default choice. The path of an input file counts by the
+    file's content, and a plug-in by the content of its file or the version of its package.
+
+    Parameters
+    ----------
+    value
+        Sections, mappings, sequences and plain values, nested as they may be.
+    """
+    if isinstance(value, BaseModel):
+        return _identity_of_section(value)
+    if isinstance(value, Mapping):
+        return {str(key): identity(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [identity(item) for item in value]
+    if isinstance(value, Path):
+        return f"sha256:{digest_file(value)}"
+    return value
+
+
+def _identity_of_section(section: BaseModel) -> dict[str, Any]:
+    found = {}
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        if isinstance(section, Plugin) and name == section.registry.tag:
+            found[name] = section.registry.identity(value)
+        elif isinstance(field.json_schema_extra, dict) and field.json_schema_extra.get("keyed") is False:
+            continue
+        elif value != (default := field.get_default(call_default_factory=True)):
+            content = identity(value)
+            # A block that differs in nothing that counts is left out as well.
+            if not (type(value) is type(default) and isinstance(value, BaseModel) and content == identity(default)):
+                found[name] = content
+    return found

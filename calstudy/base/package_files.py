@@ -1,0 +1,58 @@
+"""The files that calstudy publishes: experiments, and reference results of them.
+
+In a checkout they are its folders ``experiments`` and ``figures``, to which ``calstudy/published`` links; an installed
+package has copies.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calstudy.base.errors import InputError
+
+PUBLISHED = Path(__file__).resolve().parents[1] / "published"
+
+
+def published(kind: str) -> Path:
+    """Return the folder of published files: "experiments", or "figures" for the reference results."""
+    return (PUBLISHED / kind).resolve()
+
+
+def experiment_names() -> list[str]:
+    """Return the names of the published experiments."""
+    return sorted(path.stem for path in published("experiments").glob("*.yaml"))
+
+
+def find_experiment(path: Path) -> Path:
+    """Return the file of an experiment.
+
+    Parameters
+    ----------
+    path
+        Of a file, or the name of a published experiment, such as ``quickstart``.
+
+    Raises
+    ------
+    InputError
+        If it is a bare name, and neither.
+    """
+    if path.exists() or path.name != str(path) or path.suffix:
+        return path
+    if path.name in experiment_names():
+        return published("experiments") / f"{path.name}.yaml"
+    listed = ", ".join(experiment_names())
+    raise InputError(f"{path}: neither a file nor a published experiment (there are: {listed})")
+
+
+def reference_folder() -> Path:
+    """Return the folder of reference results: ``figures`` of the working directory, or the published ones.
+
+    Raises
+    ------
+    InputError
+        If neither is there.
+    """
+    for folder in (Path("figures"), published("figures")):
+        if folder.is_dir():
+            return folder
+    raise InputError("there are no reference results here; give the folder of some: calstudy regress FOLDER")

@@ -1,0 +1,379 @@
+"""Kinds of things that can be added: calibrators, effects, estimators, figures, papers, engines.
+
+A thing is a class: its fields are its settings, its methods what it does. The built-in ones are modules of one
+package, a file each. Others are found by an entry point of an installed package, or by the path of a Python file, which
+an experiment file may give wherever it may give a name: ``calibrator: mean-gain``, ``calibrator: mine.py`` or, where a
+file holds several, ``calibrator: mine.py:MeanGain``.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import inspect
+import pkgutil
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar, Generic, TypeVar
+
+from pydantic import ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator, model_validator
+from pydantic_core import PydanticCustomError
+
+from calstudy.base.errors import InputError, nearest
+from calstudy.base.schema import Section, fault
+
+FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
+NESTED = "nested"
+"""Type of the validation error that holds the faults of a plug-in's own settings."""
+
+
+class Plugin(Section):
+    """The base of every thing that can be added. Subclasses declare settings as fields, and what they do as methods.
+
+    Attributes
+    ----------
+    registry
+        The kind of thing; set by the base class of each kind.
+    """
+
+    registry: ClassVar[Registry]
+
+    @property
+    def reference(self) -> str:
+        """The name or path under which the thing was asked for."""
+        return getattr(self, self.registry.tag)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refer_to_class(cls, data: Any) -> Any:
+        """Fill in the name where a thing is made in Python: an experiment file always gives it."""
+        if isinstance(data, Mapping) and cls.registry.tag not in data:
+            return {**data, cls.registry.tag: cls.registry.reference_of(cls)}
+        return data
+
+    @property
+    def label(self) -> str:
+        """The name of the thing in file names and tables: its own, its class's in a file, or the file's."""
+        file = FILE_REFERENCE.fullmatch(self.reference)
+        return self.reference if file is None else file["name"] or Path(file["path"]).stem
+
+    @property
+    def is_built_in(self) -> bool:
+        """Whether the thing is one of calstudy's own."""
+        return type(self).__module__.startswith(f"{self.registry.package}.")
+
+    def __reduce__(self) -> tuple:
+        """Pickle by reference: a class from a file cannot be imported by name in another process."""
+        return _revive, (self.registry.base_path, self.model_dump(mode="json"))
+
+
+def _revive(base_path: str, block: Mapping[str, Any]) -> Plugin:
+    module, _, name = base_path.partition(":")
+    return getattr(import_module(module), name).registry.make(block)
+
+
+P = TypeVar("P", bound=Plugin)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PluginField(WrapValidator):
+    """The validator of a field that holds a thing of one kind, from `Registry.field`."""
+
+    registry: Registry[Any]
+
+
+class Registry(Generic[P]):
+    """All things of one kind: the built-in ones, those of installed packages, and those in files.
+
+    Parameters
+    ----------
+    noun
+        What one of them is called, such as "calibrator".
+    package
+        Package whose modules hold the built-in ones; module `sky_based` holds ``sky-based``. Modules whose name starts
+        with an underscore hold none.
+    base_path
+        ``module:class`` of the base class of all of them.
+    tag
+        The field of an experiment file that holds the name.
+    """
+
+    def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind") -> None:
+        self.noun, self.package, self.base_path, self.tag = noun, package, base_path, tag
+        self.group = f"calstudy.{noun}s"
+        self.a_noun = f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
+
+    @property
+    def base(self) -> type[P]:
+        """The base class."""
+        module, _, name = self.base_path.partition(":")
+        return getattr(import_module(module), name)
+
+    def built_in(self) -> list[str]:
+        """Return the names of the built-in things."""
+        found = pkgutil.iter_modules(import_module(self.package).__path__)
+        return sorted(module.name.replace("_", "-") for module in found if not module.name.startswith("_"))
+
+    def installed(self) -> dict[str, EntryPoint]:
+        """Return the entry points of installed packages, by name."""
+        return {point.name: point for point in entry_points(group=self.group)}
+
+    def names(self) -> list[str]:
+        """Return all names: built in, and of installed packages."""
+        return [*self.built_in(), *sorted(set(self.installed()) - set(self.built_in()))]
+
+    def find(self, reference: str) -> type[P]:
+        """Return the class of a thing.
+
+        Parameters
+        ----------
+        reference
+            A name, or the path of a Python file, with ``:Class`` where it holds several.
+
+        Raises
+        ------
+        InputError
+            If there is none; the message does not name the field.
+        """
+        if (file := FILE_REFERENCE.fullmatch(reference)) is not None:
+            return self._in(load_file(Path(file["path"])), reference, file["name"])
+        if reference in self.built_in():
+            return self._in(import_module(f"{self.package}.{reference.replace('-', '_')}"), reference)
+        if reference in (installed := self.installed()):
+            with user_code(reference):
+                found = installed[reference].load()
+            return self._checked(found, reference) if inspect.isclass(found) else self._in(found, reference)
+        names = self.names()
+        hint = nearest(reference, names)
+        raise InputError(f"{reference!r} is not {self.a_noun}{hint} (there are: {', '.join(names)}; or a file.py)")
+
+    def reference_of(self, thing: type[P]) -> str:
+        """Return the name or path under which `find` finds a class; its bare name if it is in no file."""
+        package, _, name = thing.__module__.rpartition(".")
+        if package == self.package:
+            return name.replace("_", "-")
+        for point in self.installed().values():
+            if point.module == thing.__module__ and point.attr in ("", thing.__name__):
+                return point.name
+        try:
+            return f"{inspect.getfile(thing)}:{thing.__name__}"
+        except (TypeError, OSError):
+            return thing.__name__
+
+    def _in(self, module: ModuleType, reference: str, name: str | None = None) -> type[P]:
+        """Return the class that a module defines, the named one of several."""
+        found = {key: value for key, value in vars(module).items() if self._is_thing(value, module)}
+        if name is not None and name not in found:
+            raise InputError(f"{reference!r} holds no {self.noun} of this name (it has: {', '.join(found) or 'none'})")
+        if name is None and len(found) != 1:
+            listed = ", ".join(found) if found else f"no subclass of {self.base.__module__}.{self.base.__name__}"
+            raise InputError(f"{reference!r} must hold one {self.noun}, or be followed by ':Class' (it has: {listed})")
+        return found[name or next(iter(found))]
+
+    def _is_thing(self, value: Any, module: ModuleType) -> bool:
+        if not (inspect.isclass(value) and issubclass(value, self.base)) or inspect.isabstract(value):
+            return False
+        return value.__module__ == module.__name__ and not value.__name__.startswith("_")
+
+    def _checked(self, found: type, reference: str) -> type[P]:
+        if not issubclass(found, self.base):
+            raise InputError(f"{reference!r} is not a subclass of {self.base.__module__}.{self.base.__name__}")
+        return found
+
+    def make(self, block: Any, default: str | None = None, folder: Path | None = None) -> P:
+        """Return the thing that a block of settings describes.
+
+        Parameters
+        ----------
+        block
+            A name or path, a block of settings with the tag, or a thing, which is returned as it is.
+        default
+            Name that a block without the tag has.
+        folder
+            Where relative paths of files start; the working directory if None.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            For wrong settings.
+        InputError
+            If there is no such thing.
+        """
+        if isinstance(block, self.base):
+            return block
+        block = {self.tag: block} if isinstance(block, str) else dict(block)
+        found, reference = self.class_of(block, default, folder)
+        return found.model_validate({**block, self.tag: reference}, context={"folder": folder})
+
+    def class_of(self, block: Mapping[str, Any], default: str | None, folder: Path | None) -> tuple[type[P], str]:
+        """Return the class that a block of settings is for, and its name or absolute path; raises as `make`."""
+        reference = block.get(self.tag, default)
+        if not isinstance(reference, str):
+            raise InputError(f"needs {self.tag!r}, the name of {self.a_noun} ({', '.join(self.names())}) or a file.py")
+        file = FILE_REFERENCE.fullmatch(reference)
+        if file is not None:
+            try:
+                path = ((folder or Path()) / Path(file["path"]).expanduser()).resolve()
+            except (RuntimeError, ValueError) as error:
+                raise InputError(f"{file['path']!r} cannot be the path of a file ({error})") from None
+            reference = str(path) if file["name"] is None else f"{path}:{file['name']}"
+        return self.find(reference), reference
+
+    def field(self, default: str | None = None) -> PluginField:
+        """Return the validator of a field of an experiment file that holds a thing of this kind."""
+
+        def validate(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> P:
+            del handler
+            if not isinstance(value, str | Mapping | self.base):
+                raise fault("", f"must be the name of {self.a_noun}, a file.py, or a block with {self.tag!r}")
+            folder = (info.context or {}).get("folder")
+            try:
+                return self.make(value, default, folder)
+            except ValidationError as error:
+                content = dict(value) if isinstance(value, Mapping) else {self.tag: value}
+                model = self.class_of(content, default, folder)[0]
+                context = {"error": error, "content": content, "model": model}
+                raise PydanticCustomError(NESTED, "nested", context) from None
+            except InputError as error:
+                path = self.tag if isinstance(value, Mapping) else ""
+                raise fault(path, str(error)) from None
+
+        return PluginField(validate, registry=self)
+
+    def identity(self, reference: str) -> str:
+        """Return what identifies the code of a thing: its name, its package's version, or the digest of its file."""
+        file = FILE_REFERENCE.fullmatch(reference)
+        if file is not None:
+            return f"sha256:{digest_file(Path(file['path']))}:{file['name'] or ''}"
+        point = None if reference in self.built_in() else self.installed().get(reference)
+        if point is None or point.dist is None:
+            return reference
+        return f"{point.dist.name}=={point.dist.version}:{reference}"
+
+
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file's content, in hexadecimal, remembered for a file that does not change."""
+    status = path.stat()
+    return _digest_of(str(path), status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=256)
+def _digest_of(path: str, modified: int, size: int) -> str:
+    del modified, size
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def load_file(path: Path) -> ModuleType:
+    """Run a Python file as a module, once for each content that it has, and return the module.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is not valid Python, or if running it raises an error; the message names the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        ast.parse(text)
+    except OSError as error:
+        raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{str(path)!r} is not a text file in UTF-8") from None
+    except (SyntaxError, ValueError) as error:
+        line = f"line {error.lineno}: {error.msg}" if isinstance(error, SyntaxError) else str(error)
+        raise InputError(f"{str(path)!r} is not valid Python ({line})") from None
+    name = f"calstudy_plugin_{path.stem}_{hashlib.sha256(f'{path}{text}'.encode()).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{str(path)!r} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        with user_code(path.name):
+            spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def load_function(path: Path, name: str) -> Callable[..., Any]:
+    """Return a function that a Python file defines.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be run, or defines no such function.
+    """
+    module = load_file(path)
+    functions = {
+        key: value
+        for key, value in vars(module).items()
+        if inspect.isfunction(value) and value.__module__ == module.__name__
+    }
+    if name not in functions:
+        listed = f"it has: {', '.join(functions)}" if functions else "it has none"
+        raise InputError(f"{name!r} is not a function of {path.name} ({listed})")
+    return functions[name]
+
+
+class UserCodeError(InputError):
+    """The user's own code raised an error; the message has its type, text, file and line, and nothing of calstudy."""
+
+
+@contextmanager
+def user_code(name: str) -> Iterator[None]:
+    """Run code of a user's; what it raises, SystemExit included, becomes a `UserCodeError` that names its line.
+
+    Parameters
+    ----------
+    name
+        What the code is called in the message.
+
+    Notes
+    -----
+    `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
+    ours, except where the call itself does not fit the user's function.
+    """
+    try:
+        yield
+    except (InputError, KeyboardInterrupt, GeneratorExit):
+        raise
+    except BaseException as error:
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
+        if not frames and not isinstance(error, TypeError | SystemExit | ImportError):
+            raise
+        lines = [f"{Path(frame.filename).name} line {frame.lineno}, in {frame.name}" for frame in frames[-1:]]
+        place = lines[0] if lines else name
+        if isinstance(error, SystemExit):
+            text = f"it ended the process (sys.exit, status {error.code}); raise an error instead"
+        else:
+            text = f"{type(error).__name__}: {error}"
+        raise UserCodeError(f"{place}: {text}") from error
+
+
+def _is_users(filename: str) -> bool:
+    """Return whether a file is neither of calstudy, nor of Python or an installed package."""
+    ours = str(Path(__file__).resolve().parents[1])
+    path = str(Path(filename).resolve())
+    return not path.startswith((ours, sys.base_prefix, sys.prefix)) and "site-packages" not in path and "<" not in path
+
+
+def guarded(thing: Plugin) -> AbstractContextManager[None]:
+    """Return a context for calls of a thing's methods: what a user's raises becomes a sentence that names its line.
+
+    An error of a built-in thing is ours, and passes as it is.
+    """
+    return nullcontext() if thing.is_built_in else user_code(thing.label)

@@ -1,0 +1,96 @@
+"""What this machine has, and what a piece of work takes of it."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from dataclasses import dataclass
+
+import psutil
+
+from calstudy.base.errors import InputError
+
+BYTES = {"MB": 1e6, "GB": 1e9, "TB": 1e12}
+
+
+def cores() -> int:
+    """Return the number of processor cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def free_memory() -> int:
+    """Return the bytes of memory that can be taken without swapping."""
+    return psutil.virtual_memory().available
+
+
+def parse_memory(text: str) -> float:
+    """Return the bytes that a text such as ``6 GB`` or ``500MB`` stands for.
+
+    Raises
+    ------
+    InputError
+        If it is not a positive number with one of the units MB, GB, TB.
+    """
+    found = re.fullmatch(r"\s*([0-9.]+)\s*([MGT]B)\s*", text)
+    try:
+        number = float(found[1]) * BYTES[found[2]] if found else 0.0
+    except ValueError:
+        number = 0.0
+    if number <= 0:
+        raise InputError(f"--max-memory {text!r}: write a positive number and a unit (MB, GB or TB), such as '6 GB'")
+    return number
+
+
+def resident_memory() -> int:
+    """Return the bytes of memory that this process holds now."""
+    return psutil.Process().memory_info().rss
+
+
+@dataclass
+class Usage:
+    """Elapsed seconds, processor seconds and peak resident memory (bytes) of a block of code in this process.
+
+    Use as a context manager; the figures are there after the block. The memory is that of the whole process, sampled
+    every 50 ms.
+    """
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    peak_memory: int = 0
+
+    def __enter__(self) -> Usage:
+        self._process = psutil.Process()
+        self._done = threading.Event()
+        self._start, self._cpu_start = time.perf_counter(), time.process_time()
+        self._sampler = threading.Thread(target=self._sample, daemon=True)
+        self._sampler.start()
+        return self
+
+    def _sample(self) -> None:
+        while True:
+            self.peak_memory = max(self.peak_memory, self._process.memory_info().rss)
+            if self._done.wait(0.05):
+                return
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        self._sampler.join()
+        self.seconds = time.perf_counter() - self._start
+        self.cpu_seconds = time.process_time() - self._cpu_start
+
+
+LIBRARIES_MEMORY = 0.8e9
+"""Bytes that a process takes for Python and the libraries alone."""
+COMPLEX128, COMPLEX64 = 16, 8
+"""Bytes of a complex number."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds on one core, bytes of memory and bytes of disk, each an estimate within a factor of about two."""
+
+    seconds: float
+    memory: float = LIBRARIES_MEMORY
+    disk: float = 0.0

@@ -1,0 +1,62 @@
+"""The base of every section of an experiment file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic.config import JsonDict
+from pydantic_core import PydanticCustomError
+
+UNKEYED: JsonDict = {"keyed": False}
+"""`json_schema_extra` of a field that changes how results are made, and not what they are (but for rounding)."""
+
+
+class Section(BaseModel):
+    """A validated, immutable, keyword-only block of an experiment file.
+
+    Unknown keys are errors, values are never coerced between kinds (``"3"`` is not ``3``), and every physical
+    quantity carries its unit in the file and is a plain SI float once validated (see `calstudy.base.units`).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    def reset(self, *names: str) -> Self:
+        """Return a copy in which the named fields have their defaults: for what does not read them."""
+        fields = type(self).model_fields
+        return self.model_copy(update={name: fields[name].get_default(call_default_factory=True) for name in names})
+
+
+def plain(value: Any) -> Any:
+    """Return nested settings as JSON-able values; sections with all their fields."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def choice(key: str, default: str | None = None) -> BeforeValidator:
+    """Make the tag `key` of a choice between blocks easy to write.
+
+    A bare string stands for the block with its defaults (``beam: airy`` for ``beam: {kind: airy}``), and a block
+    without the tag is the `default` one.
+    """
+
+    def expand(value: Any) -> Any:
+        if isinstance(value, str):
+            return {key: value}
+        if isinstance(value, dict) and key not in value and default is not None:
+            return {key: default, **value}
+        return value
+
+    return BeforeValidator(expand)
+
+
+def fault(path: str, sentence: str) -> PydanticCustomError:
+    """Return the error for a fault that involves several fields; `path` is the dotted path to name, `sentence` why."""
+    return PydanticCustomError("fault", "{sentence}", {"path": path, "sentence": sentence})

@@ -1,0 +1,125 @@
+"""Physical quantities in experiment files: strings with units outside, SI floats inside.
+
+Each type below is a field type for `calstudy.base.schema.Section`: it accepts a string such as ``"80 kHz"`` (or an
+astropy `Quantity`), refuses a bare number, and yields a float in the type's own unit. It serializes back to a string
+with that unit, so that a resolved experiment file can be read again.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic_core import PydanticCustomError
+
+LARGEST_DECIBEL = 200
+NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
+
+
+@lru_cache(maxsize=256)
+def _factor(unit: str, target: str) -> float:
+    """Multiply a number in `unit` by this to have it in `target`; raises ValueError if the dimensions differ."""
+    from astropy import units
+
+    try:
+        return float(units.Unit(unit).to(units.Unit(target)))
+    except units.UnitConversionError:
+        raise ValueError(unit) from None
+
+
+def _fail(value: Any, reason: str) -> PydanticCustomError:
+    return PydanticCustomError("quantity", "{value} {reason}", {"value": repr(value), "reason": reason})
+
+
+def parse_quantity(value: Any, target: str, example: str) -> float:
+    """Turn ``"80 kHz"`` or an astropy quantity into a float in the unit `target`.
+
+    Parameters
+    ----------
+    value
+        A string of a number and a unit, or an astropy `Quantity`.
+    target
+        Unit of the returned float, in astropy's notation.
+    example
+        A valid value, shown in error messages.
+
+    Raises
+    ------
+    PydanticCustomError
+        If the value has no unit, an unknown unit, or a unit of another dimension, or is not finite.
+    """
+    hint = f'write a number with a unit, such as "{example}"'
+    if hasattr(value, "unit"):
+        number, unit = float(value.value), value.unit.to_string()
+    elif isinstance(value, str):
+        match = NUMBER.match(value)
+        if match is None:
+            raise _fail(value, f"is not a quantity: {hint}")
+        number, unit = float(match[1]), match[2]
+    else:
+        raise _fail(value, f"has no unit: {hint}")
+    if not unit:
+        raise _fail(value, f"has no unit: {hint}")
+    if not math.isfinite(number):
+        raise _fail(value, f"is not finite: {hint}")
+    try:
+        factor = _factor(unit, target)
+    except (ValueError, TypeError):
+        raise _fail(value, f"has a unit that cannot be converted to {target}: {hint}") from None
+    # Decimal units read better, and hash the same however they were written, without binary dust.
+    return float(f"{number * factor:.15g}")
+
+
+def parse_decibel(value: Any) -> float:
+    """Turn ``"-40 dB"`` into the float -40.0; raises PydanticCustomError for anything else."""
+    match = NUMBER.match(value) if isinstance(value, str) else None
+    if match is None or match[2] != "dB":
+        raise _fail(value, 'is not a level in decibel: write for example "-40 dB"')
+    if not abs(float(match[1])) <= LARGEST_DECIBEL:
+        raise _fail(value, f"is beyond {LARGEST_DECIBEL} dB either way")
+    return float(match[1])
+
+
+def parse_hour_angle(value: Any) -> float:
+    """Turn ``"1.8 h"`` or an angle (``"27 deg"``) into a float in hours of right ascension."""
+    match = NUMBER.match(value) if isinstance(value, str) else None
+    if match is not None and match[2] in ("h", "hr", "hour"):
+        return float(match[1])
+    return parse_quantity(value, "hourangle", "1.8 h")
+
+
+def parse_wavenumber(value: Any) -> float:
+    """Turn ``"0.2 h/Mpc"`` into a float in h/Mpc; other units are refused, for h is a choice of cosmology."""
+    match = NUMBER.match(value) if isinstance(value, str) else None
+    if match is None or match[2].replace(" ", "") not in ("h/Mpc", "hMpc-1", "hMpc^-1"):
+        raise _fail(value, 'is not a wavenumber: write for example "0.2 h/Mpc"')
+    return float(match[1])
+
+
+def _field(validate: Callable[[Any], float], unit: str, example: str) -> Any:
+    return Annotated[
+        float,
+        BeforeValidator(validate, json_schema_input_type=str),
+        PlainSerializer(lambda value: f"{value!r} {unit}", return_type=str),
+        Field(json_schema_extra={"unit": unit, "example": example}),
+    ]
+
+
+def _quantity(target: str, example: str) -> Any:
+    return _field(lambda value: parse_quantity(value, target, example), target, example)
+
+
+Frequency = _quantity("Hz", "80 kHz")
+Time = _quantity("s", "2 s")
+Delay = _quantity("s", "100 ns")
+Length = _quantity("m", "14 m")
+FluxDensity = _quantity("Jy", "50 mJy")
+PowerDensity = _quantity("K2 Mpc3", "12482.356 K2 Mpc3")
+Memory = _quantity("byte", "6 GB")
+HourAngle = _field(parse_hour_angle, "h", "1.8 h")
+Wavenumber = _field(parse_wavenumber, "h/Mpc", "0.2 h/Mpc")
+Decibel = _field(parse_decibel, "dB", "-40 dB")

@@ -1,0 +1,82 @@
+"""Visibilities as one rectangular cube: the bridge between UVData and the numerical core.
+
+Every data set of a study has all its baselines at all its times, ordered time-major (all baselines of the first
+integration, then of the second, and so on). The functions here check that and reshape; they copy nothing they need not.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+
+def require_rectangular(uvd: UVData) -> None:
+    """Raise ValueError unless all baselines are present at all times in time-major order."""
+    n_bls, n_times = uvd.Nbls, uvd.Ntimes
+    baselines = uvd.baseline_array.reshape(n_times, n_bls) if uvd.Nblts == n_bls * n_times else None
+    if baselines is None or (baselines != baselines[0]).any():
+        raise ValueError(
+            f"the visibilities are not rectangular: {uvd.Nblts} samples of {n_bls} baselines at {n_times} times, "
+            "expected every baseline once at every time, ordered by time"
+        )
+
+
+def to_cube(uvd: UVData) -> np.ndarray:
+    """Return the visibilities as a view of shape (Ntimes, Nbls, Nfreqs, Npols), complex, in the data's own unit."""
+    require_rectangular(uvd)
+    return uvd.data_array.reshape(uvd.Ntimes, uvd.Nbls, uvd.Nfreqs, uvd.Npols)
+
+
+def flag_cube(uvd: UVData) -> np.ndarray:
+    """Return the flags as a view of shape (Ntimes, Nbls, Nfreqs, Npols), bool, in the order of `to_cube`."""
+    require_rectangular(uvd)
+    return uvd.flag_array.reshape(uvd.Ntimes, uvd.Nbls, uvd.Nfreqs, uvd.Npols)
+
+
+def from_cube(template: UVData, cube: np.ndarray) -> UVData:
+    """Return a copy of `template` that holds `cube`, of shape (Ntimes, Nbls, Nfreqs, Npols).
+
+    Flags and nsamples are the template's, or none flagged and one where it has none.
+    """
+    require_rectangular(template)
+    shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
+    if cube.shape != shape:
+        raise ValueError(f"visibilities have shape {cube.shape}, the template needs {shape}")
+    uvd = template.copy(metadata_only=True)
+    uvd.data_array = np.ascontiguousarray(cube).reshape(template.Nblts, template.Nfreqs, template.Npols)
+    if template.flag_array is not None:
+        uvd.flag_array = template.flag_array.copy()
+        uvd.nsample_array = template.nsample_array.copy()
+    else:
+        uvd.flag_array = np.zeros(uvd.data_array.shape, dtype=bool)
+        uvd.nsample_array = np.ones(uvd.data_array.shape, dtype=np.float32)
+    return uvd
+
+
+def antenna_pairs(uvd: UVData) -> np.ndarray:
+    """Return the antenna numbers (a, b) of each baseline, shape (Nbls, 2), in the order of `to_cube`."""
+    return np.column_stack([uvd.ant_1_array[: uvd.Nbls], uvd.ant_2_array[: uvd.Nbls]])
+
+
+def antenna_indices(uvd: UVData) -> np.ndarray:
+    """Return `antenna_pairs` as indices into `uvd.telescope.antenna_numbers`, shape (Nbls, 2)."""
+    order = np.argsort(uvd.telescope.antenna_numbers)
+    return order[np.searchsorted(uvd.telescope.antenna_numbers, antenna_pairs(uvd), sorter=order)]
+
+
+def antenna_rows(uvd: UVData) -> np.ndarray:
+    """Return where the antennas of the baselines, by ascending number, are in `uvd.telescope.antenna_numbers`."""
+    order = np.argsort(uvd.telescope.antenna_numbers)
+    numbers = np.unique(antenna_pairs(uvd))
+    return order[np.searchsorted(uvd.telescope.antenna_numbers, numbers, sorter=order)]
+
+
+def baseline_vectors(uvd: UVData) -> np.ndarray:
+    """Return x_b - x_a in east, north, up metres for each baseline (a, b), shape (Nbls, 3)."""
+    enu = uvd.telescope.get_enu_antpos()
+    first, second = antenna_indices(uvd).T
+    return enu[second] - enu[first]

@@ -1,0 +1,1 @@
+"""The calibrators: one module each, found by its name."""

@@ -1,0 +1,95 @@
+"""What the calibrators that minimize w |V - g_a g_b* F|^2 have in common."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Frame, Observation
+from calstudy.base.resources import Cost
+from calstudy.calibrate.cost import LEAST_MODELS, Dimensions, solve_cost, solve_memory
+from calstudy.calibrate.interface import Assumed, Calibration, Outline, Progress
+from calstudy.calibrate.settings import ForegroundFit, GainFit
+from calstudy.instrument.size import Size
+
+CROWDED = 0.9
+"""A fit can absorb anything from this many unknowns per sample on."""
+
+
+class LeastSquares(GainFit):
+    """A fit of gains, and of foregrounds where there is a basis for them."""
+
+    def cost(self, size: Size) -> Cost:
+        """Return what the solves take, within a factor of about two, as if no baselines shared a foreground model."""
+        return solve_cost(self, size)
+
+    def leaner(self) -> Self | None:
+        """Return the calibrator that works on half as many foreground models at a time."""
+        if not isinstance(self, ForegroundFit) or self.models_at_once <= LEAST_MODELS:
+            return None
+        return self.model_copy(update={"models_at_once": max(self.models_at_once // 2, LEAST_MODELS)})
+
+    def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
+        """Return why no foreground model can be made for these baselines and channels, or None."""
+        del has_sky_model
+        from calstudy.calibrate.problem import fitted_baselines
+
+        try:
+            frame = frame.baselines(fitted_baselines(frame, self.autos))
+            if isinstance(self, ForegroundFit):
+                _require_basis(frame, self)
+        except InputError as error:
+            return str(error).removeprefix("calibration.")
+        return None
+
+    def outline(self, frame: Frame) -> Outline:
+        """Return the cost of a solve of these very baselines, and whether it has more unknowns than it should."""
+        from calstudy.calibrate.problem import fitted_baselines
+        from calstudy.calibrate.structure import make_structure, repeat_structure
+
+        frame = frame.baselines(fitted_baselines(frame, self.autos))
+        structure = make_structure(frame, self)
+        together = min(self.integrations_per_solve, frame.n_times)
+        memory = solve_memory(Dimensions.of(repeat_structure(structure, together)), self)
+        cost = Cost(solve_cost(self, Size.of_frame(frame)).seconds, memory)
+        if not isinstance(self, ForegroundFit):
+            return Outline(cost)
+        coefficients = structure.basis.n_coefficients
+        unknowns = coefficients + structure.n_antennas * structure.n_frequencies
+        samples = structure.n_baselines * structure.n_frequencies
+        notes = ()
+        if unknowns >= CROWDED * samples:
+            notes = (
+                f"The fit has {unknowns} unknowns for {samples} samples, so that it can absorb anything: expect slow "
+                "convergence, and no residual; use a smaller basis.min_delay or --buffer, or --redundant.",
+            )
+        return Outline(cost, f"{coefficients} foreground coefficients each", notes)
+
+    def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
+        """Solve every integration, or group of them, and every polarization."""
+        from calstudy.calibrate.calamity import fit
+
+        return fit(observation, assumed, self, progress)
+
+
+def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
+    """Raise InputError if the channels cannot hold the foreground basis of the longest baseline.
+
+    Or if joint groups cannot be read or do not fit the array; the longest baseline is that of the others then.
+    """
+    from calstudy.calibrate.basis import make_basis
+    from calstudy.calibrate.joint import other_baselines, place_groups, read_joint_groups
+
+    lengths = frame.lengths
+    if settings.joint_basis is not None:
+        placed = place_groups(read_joint_groups(settings.joint_basis.path), frame.pairs, frame.n_channels)
+        lengths = lengths[other_baselines(placed, lengths.size)]
+        if lengths.size == 0:
+            return
+    longest = lengths.max()
+    try:
+        make_basis(np.array([longest]), frame.frequencies, settings.basis)
+    except InputError as error:
+        raise InputError(f"{error} (the longest baseline has {longest:.0f} m)") from None

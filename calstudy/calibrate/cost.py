@@ -1,0 +1,194 @@
+"""What a calibration will need, before it starts, and how to make it fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.resources import Cost
+from calstudy.calibrate.settings import (
+    BasisSettings,
+    ForegroundFit,
+    GainFit,
+    GaussNewtonSettings,
+    LbfgsSettings,
+    Solver,
+)
+from calstudy.instrument.settings import Channels
+from calstudy.instrument.size import Size
+
+if TYPE_CHECKING:
+    from calstudy.calibrate.problem import FitStructure
+
+SINGLE, DOUBLE = 4, 8
+# Python with TensorFlow and pyuvdata, and the compiled graphs.
+TENSORFLOW_MEMORY = 1.2e9
+# What the allocators keep besides what is in use, measured for 128 and 350 antennas.
+RETAINED = 1.6
+LEAST_MODELS = 32
+# The common basis spans the edges of all bases besides the widest.
+EXTRA_RANK = 14
+# Vectors of a basis beyond its time-bandwidth product, for the default eigenvalue cutoff.
+EXTRA_VECTORS = 14
+PAPER_SAMPLES = 630 * 384
+# Seconds of one core for the paper's samples. Gauss-Newton: a first solve, and one from the solution before.
+COLD_SECONDS, WARM_SECONDS = 1.5, 0.2
+# A step, and how many it takes to the minimum.
+LBFGS_STEP, LBFGS_STEPS = 0.06, 180
+FIRST_ORDER_STEP = 2.2e-3
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """What the memory of a solve depends on.
+
+    Attributes
+    ----------
+    antennas, baselines, models, channels
+        Their numbers, of all integrations that are solved together.
+    widest
+        Vectors of the largest foreground basis.
+    coefficients
+        Vectors of all models together.
+    """
+
+    antennas: int
+    baselines: int
+    models: int
+    channels: int
+    widest: int
+    coefficients: float
+
+    @classmethod
+    def of(cls, structure: FitStructure) -> Dimensions:
+        """Return those of a fit structure."""
+        basis = structure.basis
+        widest = max(bucket.vectors.shape[-1] for bucket in basis.buckets)
+        return cls(
+            structure.n_antennas,
+            structure.n_baselines,
+            basis.n_models,
+            structure.n_frequencies,
+            widest,
+            basis.n_coefficients,
+        )
+
+    @property
+    def samples(self) -> int:
+        """Number of visibilities."""
+        return self.baselines * self.channels
+
+    @property
+    def rank(self) -> int:
+        """Vectors of the common basis of all models, at most about."""
+        return min(self.widest + EXTRA_RANK, self.channels)
+
+
+def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
+    """Return the bytes that one solve needs at its peak, libraries included, within about a factor of 1.5.
+
+    Parameters
+    ----------
+    dimensions
+        Of all integrations that are solved together.
+    settings
+        Whose solver, and how many models at a time, are meant.
+    """
+    d = dimensions
+    # The problem's complex visibilities and weights, and the solver's pairs of them.
+    data = (2 + 1) * 2 * DOUBLE * d.samples
+    by_channel = 8 * SINGLE * d.channels * d.antennas**2
+    # Smooth gains have coefficients in place of channels, hardly as many.
+    by_antenna = 0.0 if settings.gain_delay is None else 6 * SINGLE * d.antennas * d.channels**2
+    if not isinstance(settings, ForegroundFit):
+        return TENSORFLOW_MEMORY + RETAINED * (data + 20 * SINGLE * d.samples + by_channel + by_antenna)
+    # Model, curvature and model on the baselines; roots.
+    projection = 2 * DOUBLE * d.models * d.channels + 3 * SINGLE * d.samples + SINGLE * d.models * d.widest * d.rank
+    at_once = min(settings.models_at_once, d.models)
+    pieces = 2 * DOUBLE * at_once * d.widest * d.channels
+    # S times the model of each baseline of a stretch, in the common basis; products of all pairs of its vectors; the
+    # blocks of all antennas, and their inversion in double precision.
+    seen = at_once * d.baselines / d.models
+    by_antenna += (12 * SINGLE * seen + SINGLE * d.channels + 10 * DOUBLE * d.antennas) * d.rank**2
+    while_projecting = 2 * projection + 7 * SINGLE * d.samples
+    while_preparing = projection + 2 * SINGLE * d.samples + max(by_antenna, by_channel)
+    result = projection + 8 * DOUBLE * d.samples
+    peak = data + max(while_projecting, while_preparing, result)
+    return TENSORFLOW_MEMORY + pieces + RETAINED * (peak + _unknowns(d, settings))
+
+
+def _unknowns(dimensions: Dimensions, settings: GainFit) -> float:
+    """Return the bytes of what a solver keeps of its unknowns and past steps."""
+    solver = settings.solver
+    gains = 2 * dimensions.antennas * dimensions.channels
+    if isinstance(solver, GaussNewtonSettings):
+        return 10 * SINGLE * gains
+    if isinstance(solver, LbfgsSettings):
+        return (2 * solver.memory + 10) * DOUBLE * gains
+    word = SINGLE if solver.precision == "single" else DOUBLE
+    # Parameters, moments, best and gradient; visibilities, model and residual.
+    return 8 * word * (gains + 2 * dimensions.coefficients) + 10 * word * dimensions.samples
+
+
+def fit_models_at_once(dimensions: Dimensions, settings: GainFit, budget: float) -> GainFit:
+    """Return settings that work on as few models at a time as the memory demands, and as many as they say if it allows.
+
+    What does not fit even with `LEAST_MODELS` at a time comes back with that number.
+
+    Parameters
+    ----------
+    budget
+        Bytes for one solve, libraries included.
+    """
+    while settings.models_at_once > LEAST_MODELS and solve_memory(dimensions, settings) > budget:
+        fewer = max(settings.models_at_once // 2, LEAST_MODELS)
+        settings = settings.model_copy(update={"models_at_once": fewer})
+    return settings
+
+
+def basis_vectors(length: float, channels: Channels, basis: BasisSettings) -> int:
+    """Return how many foreground vectors a baseline of this length (m) has, about.
+
+    Parameters
+    ----------
+    length
+        Of the baseline, m.
+    channels
+        Number and width of the channels.
+    basis
+        Half-width and buffer of the modelled delays.
+    """
+    delay = max(basis.horizon * length / SPEED_OF_LIGHT, basis.min_delay) + basis.buffer
+    return int(min(2 * channels.count * channels.width * delay + EXTRA_VECTORS, channels.count))
+
+
+def dimensions_of(size: Size, settings: GainFit) -> Dimensions:
+    """Return what the memory of one solve depends on, as if no baselines shared a model."""
+    baselines = min(settings.integrations_per_solve, size.times) * size.baselines
+    basis = settings.basis if isinstance(settings, ForegroundFit) else BasisSettings()
+    coefficients = baselines * basis_vectors(size.mean, size.channels, basis)
+    widest = basis_vectors(size.longest, size.channels, basis)
+    return Dimensions(size.antennas, baselines, baselines, size.channels.count, widest, coefficients)
+
+
+def solve_cost(settings: GainFit, size: Size) -> Cost:
+    """Return what consecutive solves of data of this size take, compilation included: seconds of one core, and bytes.
+
+    The constants were measured on one core of a 2020s server; they serve to plan, within a factor of about two.
+    """
+    together = settings.integrations_per_solve
+    solves = size.times * size.polarizations / together
+    seconds = _seconds(settings.solver, solves, size.baselines * size.channels.count * together)
+    return Cost(seconds, solve_memory(dimensions_of(size, settings), settings))
+
+
+def _seconds(solver: Solver, solves: float, samples: int) -> float:
+    work = samples / PAPER_SAMPLES
+    if isinstance(solver, GaussNewtonSettings):
+        warm = max(solves - 1, 0) if solver.warm_start else 0
+        # Cost of the normal matrices, baselines x channels x vectors^2, dominates.
+        return 6 + ((solves - warm) * COLD_SECONDS + warm * WARM_SECONDS) * work
+    if isinstance(solver, LbfgsSettings):
+        return 6 + LBFGS_STEP * work * solves * min(LBFGS_STEPS, solver.max_steps)
+    return 6 + FIRST_ORDER_STEP * work * solves * solver.max_steps

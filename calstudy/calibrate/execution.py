@@ -1,0 +1,301 @@
+"""Call a calibrator, check what it returns, and make the calibrated residual R = V / (g_a g_b*) - F.
+
+What a user's own calibrator does wrong becomes a sentence that names it; what a built-in one does wrong is a bug.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Frame, Observation
+from calstudy.base.plugins import FILE_REFERENCE, guarded
+from calstudy.base.resources import Cost, Usage
+from calstudy.calibrate.interface import (
+    USABLE,
+    Assumed,
+    Calibration,
+    Calibrator,
+    Outcome,
+    Progress,
+    Status,
+)
+from calstudy.calibrate.records import CalibrationResult, SolveRecord
+from calstudy.instrument.size import Size
+
+if TYPE_CHECKING:
+    from pyuvdata import UVCal, UVData
+
+
+def require_calibratable(calibrator: Calibrator, frame: Frame, has_sky_model: bool) -> None:
+    """Raise InputError, with the calibrator's own sentence, if it refuses data of these baselines and channels.
+
+    Parameters
+    ----------
+    calibrator
+        Asked for its refusal.
+    frame
+        Antennas, baselines and channels of the data.
+    has_sky_model
+        Whether there is one.
+    """
+    with guarded(calibrator):
+        reason = calibrator.refusal(frame, has_sky_model)
+    if reason is not None:
+        field, colon, _ = reason.partition(":")
+        about_field = colon and field.split(".")[0] in type(calibrator).model_fields
+        raise InputError(f"calibration.{reason}" if about_field else f"{_where(calibrator)}: {reason}")
+
+
+def cost_of(calibrator: Calibrator, size: Size) -> Cost:
+    """Return what a calibrator says that data of a size cost it; raises InputError if a user's says something else."""
+    with guarded(calibrator):
+        cost = calibrator.cost(size)
+    if not isinstance(cost, Cost):
+        raise InputError(f"{_where(calibrator)}: its cost is {cost!r}, not a calstudy.base.resources.Cost")
+    return cost
+
+
+def run_calibrator(
+    calibrator: Calibrator,
+    data: UVData,
+    sky_model: UVData | None = None,
+    gains: UVCal | None = None,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """Calibrate visibilities, and put what comes back into standard objects.
+
+    Parameters
+    ----------
+    calibrator
+        Any, built in or a user's.
+    data
+        Visibilities, rectangular and time-major; not changed.
+    sky_model
+        Visibilities of the sky as far as it is known, with the samples of `data`, or None; not changed.
+    gains
+        Where to start, for a calibrator that starts somewhere; None for what it does by itself.
+    progress
+        Called after each solve with the number done and the total.
+
+    Raises
+    ------
+    InputError
+        If the data or the sky model cannot be used, the calibrator refuses them, or a user's calibrator fails or
+        returns what does not fit.
+    """
+    observation = Observation(data)
+    assumed = Assumed(None if sky_model is None else Observation(sky_model), gains)
+    if assumed.sky_model is not None:
+        _require_usable(assumed.sky_model, observation)
+    require_calibratable(calibrator, observation, assumed.sky_model is not None)
+    with Usage() as usage, guarded(calibrator):
+        returned = calibrator.calibrate(observation, assumed, progress)
+    return _Returned(calibrator, returned, observation, assumed).result(usage)
+
+
+def _require_usable(sky_model: Observation, data: Observation) -> None:
+    """Raise InputError unless a sky model has the samples of the data, and finite values where they are not flagged."""
+    if (
+        sky_model.shape != data.shape
+        or not np.array_equal(sky_model.pairs, data.pairs)
+        or not np.allclose(sky_model.frequencies, data.frequencies, rtol=1e-9, atol=0)
+        or not np.allclose(sky_model.times, data.times, rtol=0, atol=1e-6)
+        or not np.array_equal(sky_model.polarizations, data.polarizations)
+    ):
+        raise InputError(
+            "the sky model must have the baselines, times, channels and polarizations of the data, in the same order"
+        )
+    if not (np.isfinite(sky_model.visibilities) | data.flags).all():
+        raise InputError("the sky model is not finite where the data are not flagged")
+
+
+def _name(calibrator: Calibrator) -> str:
+    file = FILE_REFERENCE.fullmatch(calibrator.reference)
+    return (calibrator.reference or type(calibrator).__name__) if file is None else Path(file["path"]).name
+
+
+def _where(calibrator: Calibrator) -> str:
+    return f"calibration.calibrator = {_name(calibrator)!r}"
+
+
+class _Returned:
+    """What a calibrator returned, checked: faults of a user's are sentences, those of a built-in one are our bugs."""
+
+    def __init__(
+        self, calibrator: Calibrator, returned: Calibration, observation: Observation, assumed: Assumed
+    ) -> None:
+        self.calibrator, self.returned = calibrator, returned
+        self._require(isinstance(returned, Calibration), f"returns {type(returned).__name__}, not a Calibration")
+        self.groups = calibrator.solves(observation.n_times)
+        self.fitted = observation if returned.baselines is None else observation.baselines(self._chosen(observation))
+        self.numbers, self.gains, self.gain_flags = self._gains()
+        self.model = self._model(assumed)
+        self.outcomes = self._outcomes()
+
+    def _require(self, condition: bool, sentence: str) -> None:
+        if not condition:
+            raise self._fault(sentence)
+
+    def _fault(self, sentence: str) -> ValueError:
+        kind = ValueError if self.calibrator.is_built_in else InputError
+        return kind(f"{_where(self.calibrator)}: {sentence}")
+
+    def _chosen(self, observation: Observation) -> np.ndarray:
+        chosen = np.asarray(self.returned.baselines)
+        self._require(
+            chosen.dtype == bool and chosen.shape == (observation.n_baselines,) and bool(chosen.any()),
+            f"returns baselines of shape {chosen.shape} and type {chosen.dtype}, expected bool of shape "
+            f"({observation.n_baselines},) with at least one True",
+        )
+        return chosen
+
+    def _gains(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return antenna numbers, gains and their flags, (Nants, Nfreqs, Ntimes, Npols)."""
+        numbers, gains, flags = self.fitted.numbers, self.returned.gains, self.returned.gain_flags
+        if not isinstance(gains, np.ndarray):
+            numbers, gains, flags = self._from_uvcal(gains, flags)
+        n_times, n_channels, n_polarizations = self.fitted.n_times, self.fitted.n_channels, self.fitted.n_polarizations
+        shapes = [(len(numbers), n_channels, count, n_polarizations) for count in (n_times, len(self.groups))]
+        self._require(
+            gains.shape in shapes and gains.dtype.kind in "cfiu",
+            f"returns gains of shape {gains.shape} and type {gains.dtype}, expected complex numbers of shape "
+            f"{shapes[0]} (antennas, channels, integrations, polarizations)"
+            + (f" or {shapes[1]}, one for each solve" if shapes[0] != shapes[1] else ""),
+        )
+        flags = np.zeros(gains.shape, bool) if flags is None else np.asarray(flags)
+        self._require(
+            flags.shape == gains.shape and flags.dtype == bool,
+            f"returns gain_flags of shape {flags.shape} and type {flags.dtype}, expected bool of shape {gains.shape}",
+        )
+        used = gains[~flags]
+        self._require(
+            bool(np.isfinite(used).all() and (used != 0).all()),
+            "returns gains that are zero or not finite, and not flagged",
+        )
+        if gains.shape[2] != n_times:
+            lengths = [group.stop - group.start for group in self.groups]
+            gains, flags = np.repeat(gains, lengths, axis=2), np.repeat(flags, lengths, axis=2)
+        return numbers, np.where(flags, 1, gains).astype(complex), flags.copy()
+
+    def _from_uvcal(self, gains: UVCal, flags: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        from pyuvdata import UVCal
+
+        self._require(
+            isinstance(gains, UVCal) and gains.gain_array is not None,
+            f"returns gains of type {type(gains).__name__}, expected an array or a UVCal of gains",
+        )
+        self._require(
+            gains.gain_convention == "divide",
+            f"returns gains of the convention {gains.gain_convention!r}; it must be 'divide'",
+        )
+        missing = sorted(set(self.fitted.numbers.tolist()) - set(gains.ant_array.tolist()))
+        self._require(not missing, f"returns no gains for antenna {missing[0] if missing else ''}")
+        order = np.argsort(gains.ant_array)
+        rows = order[np.searchsorted(gains.ant_array, self.fitted.numbers, sorter=order)]
+        flagged = gains.flag_array[rows] if flags is None else flags
+        return self.fitted.numbers, gains.gain_array[rows], flagged
+
+    def _model(self, assumed: Assumed) -> np.ndarray:
+        model, sky_model, shape = self.returned.model, assumed.sky_model, self.fitted.shape
+        if model is None:
+            if sky_model is None:
+                raise self._fault("returns no model, and there is no sky model in its place")
+            if self.returned.baselines is not None:
+                sky_model = sky_model.baselines(np.asarray(self.returned.baselines))
+            model = sky_model.visibilities
+        self._require(
+            isinstance(model, np.ndarray) and model.shape == shape,
+            f"returns a model of shape {getattr(model, 'shape', None)}, expected {shape} (integrations, baselines, "
+            "channels, polarizations), or None for the sky model",
+        )
+        finite = bool((np.isfinite(model) | self.fitted.flags).all())
+        self._require(finite, "returns a model that is not finite for unflagged data")
+        return model
+
+    def _outcomes(self) -> list[Outcome]:
+        outcomes, count = self.returned.outcomes, len(self.groups) * self.fitted.n_polarizations
+        outcomes = [outcomes] * count if isinstance(outcomes, Outcome) else list(outcomes)
+        self._require(
+            len(outcomes) == count,
+            f"returns {len(outcomes)} outcomes for {count} solves (one for each polarization and each "
+            f"{self.calibrator.integrations_per_solve} integration(s))",
+        )
+        for outcome in outcomes:
+            self._require(
+                isinstance(outcome, Outcome) and outcome.status in get_args(Status) and bool(outcome.message),
+                f"returns an outcome {outcome!r}; it must be an Outcome with a message, and its status one of "
+                f"{', '.join(get_args(Status))}",
+            )
+        return outcomes
+
+    def result(self, usage: Usage) -> CalibrationResult:
+        """Return gains, model and residual in standard objects, and the records of all solves."""
+        # pyuvdata takes long to import, and plans need other parts of this module.
+        from calstudy.calibrate.standard_formats import make_gains, make_visibilities
+
+        flags = np.array(self.fitted.flags)
+        if self.returned.flags is not None:
+            excluded = np.asarray(self.returned.flags)
+            self._require(
+                excluded.shape == flags.shape and excluded.dtype == bool,
+                f"returns flags of shape {excluded.shape} and type {excluded.dtype}, expected bool of shape "
+                f"{flags.shape}",
+            )
+            flags |= excluded
+        for index, outcome in enumerate(self.outcomes):
+            if outcome.status not in USABLE:
+                p, group = divmod(index, len(self.groups))
+                flags[self.groups[group], :, :, p] = True
+                self.gain_flags[:, :, self.groups[group], p] = True
+        gains = np.where(self.gain_flags, 1, self.gains)
+        residual = self._residual(gains, flags)
+        template = self.fitted.uvd
+        return CalibrationResult(
+            make_gains(template, self.numbers, gains, self.gain_flags),
+            make_visibilities(template, self.model, flags),
+            make_visibilities(template, residual, flags),
+            tuple(self._records(usage)),
+        )
+
+    def _residual(self, gains: np.ndarray, flags: np.ndarray) -> np.ndarray:
+        """Return V / (g_a g_b*) - F, zero where flagged; adds to the flags those of the gains."""
+        residual = np.zeros(self.fitted.shape, complex)
+        first, second = np.searchsorted(self.numbers, self.fitted.pairs).T
+        for t in range(self.fitted.n_times):
+            for p in range(self.fitted.n_polarizations):
+                flagged = self.gain_flags[:, :, t, p]
+                flags[t, :, :, p] |= flagged[first] | flagged[second]
+                unused = flags[t, :, :, p]
+                products = gains[first, :, t, p] * gains[second, :, t, p].conj()
+                calibrated = np.where(unused, 0, self.fitted.visibilities[t, :, :, p]) / products
+                residual[t, :, :, p] = np.where(unused, 0, calibrated - self.model[t, :, :, p])
+        return residual
+
+    def _records(self, usage: Usage) -> list[SolveRecord]:
+        share = usage.seconds / len(self.outcomes)
+        found = []
+        for index, outcome in enumerate(self.outcomes):
+            p, group = divmod(index, len(self.groups))
+            times = self.groups[group]
+            found.append(
+                SolveRecord(
+                    integration=times.start,
+                    n_integrations=times.stop - times.start,
+                    time=float(self.fitted.times[times.start]),
+                    polarization=int(self.fitted.polarizations[p]),
+                    status=outcome.status,
+                    message=outcome.message,
+                    n_steps=outcome.steps,
+                    loss_history=np.asarray(outcome.loss_history, float),
+                    seconds=share if outcome.seconds is None else outcome.seconds,
+                    newton_decrement=outcome.newton_decrement,
+                    decrement_rms=outcome.decrement_rms,
+                    peak_memory=usage.peak_memory if outcome.peak_memory is None else outcome.peak_memory,
+                    diagnostics=outcome.diagnostics,
+                )
+            )
+        return found

@@ -1,0 +1,341 @@
+"""How much of a small signal a calibration is expected to leave, from the fit alone.
+
+At the minimum of the likelihood sum w |V - g_a g_b* F|^2, let J be the Jacobian of the model g_a g_b* F in all
+unknowns, gains and coefficients of the foregrounds, times sqrt(w) and free of the phases of g_a g_b*. A small signal s
+in the calibrated visibilities changes the data by y = sqrt(D) s in the same unit, with D = w |g_a g_b*|^2. To first
+order, in the Gauss-Newton approximation, the unknowns change by (J^T J)^-1 J^T y, and the residual by
+
+    y - P y,   P = J (J^T J)^-1 J^T,
+
+the part of y that is orthogonal to the tangent space of the fit, P being the projector on that. A signal with white y
+therefore keeps the fraction
+
+    T(p, tau) = <|f* (1 - P) y|^2> / <|f* y|^2> = 1 - <f|P|f> / <f|f>
+
+of its power on baseline p at delay tau, where f is the tapered delay mode. All matrices are real, because gains enter
+with their conjugates: data and unknowns count as twice as many real numbers, and <f|P|f> is the mean over the two
+phases of the mode.
+
+P is the sum of two projectors: P_F on the foreground sequences, weighted by sqrt(D), which is known in closed form for
+each baseline or group; and that on what gains can do and foregrounds cannot, the span of Z = (1 - P_F) J_g with the
+Jacobian J_g of the gains. What gains of per-channel freedom absorb far from the modelled delays is their share of the
+degrees of freedom, (2 N - 1) / (N (N - 1)) for N antennas.
+
+The second part is exact from a dense decomposition for small arrays. For others it is a stochastic diagonal (Hutchinson
+1990, Commun. Stat. Simul. Comput. 19, 433; Bekas, Kokiopoulou & Saad 2007, Appl. Numer. Math. 57, 1214), here in the
+basis of the delay modes: for white noise x with <x x*> = 1, the mean of |f* P x|^2 is <f|P P|f> = <f|P|f>, and P x
+costs one solve of the normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import tensorflow as tf
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.basis import channel_grid
+from calstudy.calibrate.problem import CalibrationProblem, gain_products
+from calstudy.calibrate.solvers.preconditioners import DEGREE_FLOOR, Inverse, channel_inverse
+from calstudy.calibrate.solvers.reduced import DAMPING_BOUNDS, PRECONDITIONER_DAMPING, NormalEquations, compiled
+from calstudy.power.delay import make_taper
+
+TAPER = "blackman-harris"
+# Singular values of weighted sequences below this, relative to the largest, belong to what flags left undetermined; the
+# solvers' ridge on their squares is the square of it.
+SPAN_CUTOFF = 1e-6
+# Elements of the dense Jacobian up to which the exact diagonal is offered.
+DENSE = 3e7
+CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
+
+
+class DelayModes:
+    """Tapered delay modes of a band, with or without gaps.
+
+    Parameters
+    ----------
+    frequency
+        Channel centres on an even grid, Hz, (Nfreqs,).
+    taper
+        See `calstudy.power.delay.TAPERS`.
+    """
+
+    def __init__(self, frequency: np.ndarray, taper: str = TAPER) -> None:
+        grid = channel_grid(np.asarray(frequency, float))
+        self._grid = grid
+        self.delay = np.fft.fftshift(np.fft.fftfreq(grid.n_channels, grid.width))
+        self.weights = make_taper(taper, grid.n_channels)[grid.positions]
+
+    def amplitudes(self, values: np.ndarray) -> np.ndarray:
+        """Return f* values for every delay: frequency is the last axis, (..., Nfreqs) to (..., Ndelays)."""
+        padded = np.zeros((*values.shape[:-1], self._grid.n_channels), complex)
+        padded[..., self._grid.positions] = values * self.weights
+        transformed = np.fft.ifft(padded, axis=-1, norm="forward")
+        return np.fft.fftshift(transformed, axes=-1)
+
+
+@dataclass(frozen=True)
+class ExpectedTransfer:
+    """The fraction of a white signal's power that a fit leaves.
+
+    Attributes
+    ----------
+    delay
+        Ascending, s, (Ndelays,).
+    transfer
+        T, (Nbls, Ndelays); NaN for baselines without data.
+    error
+        Standard deviation of the stochastic estimate, of the same shape; zero if it is exact.
+    foregrounds, gains
+        What each of them absorbs, of the same shape; the three add up to one.
+    """
+
+    delay: np.ndarray = field(metadata={"unit": "s"})
+    transfer: np.ndarray = field(metadata={"unit": ""})
+    error: np.ndarray = field(metadata={"unit": ""})
+    foregrounds: np.ndarray = field(metadata={"unit": ""})
+    gains: np.ndarray = field(metadata={"unit": ""})
+
+
+def expected_transfer(
+    problem: CalibrationProblem,
+    gains: np.ndarray,
+    model: np.ndarray,
+    modes: DelayModes,
+    probes: int | None = None,
+    seed: int = 0,
+) -> ExpectedTransfer:
+    """Return what a fit is expected to leave of a white signal, for every baseline and delay.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    gains, model
+        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
+    modes
+        The delay modes of its channels.
+    probes
+        Number of random vectors; None for the exact diagonal.
+    seed
+        Of the random vectors.
+
+    Raises
+    ------
+    ValueError
+        If the exact diagonal of a large problem is asked for, or fewer than two probes.
+    """
+    tangent = TangentSpace.at(problem, gains, model)
+    used = tangent.roots > 0
+    norm = np.sum(modes.weights**2 * used, axis=1)[:, None]
+    if probes is None:
+        by_gains, error = _exact_diagonal(problem, gains, tangent, modes), np.zeros((len(norm), modes.delay.size))
+    else:
+        by_gains, error = _stochastic_diagonal(problem, gains, tangent, modes, probes, seed)
+    norm = np.where(norm > 0, norm, np.nan)
+    foregrounds, by_gains, error = tangent.foreground_diagonal(modes) / norm, by_gains / norm, error / norm
+    return ExpectedTransfer(modes.delay, 1 - foregrounds - by_gains, error, foregrounds, by_gains)
+
+
+@dataclass(frozen=True, eq=False)
+class TangentSpace:
+    """The tangent space of a fit, in units in which the noise of the likelihood is white.
+
+    Attributes
+    ----------
+    roots
+        Square root of D, (Nbls, Nfreqs).
+    slope
+        sqrt(D) F: what a relative change of a gain does to the baseline, (Nbls, Nfreqs), complex.
+    conjugated
+        Baselines that see the conjugate of their model, (Nbls,) bool.
+    sequences
+        For each model, or joint bucket of models, its baselines, and orthonormal sequences on all of them,
+        (Nmembers, Nfreqs, Nkept), real.
+    """
+
+    roots: np.ndarray
+    slope: np.ndarray
+    conjugated: np.ndarray
+    sequences: tuple[tuple[np.ndarray, np.ndarray], ...]
+
+    @classmethod
+    def at(cls, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) -> TangentSpace:
+        """Return the tangent space at a solution.
+
+        Parameters
+        ----------
+        problem
+            What was fitted.
+        gains, model
+            The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
+        """
+        structure = problem.structure
+        curvature = problem.weights * np.abs(gain_products(gains, structure.antennas)) ** 2
+        roots = np.sqrt(curvature)
+        sequences = []
+        if not problem.frozen:
+            for bucket in structure.basis.buckets:
+                if bucket.joint:
+                    row, members = np.nonzero(structure.groups == bucket.members[:, None])
+                    sequences.append((members, _orthonormal(roots[members], bucket.vectors[row])))
+                    continue
+                for index in bucket.members:
+                    members = np.flatnonzero(structure.groups == index)
+                    sequences.append((members, _orthonormal(roots[members], bucket.vectors)))
+        return cls(roots, roots * model, structure.conjugated, tuple(sequences))
+
+    def without_foregrounds(self, values: np.ndarray) -> np.ndarray:
+        """Return (1 - P_F) y of whitened changes y, complex, (Nbls, Nfreqs, ...)."""
+        result = values.copy()
+        result[self.conjugated] = result[self.conjugated].conj()
+        for members, vectors in self.sequences:
+            stacked = vectors.reshape(vectors.shape[0] * vectors.shape[1], vectors.shape[2])
+            rows = result[members].reshape(len(stacked), -1)
+            result[members] = (rows - stacked @ (stacked.T @ rows)).reshape(result[members].shape)
+        result[self.conjugated] = result[self.conjugated].conj()
+        return result
+
+    def foreground_diagonal(self, modes: DelayModes) -> np.ndarray:
+        """Return <f|P_F|f> of the unnormalized modes f, (Nbls, Ndelays)."""
+        found = np.zeros((len(self.roots), modes.delay.size))
+        for members, vectors in self.sequences:
+            spectra = modes.amplitudes(np.moveaxis(vectors, 2, 1))
+            found[members] = np.sum(np.abs(spectra) ** 2, axis=1)
+        return found
+
+
+def _orthonormal(roots: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of the sequences, weighted by `roots` (Nmembers, Nfreqs).
+
+    The sequences are (Nfreqs, Nvec), the same on all members, or (Nmembers, Nfreqs, Nvec).
+    """
+    weighted = (roots[:, :, None] * vectors).reshape(-1, vectors.shape[-1])
+    left, singular, _ = np.linalg.svd(weighted, full_matrices=False)
+    kept = singular > SPAN_CUTOFF * max(singular[0], np.finfo(float).tiny)
+    return left[:, kept].reshape(*roots.shape, -1)
+
+
+def jacobian_size(problem: CalibrationProblem) -> int:
+    """Return the number of elements of the dense Jacobian of the gains."""
+    structure = problem.structure
+    n_gains = structure.n_frequencies if structure.gain_vectors is None else structure.gain_vectors.shape[1]
+    return 4 * structure.n_baselines * structure.n_frequencies * structure.n_antennas * n_gains
+
+
+def _exact_diagonal(
+    problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace, modes: DelayModes
+) -> np.ndarray:
+    """Return <f|P|f> of the gains, (Nbls, Ndelays), from dense matrices."""
+    if jacobian_size(problem) > DENSE:
+        raise ValueError(
+            f"the exact transfer of {problem.structure.n_antennas} antennas and {problem.structure.n_frequencies} "
+            "channels needs too large a matrix; use random probes"
+        )
+    jacobian, degrees = _jacobian(problem, gains, tangent)
+    normal = jacobian.T @ jacobian
+    inverse = np.linalg.inv(normal + np.diag(DAMPING_BOUNDS[0] * degrees))
+    # The damped projector is one but for directions of next to no curvature; its square is what the probes measure.
+    kernel = inverse @ normal @ inverse
+    n_baselines, n_frequencies = tangent.roots.shape
+    rows = jacobian.reshape(2, n_baselines, n_frequencies, -1)
+    found = np.empty((n_baselines, modes.delay.size))
+    for p in range(n_baselines):
+        real, imaginary = (modes.amplitudes(part[p].T) for part in rows)
+        # Re and Im of f* x are two real functionals of the real and imaginary parts of x.
+        first, second = real.real - imaginary.imag, real.imag + imaginary.real
+        found[p] = sum(np.einsum("ud,uv,vd->d", part, kernel, part, optimize=True) for part in (first, second)) / 2
+    return found
+
+
+def _jacobian(problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Return Z, (2 Nbls Nfreqs, unknowns), real and imaginary parts stacked, and the diagonal that damping scales."""
+    structure, shape = problem.structure, tangent.slope.shape
+    n_antennas, n_frequencies = structure.n_antennas, structure.n_frequencies
+    directions = np.eye(n_frequencies) if structure.gain_vectors is None else structure.gain_vectors
+    columns, power = [], np.abs(tangent.slope) ** 2
+    degrees = np.zeros((n_antennas, n_frequencies))
+    for column in structure.antennas.T:
+        np.add.at(degrees, column, power)
+    degrees = np.maximum(degrees, DEGREE_FLOOR * degrees.mean())
+    diagonal = []
+    for turn in (1, 1j):
+        for antenna in range(n_antennas):
+            relative = turn * directions / (1 if structure.gain_vectors is None else gains[antenna][:, None])
+            change = np.zeros((*shape, directions.shape[1]), complex)
+            for side, column in enumerate(structure.antennas.T):
+                rows = column == antenna
+                change[rows] += tangent.slope[rows][:, :, None] * (relative.conj() if side else relative)
+            columns.append(tangent.without_foregrounds(change).reshape(-1, directions.shape[1]))
+            diagonal.append(np.sum(degrees[antenna][:, None] * np.abs(relative) ** 2, axis=0))
+    whole = np.concatenate(columns, axis=1)
+    return np.concatenate([whole.real, whole.imag]), np.concatenate(diagonal)
+
+
+class GainResponse:
+    """The linear response of the gains to a change of the data, at a solution.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    gains
+        The solution, (Nants, Nfreqs), complex.
+    """
+
+    def __init__(self, problem: CalibrationProblem, gains: np.ndarray) -> None:
+        self._kernels = kernels = compiled(problem.structure, problem.frozen)
+        reduced = kernels.reduce(problem, gains)
+        self._unit = reduced.loss_unit
+        projection = kernels.project(reduced.gains, *reduced.data)
+        stronger = tf.constant(PRECONDITIONER_DAMPING, tf.float32)
+        if kernels.by_channel:
+            inverse: Inverse = channel_inverse(kernels.tensors, projection, stronger)
+        else:
+            inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
+        damping = tf.constant(DAMPING_BOUNDS[0], tf.float32)
+        self._equations = NormalEquations(projection, reduced.gains, damping, inverse)
+        self._compiled = tf.function(self._solve)
+
+    def solve(self, change: np.ndarray) -> np.ndarray:
+        """Return the relative change eta of the gains, complex, (Nants, Nfreqs), for a change y of the whitened data.
+
+        Parameters
+        ----------
+        change
+            J_g* y, in the unit of the square root of the loss, complex, (Nants, Nfreqs).
+        """
+        # Inside the kernels the loss has the weighted square of the data for a unit.
+        return pairs.to_complex(self._compiled(pairs.to_pair(change / self._unit, tf.float32)))
+
+    def _solve(self, descent: tf.Tensor) -> tf.Tensor:
+        eta, _ = self._kernels.solve(self._equations, descent, CG_TOLERANCE, CG_ITERATIONS)
+        return eta
+
+
+def _stochastic_diagonal(
+    problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace, modes: DelayModes, probes: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return <f|P|f> of the gains and its standard deviation, (Nbls, Ndelays) each; parameters as `expected_transfer`.
+
+    Raises ValueError for fewer than two probes, which give no error.
+    """
+    if probes < 2:
+        raise ValueError(f"probes: {probes}, at least 2 are needed")
+    response, rng = GainResponse(problem, gains), np.random.default_rng(seed)
+    first, second = problem.structure.antennas.T
+    shape, used = tangent.slope.shape, tangent.roots > 0
+    sums = np.zeros((2, shape[0], modes.delay.size))
+    for _ in range(probes):
+        noise = used * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
+        gradient = tangent.slope.conj() * tangent.without_foregrounds(noise)
+        descent = np.zeros(gains.shape, complex)
+        np.add.at(descent, first, gradient)
+        np.add.at(descent, second, gradient.conj())
+        eta = response.solve(descent)
+        absorbed = tangent.without_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
+        power = np.abs(modes.amplitudes(absorbed)) ** 2
+        sums += power, power**2
+    mean, square = sums / probes
+    return mean, np.sqrt(np.maximum(square - mean**2, 0) / (probes - 1))

@@ -1,0 +1,202 @@
+"""What a calibrator is: settings, what it refuses, what it costs, and how visibilities become gains.
+
+Built-in calibrators are the modules of `calstudy.calibrate.calibrators`. One's own is a subclass of `Calibrator` in a
+file or an installed package (docs/extending.md). `calstudy.calibrate.execution` calls either.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.observation import Frame, Observation
+from calstudy.base.plugins import Plugin, Registry
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.instrument.size import Size
+
+if TYPE_CHECKING:
+    from pyuvdata import UVCal
+
+Status = Literal["converged", "max-steps", "stalled", "failed", "skipped"]
+USABLE: tuple[Status, ...] = ("converged", "max-steps", "stalled")
+"""Statuses of solves that gave gains; what others cover is flagged."""
+Progress = Callable[[int, int], None]
+"""Called after each solve with the number done and the total."""
+
+
+@dataclass(frozen=True, eq=False)
+class Assumed:
+    """What a calibrator takes for granted.
+
+    Attributes
+    ----------
+    sky_model
+        Visibilities of the sky as far as it is known, with the baselines, times, channels and polarizations of the
+        data, in the same order; None if there are none.
+    gains
+        Gains to start from, None for unity. A calibrator that does not iterate may leave them alone.
+    """
+
+    sky_model: Observation | None = None
+    gains: UVCal | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Outcome:
+    """How a solve ended.
+
+    Attributes
+    ----------
+    status
+        ``converged``; ``max-steps`` or ``stalled`` for gains that are usable but not those that were sought;
+        ``failed`` for none; ``skipped`` if there were no data to fit.
+    message
+        One sentence on why it stopped.
+    steps
+        Steps taken; None if the calibrator does not iterate.
+    loss_history
+        What was minimized, before the first step and after each.
+    seconds
+        Wall time; None for an equal share of the whole.
+    newton_decrement, decrement_rms
+        As in `calstudy.calibrate.solution.Solution`; NaN if unknown.
+    peak_memory
+        Bytes; None for that of the whole.
+    diagnostics
+        Any other numbers and texts that are worth keeping, by name.
+    """
+
+    status: Status
+    message: str
+    steps: int | None = None
+    loss_history: np.ndarray = field(default_factory=lambda: np.empty(0))
+    seconds: float | None = None
+    newton_decrement: float = np.nan
+    decrement_rms: float = np.nan
+    peak_memory: int | None = None
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration:
+    """What a calibrator returns.
+
+    Attributes
+    ----------
+    gains
+        Gains g with V = g_a g_b* F: complex, shape (Nants, Nfreqs, Ntimes, Npols), for the antennas of the calibrated
+        baselines in the order of their numbers (`Observation.numbers`, unless `baselines` leaves some out); or a UVCal
+        of the convention "divide". In place of Ntimes there may be one for each solve of `integrations_per_solve`
+        integrations.
+    outcomes
+        How the solves ended: one for each polarization and each group of integrations, polarization by polarization,
+        each in the order of time; or a single one for all of them.
+    gain_flags
+        Which gains are not to be used, bool, like `gains`; None for none, or for those of the UVCal.
+    model
+        The foregrounds F, (Ntimes, Nbls, Nfreqs, Npols), in the unit of the data; None for the sky model.
+    flags
+        Samples that are excluded besides the flagged ones, like `model`; None for none.
+    baselines
+        Which baselines were calibrated, bool, (Nbls,); None for all. Model and flags cover only these.
+    """
+
+    gains: np.ndarray | UVCal
+    outcomes: Outcome | Sequence[Outcome]
+    gain_flags: np.ndarray | None = None
+    model: np.ndarray | None = None
+    flags: np.ndarray | None = None
+    baselines: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What is known of a calibration before it starts.
+
+    Attributes
+    ----------
+    cost
+        Of all its solves.
+    details
+        What is worth reporting besides the dimensions of the data, such as "640 foreground coefficients each".
+    notes
+        Sentences on what will not work well.
+    """
+
+    cost: Cost
+    details: str = ""
+    notes: tuple[str, ...] = ()
+
+
+class Calibrator(Plugin):
+    """A way to find gains. Fields of a subclass are its settings; `calibrate` is what it does."""
+
+    registry: ClassVar[Registry[Calibrator]] = Registry(
+        "calibrator",
+        "calstudy.calibrate.calibrators",
+        "calstudy.calibrate.interface:Calibrator",
+        tag="calibrator",
+    )
+
+    calibrator: str = Field("", description="Its name, or the path of a Python file that defines it.")
+    integrations_per_solve: int = Field(
+        1, ge=1, description="Consecutive integrations that are solved together and share their gains."
+    )
+    chunks: int = Field(
+        4, ge=1, description="Pieces of consecutive integrations; the unit of resuming and of work sharing."
+    )
+
+    def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
+        """Return in one sentence why data cannot be calibrated, or None if they can.
+
+        Asked by plans, before there are data, and again before data are calibrated. A sentence about a setting starts
+        with its path and a colon, such as ``basis.buffer: must be ...``.
+
+        Parameters
+        ----------
+        frame
+            Antennas, baselines and channels of the data.
+        has_sky_model
+            Whether `Assumed.sky_model` will be there.
+        """
+        del frame, has_sky_model
+        return None
+
+    def cost(self, size: Size) -> Cost:
+        """Return what calibrating data of this size takes; by default little beyond the data themselves."""
+        return Cost(5.0 + 1e-6 * size.samples, LIBRARIES_MEMORY + 6 * COMPLEX128 * size.samples)
+
+    def outline(self, frame: Frame) -> Outline:
+        """Return what is known of a calibration of data with these baselines; by default the cost of their size."""
+        return Outline(self.cost(Size.of_frame(frame)))
+
+    def leaner(self) -> Self | None:
+        """Return a calibrator with the same results that needs less memory; None if there is none."""
+        return None
+
+    @abstractmethod
+    def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
+        """Calibrate a whole number of groups of `integrations_per_solve` integrations; the last may be shorter.
+
+        Parameters
+        ----------
+        observation
+            The data; arrays are read-only.
+        assumed
+            What may be taken for granted.
+        progress
+            To be called after each solve with the number done and the total; None for no progress reports.
+        """
+
+    def solves(self, n_times: int) -> list[slice]:
+        """Return the groups of integrations that are solved together."""
+        step = self.integrations_per_solve
+        return [slice(first, min(first + step, n_times)) for first in range(0, n_times, step)]
+
+
+CALIBRATORS = Calibrator.registry

@@ -1,0 +1,131 @@
+"""From an observation and the settings of a fit to the problems that solvers take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.gains import read_gains
+from calstudy.base.observation import Observation
+from calstudy.calibrate.interface import Assumed
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, fitted_baselines
+from calstudy.calibrate.settings import ForegroundFit, GainFit
+from calstudy.calibrate.standard_formats import require_parallel_hands
+from calstudy.calibrate.starts import redundant_start, starting_gains
+from calstudy.calibrate.structure import make_structure, repeat_structure
+from calstudy.calibrate.weights import make_weights
+
+NOTHING = Assumed()
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFit:
+    """The arrays of a fit, of all integrations.
+
+    Attributes
+    ----------
+    data
+        The visibilities that are calibrated: without the autocorrelations, unless they are fitted. Indices of the
+        structure stand for `data.numbers`.
+    fitted
+        Which baselines of the observation these are, bool, (Nbls,).
+    structure
+        Of the fit of one integration.
+    weights
+        Shape (Ntimes, Nbls, Nfreqs, Npols).
+    start
+        Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
+    sky
+        The sky model like the visibilities, or None.
+    """
+
+    data: Observation
+    fitted: np.ndarray
+    structure: FitStructure
+    weights: np.ndarray
+    start: np.ndarray
+    sky: np.ndarray | None
+
+
+def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTHING) -> PreparedFit:
+    """Return what is fitted, after checking it.
+
+    Parameters
+    ----------
+    observation, assumed
+        As for `calstudy.calibrate.interface.Calibrator.calibrate`.
+    settings
+        Of the fit.
+
+    Raises
+    ------
+    InputError
+        If there are polarizations that are not of feeds, or unflagged data that are not finite, or weights, gains or
+        joint groups do not fit the data.
+    """
+    require_parallel_hands(observation.uvd)
+    fitted = fitted_baselines(observation, settings.autos)
+    weights = make_weights(observation, fitted, settings.weights)
+    data = observation.baselines(fitted)
+    sky = None if assumed.sky_model is None else assumed.sky_model.baselines(fitted).visibilities
+    _require_finite(data)
+    structure = make_structure(data, settings)
+    gains = assumed.gains
+    if gains is None and settings.initial_gains.kind == "file":
+        gains = read_gains(settings.initial_gains.path, "calibration.initial_gains.path")
+    if gains is None and settings.initial_gains.kind == "redundant":
+        start = redundant_start(data, weights, settings.initial_gains, settings.redundancy_tolerance)
+    else:
+        start = starting_gains(data, gains)
+    return PreparedFit(data, fitted, structure, weights, start, sky)
+
+
+def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polarization: int) -> CalibrationProblem | str:
+    """Return the problem of some consecutive integrations together, or the reason why there is none.
+
+    Parameters
+    ----------
+    prepared
+        All integrations.
+    settings
+        Of the fit.
+    times
+        The integrations.
+    polarization
+        Index of the polarization.
+    """
+    structure = repeat_structure(prepared.structure, times.stop - times.start)
+
+    def rows(cube: np.ndarray) -> np.ndarray:
+        return cube[times, :, :, polarization].reshape(structure.n_baselines, structure.n_frequencies)
+
+    weights, visibilities = rows(prepared.weights), rows(prepared.data.visibilities)
+    flagged = float(np.mean(weights == 0))
+    if flagged == 1:
+        return "every sample is flagged or has no weight"
+    if flagged >= settings.skip_flagged:
+        return f"{100 * flagged:.0f} % of the samples are flagged, which skip_flagged excludes"
+    if not np.any(visibilities, where=weights > 0):
+        return "the data are zero"
+    return CalibrationProblem(
+        structure,
+        visibilities,
+        weights,
+        prepared.start[:, :, times.start, polarization],
+        None if prepared.sky is None else rows(prepared.sky),
+        settings.prior if isinstance(settings, ForegroundFit) else "sum",
+        frozen=not isinstance(settings, ForegroundFit),
+    )
+
+
+def _require_finite(data: Observation) -> None:
+    bad = ~(np.isfinite(data.visibilities) | data.flags)
+    if bad.any():
+        t, baseline, channel, _ = np.argwhere(bad)[0]
+        a, b = data.pairs[baseline]
+        raise InputError(
+            f"{bad.sum()} unflagged visibilities are not finite, the first on baseline ({a}, {b}), integration {t}, "
+            f"channel {channel}; flag them"
+        )

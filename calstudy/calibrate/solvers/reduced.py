@@ -1,0 +1,227 @@
+"""The problem for the gains alone, with the foregrounds eliminated: what its solvers have in common.
+
+Eliminating the foregrounds (`calstudy.calibrate.projection`) leaves a least-squares problem for relative changes eta of
+the gains, g (1 + eta). At given gains it has a loss L, half of its negative gradient d (the descent direction) and a
+Gauss-Newton matrix H. The damped normal equations
+
+    (H + mu K) eta = d,
+
+with the diagonal K of `calstudy.calibrate.solvers.preconditioners.antenna_degrees`, are solved by preconditioned
+conjugate gradients. The step is predicted to lower the loss by d^T eta. With a damping that vanishes with the loss this
+is the Newton decrement; relative to the loss it says how far from the minimum any solver has stopped. Where the
+preconditioner has the channel blocks of each antenna, its inverse stands for that of H + mu K.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import tensorflow as tf
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.gain_space import GainSpace
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure
+from calstudy.calibrate.projection import FrozenForegrounds, Projection, Projector
+from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
+from calstudy.calibrate.solvers.preconditioners import (
+    AntennaBlocks,
+    Inverse,
+    antenna_blocks,
+    antenna_degrees,
+    antenna_inverse,
+    channel_inverse,
+    coordinate_inverse,
+)
+from calstudy.calibrate.tensors import FitTensors
+
+# Damping, relative to the diagonal, is this times the loss relative to the data, within the two bounds.
+DAMPING_PER_LOSS = 10.0
+DAMPING_BOUNDS = (1e-6, 1e-2)
+# The blocks of float32 numbers cannot be inverted with less.
+PRECONDITIONER_DAMPING = 1e-5
+CG_TOLERANCE = 1e-3
+CG_CHANNEL_ITERATIONS = 300
+CG_ANTENNA_ITERATIONS = 60
+# Loss relative to the data below which a residual is rounding: 3e-8 of the visibilities, float32's resolution.
+ROUNDING_LOSS = 1e-15
+
+
+class ReducedData(NamedTuple):
+    """The arrays of a reduced problem.
+
+    Attributes
+    ----------
+    gains
+        Where to start, (2, Nants, Nfreqs), float64.
+    data
+        Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) whose sum is one, and the model if it is frozen; float64.
+    scale
+        Unit of the visibilities, their weighted rms.
+    loss_unit
+        Unit of the loss, in the unit of the data squared.
+    """
+
+    gains: tf.Tensor
+    data: tuple[tf.Tensor, ...]
+    scale: float
+    loss_unit: float
+
+
+class NormalEquations(NamedTuple):
+    """The damped Gauss-Newton equations at one point, and what preconditions them.
+
+    Attributes
+    ----------
+    projection
+        The reduced problem there.
+    gains
+        (2, Nants, Nfreqs), float32 or float64.
+    damping
+        Relative to the diagonal, scalar, float32.
+    inverse
+        Preconditioner.
+    """
+
+    projection: Projection
+    gains: tf.Tensor
+    damping: tf.Tensor
+    inverse: Inverse
+
+
+class ReducedKernels:
+    """The compiled operations on the reduced problem of one fit structure.
+
+    Attributes
+    ----------
+    by_channel
+        Whether the antenna blocks of each channel are the preconditioner throughout: couplings between antennas remain
+        the strong ones where baselines share models or coefficients, and are the only ones where the foregrounds are
+        frozen.
+    """
+
+    def __init__(self, structure: FitStructure, frozen: bool = False) -> None:
+        self.tensors = FitTensors(structure)
+        self.frozen = frozen
+        self.by_channel = (self.tensors.coupled or frozen) and structure.gain_vectors is None
+        self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(self.tensors)
+        self.space = GainSpace(structure.gain_vectors, tf.float32)
+        self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
+        self.project = self.projector.project
+        self.channel_step = tf.function(self._channel_step)
+        self.antenna_step = tf.function(self._antenna_step)
+        self.blocks = tf.function(self._blocks)
+        self.inverse = tf.function(self._inverse)
+        self.predicted_decrease = tf.function(self._predicted_decrease)
+
+    def reduce(self, problem: CalibrationProblem, gains: np.ndarray) -> ReducedData:
+        """Return the data of a problem, and gains (Nants, Nfreqs) as close as their space allows, as tensors."""
+        data = self.tensors.load(problem, tf.float64)
+        total = float(tf.reduce_sum(data.weights))
+        arrays: tuple[tf.Tensor, ...] = (data.visibilities, data.weights / total)
+        if (model := problem.frozen_model) is not None:
+            arrays += (self.tensors.load_model(model, data.scale, tf.float64),)
+        start = self.exact_space.expand(self.exact_space.reduce(pairs.to_pair(gains, tf.float64)))
+        return ReducedData(start, arrays, data.scale, total * data.scale**2)
+
+    def _channel_step(
+        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return eta, and the decrease of the loss that its quadratic model promises."""
+        inverse = channel_inverse(self.tensors, projection, damping)
+        descent = tf.cast(projection.descent, tf.float32)
+        equations = NormalEquations(projection, gains, damping, inverse)
+        eta, _ = self.solve(equations, descent, CG_TOLERANCE, CG_CHANNEL_ITERATIONS)
+        return eta, pairs.inner_product(descent, eta)
+
+    def _antenna_step(
+        self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return eta, and the iterations it took."""
+        descent = tf.cast(projection.descent, tf.float32)
+        equations = NormalEquations(projection, gains, damping, inverse)
+        return self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)
+
+    def solve(
+        self, equations: NormalEquations, descent: tf.Tensor, tolerance: float, iterations: int
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return eta for a descent direction, both (2, Nants, Nfreqs), float32, and the iterations it took.
+
+        Parameters
+        ----------
+        equations
+            What is solved.
+        descent
+            Minus half the gradient in eta.
+        tolerance, iterations
+            See `calstudy.calibrate.solvers.conjugate_gradients.conjugate_gradients`.
+        """
+        projection = equations.projection
+        diagonal = equations.damping * antenna_degrees(self.tensors, projection)
+        gains = tf.cast(equations.gains, tf.float32)
+
+        def operator(coordinates: tf.Tensor) -> tf.Tensor:
+            eta = self.space.expand_relative(coordinates, gains)
+            image = self.projector.hessian_product(eta, projection) + diagonal * eta
+            return self.space.reduce_relative(image, gains)
+
+        coordinates, count = conjugate_gradients(
+            operator,
+            equations.inverse.apply,
+            self.space.reduce_relative(descent, gains),
+            tf.constant(tolerance),
+            tf.constant(iterations),
+        )
+        return self.space.expand_relative(coordinates, gains), count
+
+    def _blocks(self, projection: Projection) -> AntennaBlocks:
+        if isinstance(self.projector, FrozenForegrounds):
+            return AntennaBlocks(antenna_degrees(self.tensors, projection))
+        return antenna_blocks(self.projector, projection)
+
+    def _inverse(self, blocks: AntennaBlocks, damping: tf.Tensor, gains: tf.Tensor) -> Inverse:
+        if self.space.vectors is None:
+            return antenna_inverse(blocks, damping)
+        return coordinate_inverse(blocks, self.space.columns(tf.cast(gains, tf.float32)), damping)
+
+    def _predicted_decrease(self, projection: Projection, gains: tf.Tensor, inverse: Inverse) -> tf.Tensor:
+        descent = self.space.reduce_relative(tf.cast(projection.descent, tf.float32), tf.cast(gains, tf.float32))
+        return pairs.inner_product(descent, inverse.apply(descent))
+
+
+@lru_cache(maxsize=4)
+def compiled(structure: FitStructure, frozen: bool = False) -> ReducedKernels:
+    """Return the kernels of a structure, compiled once for all its integrations."""
+    return ReducedKernels(structure, frozen)
+
+
+def damping_at(loss: float) -> float:
+    """Return the damping, relative to the diagonal, at a loss relative to the weighted square of the data."""
+    low, high = DAMPING_BOUNDS
+    return min(max(DAMPING_PER_LOSS * loss, low), high)
+
+
+def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
+    """Return the relative Newton decrement of the reduced problem at given gains (see `Solution`).
+
+    Parameters
+    ----------
+    problem
+        Data and weights.
+    gains
+        Where any solver stopped, (Nants, Nfreqs).
+    """
+    kernels = compiled(problem.structure, problem.frozen)
+    reduced = kernels.reduce(problem, gains)
+    projection = kernels.project(reduced.gains, *reduced.data)
+    loss = float(projection.loss)
+    if loss < ROUNDING_LOSS:
+        return 0.0
+    damping = damping_at(loss)
+    if kernels.by_channel:
+        _, decrease = kernels.channel_step(projection, reduced.gains, tf.constant(damping, tf.float32))
+        return float(decrease) / loss
+    stronger = tf.constant(max(damping, PRECONDITIONER_DAMPING), tf.float32)
+    inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
+    return float(kernels.predicted_decrease(projection, reduced.gains, inverse)) / loss

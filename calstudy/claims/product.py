@@ -1,0 +1,139 @@
+"""The claims of a run, or of the members of a collection: the statements of papers, measured on tables of products."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import Cost
+from calstudy.claims.paper import Paper
+from calstudy.experiment.model import Experiment
+from calstudy.products import agreement, spectra
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    from calstudy.claims.evaluation import Evaluation
+
+TABLES = ("spectra", "agreement")
+
+
+def _facts(experiment: Experiment) -> Experiment:
+    """Return the experiment without what no statement reads, so that it does not decide the key of the claims."""
+    return experiment.reset("description", "sweep", "scales", "outputs")
+
+
+def _inputs(graph: Graph) -> dict[str, Task]:
+    inputs = {"spectra": spectra.spectra(graph), "agreement": agreement.agreement(graph)}
+    return {name: task for name, task in inputs.items() if task is not None}
+
+
+def claims(graph: Graph, notes: Sequence[str]) -> Task | None:
+    """Return the task that evaluates the statements of an experiment's papers on it alone; None without papers.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    notes
+        Its stand-ins.
+    """
+    experiment = graph.experiment
+    if not experiment.papers:
+        return None
+    settings = {"papers": list(experiment.papers), "title": experiment.name, "notes": list(notes)}
+    return Task(EVALUATE, "claims", {**settings, "experiments": {"": _facts(experiment)}}, _inputs_of({"": graph}))
+
+
+def combined_claims(
+    title: str, graphs: Mapping[str, Graph], papers: Sequence[Paper], roles: Mapping[str, str], notes: Sequence[str]
+) -> Task | None:
+    """Return the task that evaluates the statements of papers on several runs; None without papers.
+
+    Parameters
+    ----------
+    title
+        Name of the collection.
+    graphs
+        Of the members, by name.
+    papers
+        Whose statements.
+    roles
+        The member that plays each role.
+    notes
+        Stand-ins of all members.
+    """
+    playing = {name: graphs[name] for name in roles.values()}
+    if not papers:
+        return None
+    settings = {
+        "papers": list(papers),
+        "title": title,
+        "notes": list(notes),
+        "roles": dict(roles),
+        "experiments": {name: _facts(graph.experiment) for name, graph in playing.items()},
+    }
+    return Task(EVALUATE, "claims of all", settings, _inputs_of(playing))
+
+
+def _inputs_of(graphs: Mapping[str, Graph]) -> dict[str, Task]:
+    return {f"{table}:{name}": task for name, graph in graphs.items() for table, task in _inputs(graph).items()}
+
+
+def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Task | None:
+    """Return the task that evaluates the statements of papers on the run times of a study; None without papers.
+
+    Parameters
+    ----------
+    title
+        Name of the study.
+    papers
+        Whose statements.
+    run_times
+        The task of the table of measurements.
+    """
+    if not papers:
+        return None
+    return Task(EVALUATE_RUN_TIMES, "claims", {"papers": list(papers), "title": title}, {"runtime": run_times})
+
+
+def evaluate(job: Job) -> Mapping[str, Any]:
+    """Write claims.json and claims.md of one run, or of the members of a collection in the roles that they play."""
+    from calstudy.claims.evaluation import evaluate_members, evaluate_run
+    from calstudy.claims.results import RunResults
+
+    results = {
+        name: RunResults(
+            experiment, tuple(job.inputs[f"{table}:{name}"] for table in TABLES if f"{table}:{name}" in job.inputs)
+        )
+        for name, experiment in job.settings["experiments"].items()
+    }
+    papers = job.settings["papers"]
+    if "roles" in job.settings:
+        return _write(
+            job, evaluate_members(papers, {role: results[name] for role, name in job.settings["roles"].items()})
+        )
+    return _write(job, evaluate_run(papers, results[""]))
+
+
+def evaluate_run_times(job: Job) -> Mapping[str, Any]:
+    """Write claims.json and claims.md of a run-time study."""
+    from calstudy.claims import evaluation
+    from calstudy.claims.run_times import RunTimes
+
+    times = RunTimes.of(job.settings["title"], job.inputs["runtime"])
+    return _write(job, evaluation.evaluate_run_times(job.settings["papers"], times))
+
+
+def _write(job: Job, found: Evaluation) -> dict[str, Any]:
+    from calstudy.verdicts.tables import tally, write_claims
+
+    write_claims(found.verdicts, job.output, job.settings["title"], job.settings.get("notes", ()), found.without_role)
+    failed = [claim.name for claim in found.verdicts if claim.verdict == "FAIL"]
+    return {"verdicts": tally(found.verdicts), "failed": failed, "without_role": list(found.without_role)}
+
+
+EVALUATE = Stage(name="claims", version=5, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
+EVALUATE_RUN_TIMES = Stage(
+    name="runtime-claims", version=3, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
+)

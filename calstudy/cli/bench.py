@@ -1,0 +1,129 @@
+"""``calstudy bench``: what the parts cost, measured here."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from calstudy.base.errors import InputError
+from calstudy.verdicts.tables import Table, require_writable
+
+bench_app = typer.Typer(help="Measure what the parts cost on this machine.", no_args_is_help=True)
+
+Output = Annotated[Path | None, typer.Option(help="Also write the table here, as .csv or .md.")]
+
+
+@bench_app.callback()
+def _group() -> None:
+    """Keep `simulate` a subcommand, even while it is the only one."""
+
+
+@bench_app.command()
+def simulate(
+    sources: Annotated[int, typer.Option(min=200, help="Sources of the whole sky, brightest first.")] = 283_000,
+    antennas: Annotated[int, typer.Option(min=2, max=36, help="Tiles of the minimally redundant array.")] = 36,
+    channels: Annotated[int, typer.Option(min=1, max=64, help="Channels, spread over 30.72 MHz.")] = 2,
+    times: Annotated[int, typer.Option(min=1, max=16, help="Integrations, spread over 112 s.")] = 1,
+    engines: Annotated[str, typer.Option(help="Names, separated by commas.")] = "dense,matvis,fftvis,pyuvsim",
+    output: Output = None,
+) -> None:
+    """Simulate the same visibilities with every engine: processor time, error against pyuvsim, memory."""
+    from calstudy.bench.engines import Work, time_engines
+
+    if output is not None:
+        require_writable(output)
+    console = Console(highlight=False)
+    work = Work(sources=sources, antennas=antennas, channels=channels, times=times)
+    with console.status("") as status:
+        timings = time_engines(work, engines.split(","), lambda name: status.update(f"running {name}"))
+    headings = ("engine", "CPU s per slot", "pyuvsim / it", "error / rms", "peak memory")
+    rows = [
+        (
+            f"{timing.engine}, {timing.precision}",
+            f"{timing.seconds:.3g}",
+            f"{timing.ratio:.3g}",
+            f"{timing.error:.1e}",
+            f"{timing.memory / 1e9:.2f} GB",
+        )
+        for timing in timings
+    ]
+    title = f"{sources} sources, {antennas} antennas, {work.slots} slots (time x channel), one core"
+    _publish(Table(headings, rows, title), console, output)
+
+
+@bench_app.command()
+def calibrate(
+    antennas: Annotated[int, typer.Option(min=3)] = 36,
+    channels: Annotated[int, typer.Option(min=64)] = 384,
+    integrations: Annotated[int, typer.Option(min=1, help="Solved one from the other.")] = 56,
+    adamax_steps: Annotated[
+        int, typer.Option(min=0, help="Steps the paper's Adamax is given to come within 0.2 % of the minimum.")
+    ] = 20_000,
+    device: Annotated[str, typer.Option(help="cpu or gpu.")] = "cpu",
+    threads: Annotated[int, typer.Option(min=1, help="Processor cores to use.")] = 1,
+    output: Annotated[Path | None, typer.Option(help="Also write the table: a name ending in .md or .csv.")] = None,
+) -> None:
+    """Time steps and solves of the calibrator against the paper's solver, on a synthetic problem."""
+    from calstudy.base.quiet import load_tensorflow
+
+    if output is not None:
+        require_writable(output)
+    load_tensorflow(threads)
+    from calstudy.bench.calibration import HEADINGS, time_calibrator
+    from calstudy.bench.calibration_case import Case
+
+    case = Case(antennas=antennas, channels=channels)
+    rows = time_calibrator(case, integrations, adamax_steps, device)
+    _publish(Table(HEADINGS, rows, "calibrator"), Console(highlight=False), output)
+
+
+@bench_app.command()
+def memory(
+    antennas: Annotated[str, typer.Option(help="Sizes, separated by commas.")] = "36,128",
+    channels: Annotated[int, typer.Option(min=64)] = 384,
+    max_memory: Annotated[str, typer.Option(metavar="SIZE", help="What one solve may take.")] = "16 GB",
+    max_steps: Annotated[int, typer.Option(min=1, help="Steps of the default solver at most.")] = 100,
+    output: Output = None,
+) -> None:
+    """Solve one integration of growing arrays, each in a process of its own: planned and measured memory, time."""
+    from calstudy.base.resources import parse_memory
+    from calstudy.bench.solve_memory import HEADINGS, measure_solve
+
+    if output is not None:
+        require_writable(output)
+    budget, sizes = parse_memory(max_memory), _sizes(antennas)
+    console, rows = Console(highlight=False), []
+    with console.status("") as status:
+        for size in sizes:
+            status.update(f"{size} antennas")
+            found = measure_solve(size, channels, budget, max_steps)
+            rows.append(
+                (
+                    f"{found.antennas}",
+                    f"{found.baselines}",
+                    f"{found.models_at_once}",
+                    f"{found.planned / 1e9:.1f} GB",
+                    f"{found.measured / 1e9:.1f} GB",
+                    f"{found.cpu_seconds:.0f}",
+                    f"{found.n_steps}, {found.status}",
+                )
+            )
+    _publish(Table(HEADINGS, rows, f"one cold solve, {channels} channels, one core"), console, output)
+
+
+def _publish(table: Table, console: Console, output: Path | None) -> None:
+    """Print a table, and write it to a file if one is wanted."""
+    table.show(console)
+    if output is not None:
+        table.write(output)
+
+
+def _sizes(text: str) -> list[int]:
+    """Return the numbers of antennas in a text such as ``36,128``; raises InputError for anything else."""
+    if not re.fullmatch(r"\d+(,\d+)*", text) or min(map(int, text.split(","))) < 3:
+        raise InputError(f"--antennas {text}: write whole numbers of at least 3, separated by commas, such as 36,128")
+    return [int(part) for part in text.split(",")]

@@ -1,0 +1,188 @@
+"""The command line: ``calstudy run | plan | calibrate | claims | report | regress | validate | data``.
+
+Only light modules are imported here, so that ``calstudy --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from calstudy import __version__
+from calstudy.base import ranks
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.cli.bench import bench_app
+from calstudy.cli.calibrate import calibrate
+from calstudy.cli.check import check_app
+from calstudy.cli.regress import regress
+from calstudy.cli.validate import validate
+
+app = typer.Typer(
+    help="Simulation and validation studies of 21 cm interferometer calibration.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+data_app = typer.Typer(help="Files that are downloaded once.", no_args_is_help=True)
+app.add_typer(data_app, name="data")
+app.command()(calibrate)
+app.command()(regress)
+# Step -1 is an argument, not an option.
+app.command(context_settings={"ignore_unknown_options": True})(validate)
+app.add_typer(bench_app, name="bench")
+app.add_typer(check_app, name="check")
+
+EXIT_INPUT = 2
+
+File = Annotated[
+    Path,
+    typer.Argument(
+        help="The file (YAML) of an experiment or a collection, or the name of a published one, such as quickstart.",
+        show_default=False,
+    ),
+]
+Scale = Annotated[str | None, typer.Option(help="Apply a named set of overrides of the file, such as 'small'.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set calibration.basis.buffer='200 ns'."),
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
+MaxMemory = Annotated[
+    str | None,
+    typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
+]
+Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster instead.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"calstudy {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show it.")] = False,
+) -> None:
+    del version
+
+
+@app.command()
+def run(
+    file: File,
+    scale: Scale = None,
+    overrides: Set = None,
+    workers: Workers = None,
+    max_memory: MaxMemory = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Run an experiment or a collection: simulate, corrupt, calibrate, measure power spectra, draw figures.
+
+    Products that are in the store already are not made again; an interrupted run is resumed by the same command.
+    """
+    from calstudy.studies.load import load_study
+    from calstudy.studies.show import show_run
+    from calstudy.studies.study import Budget, run_study
+
+    console = Console(soft_wrap=True, highlight=False)
+    study = load_study(file, scale, overrides or ())
+    show_run(run_study(study, Budget(workers, max_memory, scheduler), console), console)
+
+
+@app.command()
+def plan(
+    file: File,
+    scale: Scale = None,
+    overrides: Set = None,
+    workers: Workers = None,
+    max_memory: MaxMemory = None,
+) -> None:
+    """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
+    from calstudy.studies.load import load_study
+    from calstudy.studies.show import show_plan
+    from calstudy.studies.study import Budget
+
+    show_plan(load_study(file, scale, overrides or ()), Budget(workers, max_memory), Console(highlight=False))
+
+
+@app.command()
+def claims(
+    folder: Annotated[Path, typer.Argument(help="The folder of a finished run or collection.", show_default=False)],
+    paper: Annotated[
+        list[str] | None, typer.Option(help="Name of a paper, or a file.py, in place of those that the run names.")
+    ] = None,
+) -> None:
+    """Compare a finished run with published statements: the measured number, its threshold, PASS or FAIL.
+
+    Writes claims.json and claims.md into the folder.
+    """
+    from calstudy.claims.folders import evaluate_folder
+    from calstudy.verdicts.tables import show_verdicts
+
+    console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or ())
+    if evaluated.claims:
+        show_verdicts(evaluated.claims, evaluated.title, console)
+    for sentence in evaluated.without_role:
+        console.print(sentence, markup=False)
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="The folder of a finished run.", show_default=False)],
+) -> None:
+    """Write the report of a finished run, one self-contained page, report.html, into its folder."""
+    from calstudy.report.page import write_report
+
+    typer.echo(f"{write_report(folder)}")
+
+
+@app.command()
+def fields(
+    file: Annotated[Path | None, typer.Argument(help="A Python file: print the settings of what it defines.")] = None,
+) -> None:
+    """Print the reference of all fields of an experiment file (Markdown)."""
+    from calstudy.studies.reference import field_reference, plugin_reference
+
+    typer.echo(field_reference() if file is None else plugin_reference(file), nl=False)
+
+
+@data_app.command()
+def fetch(
+    name: Annotated[str, typer.Argument(help="What to fetch: gleam or beam.")],
+    directory: Annotated[Path | None, typer.Option(help="Where to put it; by default the user's data folder.")] = None,
+) -> None:
+    """Download the GLEAM catalogue or the MWA's beam, check it, and keep it for later runs."""
+    if name not in ("gleam", "beam"):
+        raise InputError(f"calstudy data fetch {name}: nothing that can be fetched (allowed: gleam, beam)")
+    from calstudy.instrument.beam_file import fetch_beam
+    from calstudy.sky.gleam import fetch_gleam
+
+    path = fetch_gleam(directory) if name == "gleam" else fetch_beam(directory)
+    typer.echo(f"{path}")
+
+
+def main() -> None:
+    """Run the command line; a user's mistake ends with sentences on standard error and exit status 2."""
+    logging.getLogger().addHandler(logging.NullHandler())
+    if ranks.is_helper():
+        ranks.serve()
+        return
+    try:
+        with ranks.leading():
+            app()
+    except ExperimentError as error:
+        for sentence in error.faults:
+            typer.echo(f"calstudy: {sentence}", err=True)
+        sys.exit(EXIT_INPUT)
+    except InputError as error:
+        typer.echo(f"calstudy: {error}", err=True)
+        sys.exit(EXIT_INPUT)
+    except KeyboardInterrupt:
+        typer.echo("calstudy: interrupted; finished products are kept, the same command resumes", err=True)
+        sys.exit(130)

@@ -1,1 +1,0 @@
-"""Commands of the command line that have options of their own, one module each."""

@@ -1,4 +1,0 @@
-"""Constants of nature that light modules need too."""
-
-HYDROGEN_LINE = 1420405751.768
-"""Rest frequency of the 21 cm line, in Hz."""

@@ -1,0 +1,167 @@
+"""What an effect on the data is: it draws its truth, saved as a product of its own, and applies it to visibilities."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin, Registry, guarded
+
+if TYPE_CHECKING:
+    from calstudy.base.observation import Observation
+
+Truth = Mapping[str, np.ndarray]
+"""Arrays of numbers, by name."""
+
+
+class Effect(Plugin, ABC):
+    """Something that happens to the data between the sky and the calibration.
+
+    Fields of a subclass are its settings. One that draws random numbers declares ``seed: int``.
+
+    Notes
+    -----
+    The `Observation` that `draw` and `apply` are given is without data: antennas, baselines, channels, times and
+    polarizations.
+    """
+
+    registry: ClassVar[Registry[Effect]] = Registry(
+        "effect", "calstudy.corrupt.effects", "calstudy.corrupt.interface:Effect"
+    )
+
+    kind: str = Field("", description="Name of an effect, or a file.py.")
+
+    def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
+        """Return what the effect draws or reads for this observation, as arrays of numbers by name; by default nothing.
+
+        Parameters
+        ----------
+        observation
+            See the notes of the class.
+        random
+            ``numpy.random.default_rng(seed)``.
+        """
+        del observation, random
+        return {}
+
+    @abstractmethod
+    def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
+        """Return the visibilities after the effect, complex, of the same shape.
+
+        Parameters
+        ----------
+        visibilities
+            Before it, complex128 in Jy, (Ntimes, Nbls, Nfreqs, Npols). May be changed in place.
+        observation
+            See the notes of the class.
+        truth
+            From `draw`.
+        """
+
+
+class GainEffect(Effect):
+    """Gains of the antennas: V_ab becomes g_a g_b* V_ab (paper Eq. GENERALMODEL).
+
+    The product of all gain effects is the true gains, with which a calibration is compared.
+    """
+
+    @abstractmethod
+    def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
+        """Return the gains, complex, shape (Nants, Nfreqs, 1, Npols); they must be constant in time.
+
+        Antennas are in the order of ``observation.numbers``, to which ``observation.antennas`` of the baselines refer.
+        """
+
+    def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
+        """Return the gains, complex128, by the name "gains".
+
+        Raises
+        ------
+        InputError
+            If they are not an array of the right shape, vary in time, or are zero or not finite somewhere.
+        """
+        gains = np.asarray(self.gains(observation, random))
+        sizes = observation.n_antennas, observation.n_channels, 1, observation.n_polarizations
+        # Everything that reads true gains (figures, agreement, convergence) takes them as constant in time.
+        if gains.shape == (*sizes[:2], observation.n_times, sizes[3]) != sizes:
+            raise InputError(f"effect {self.label!r}: its gains vary in time, which is not supported yet")
+        if gains.shape != sizes or gains.dtype.kind not in "fc":
+            raise InputError(
+                f"effect {self.label!r}: its gains are {gains.dtype} of shape {gains.shape}, expected complex of shape "
+                f"{sizes} (antennas, channels, times, polarizations)"
+            )
+        if not np.isfinite(gains).all() or (gains == 0).any():
+            raise InputError(f"effect {self.label!r}: its gains are zero or not finite somewhere")
+        return {"gains": gains.astype(np.complex128)}
+
+    def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
+        """Return g_a(nu) g_b*(nu) V_ab(nu, t), shape (Ntimes, Nbls, Nfreqs, Npols)."""
+        first, second = observation.antennas.T
+        gains = np.moveaxis(truth["gains"], 2, 0)
+        visibilities *= gains[:, first] * gains[:, second].conj()
+        return visibilities
+
+
+def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray]:
+    """Return the truth of an effect for an observation, checked; the same settings and observation give the same bits.
+
+    Raises
+    ------
+    InputError
+        If the effect refuses, fails, or returns anything but arrays of numbers by name.
+    """
+    random = np.random.default_rng(getattr(effect, "seed", 0))
+    with guarded(effect):
+        truth = effect.draw(observation, random)
+    if not isinstance(truth, Mapping):
+        raise InputError(f"effect {effect.label!r}: draw returned {_described(truth)}, expected arrays by name")
+    arrays = {str(name): np.asarray(value) for name, value in truth.items()}
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biufc" or "/" in name:
+            raise InputError(
+                f"effect {effect.label!r}: {name!r} of its truth is {_described(array)}; expected arrays of numbers "
+                "by names without '/'"
+            )
+    return arrays
+
+
+def apply_effect(effect: Effect, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
+    """Return visibilities after an effect, complex128, (Ntimes, Nbls, Nfreqs, Npols), checked.
+
+    Parameters
+    ----------
+    effect
+        Which.
+    visibilities
+        Before it, complex128 in Jy, (Ntimes, Nbls, Nfreqs, Npols). May be changed in place.
+    observation
+        See the notes of `Effect`.
+    truth
+        What the effect drew.
+
+    Raises
+    ------
+    InputError
+        If the effect refuses, fails, or returns visibilities of another shape or that are not finite.
+    """
+    shape = visibilities.shape
+    with guarded(effect):
+        changed = effect.apply(visibilities, observation, truth)
+    if not isinstance(changed, np.ndarray) or changed.shape != shape or changed.dtype.kind not in "fc":
+        raise InputError(
+            f"effect {effect.label!r}: apply returned {_described(changed)}, expected complex of shape {shape}"
+        )
+    if not np.isfinite(changed).all():
+        raise InputError(f"effect {effect.label!r}: apply returned visibilities that are not finite")
+    return changed.astype(np.complex128, copy=False)
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"an array of {value.dtype} of shape {value.shape}"
+    return f"a {type(value).__name__}"

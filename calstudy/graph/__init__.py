@@ -1,1 +1,0 @@
-"""What an experiment makes: products, what each is made from, and what each costs."""

@@ -1,0 +1,1 @@
+"""The beams of antennas, one in each module."""

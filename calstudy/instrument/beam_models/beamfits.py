@@ -1,0 +1,31 @@
+"""A beam from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from calstudy.instrument.interface import STAND_IN, Beam, BeamModel
+from calstudy.instrument.settings import Channels
+
+
+class FileBeam(BeamModel):
+    """An E-field beam from a beamfits file, on a grid of azimuth and zenith angle."""
+
+    path: Path = Field(strict=False)
+    interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = "chebyshev"
+
+    @property
+    def smooth(self) -> bool:
+        """Whether it is interpolated by a smooth fit."""
+        return self.interpolation == "chebyshev"
+
+    def make(self, channels: Channels) -> Beam:
+        """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
+        from calstudy.instrument.beams import GriddedBeam
+        from calstudy.instrument.tabulated import TabulatedBeam, read_beamfits
+
+        table = TabulatedBeam(read_beamfits(self.path), channels.band, self.interpolation)
+        return GriddedBeam(table, self.path.name, STAND_IN.format(what=f"the file {self.path.name}"))

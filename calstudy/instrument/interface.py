@@ -1,0 +1,78 @@
+"""The interface of antenna beams."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar, Protocol, cast
+
+from pydantic import Field
+
+from calstudy.base.plugins import Plugin
+from calstudy.instrument.settings import BEAMS, Channels
+
+if TYPE_CHECKING:
+    import numpy as np
+    from pyuvdata import UVBeam
+    from pyuvdata.analytic_beam import AnalyticBeam
+
+STAND_IN = "beam: {what}, not the MWA full embedded element of Sokolowski et al. (2017)"
+
+
+class Beam(Protocol):
+    """The primary beam of an antenna.
+
+    Attributes
+    ----------
+    name
+        Name of the beam.
+    stand_in
+        A note if it is not the beam of the paper, otherwise None.
+    """
+
+    name: str
+    stand_in: str | None
+
+    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
+        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)), feeds x (east-west) and y (north-south)."""
+
+    def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return Ω_p = ∫A dΩ and Ω_pp = ∫A² dΩ above the horizon, in sr, each of shape (Nfreqs,).
+
+        `frequencies` are in Hz; `polarization` is "xx" or "yy".
+        """
+
+
+def model_of(section: Plugin) -> BeamModel:
+    """Return what a field of a beam holds; its registry lets no other plug-ins in."""
+    return cast(BeamModel, section)
+
+
+class BeamModel(Plugin, ABC):
+    """The settings of a beam, and how it is made of them. Fields of a subclass are its settings.
+
+    Its module is imported when an experiment file is read: import libraries that take long inside `make`.
+    """
+
+    registry: ClassVar = BEAMS
+
+    kind: str = Field("", description="Name of a beam, or a file.py.")
+
+    @property
+    def smooth(self) -> bool:
+        """Whether the beam is smooth in frequency, so that simulations may be interpolated between nodes."""
+        return True
+
+    @abstractmethod
+    def make(self, channels: Channels) -> Beam:
+        """Return the beam.
+
+        Parameters
+        ----------
+        channels
+            To be observed. A beam need not be known far outside their band.
+
+        Raises
+        ------
+        InputError
+            If a beam file is missing, cannot be read, or does not cover the channels.
+        """

@@ -1,0 +1,137 @@
+"""How large the data of an instrument are, from its settings alone: for plans, before anything is made."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calstudy.base.observation import Frame
+from calstudy.instrument.settings import (
+    Channels,
+    CsvLayout,
+    GolombLayout,
+    HexLayout,
+    InstrumentSettings,
+    Layout,
+    LinearLayout,
+    RectangularLayout,
+)
+
+MWA_LENGTHS = {
+    "mwa-compact-minredundant": (176.2, 54.1),
+    "mwa-compact-hex-east": (84.1, 41.9),
+    "mwa-compact-hex-south": (84.1, 41.9),
+    "mwa-compact": (740.8, 154.9),
+}
+"""Longest and mean baseline, m."""
+MEAN_OVER_LONGEST = 0.45
+# Of an optimal ruler, over the square of its marks.
+GOLOMB_LENGTH = 0.55
+
+
+@dataclass(frozen=True)
+class Size:
+    """The dimensions of a data set, and of its array.
+
+    Attributes
+    ----------
+    antennas, times, polarizations
+        Their numbers.
+    channels
+        Centre of the first, width (Hz) and number.
+    longest, mean
+        Longest and mean baseline, m, estimated.
+    """
+
+    antennas: int
+    times: int
+    channels: Channels
+    polarizations: int
+    longest: float
+    mean: float
+
+    @classmethod
+    def of(cls, instrument: InstrumentSettings) -> Size:
+        """Return the size of an instrument's data."""
+        longest, mean = baseline_lengths(instrument.layout)
+        return cls(
+            antennas=antenna_count(instrument.layout),
+            times=instrument.times.count,
+            channels=instrument.channels,
+            polarizations=len(instrument.polarizations),
+            longest=longest,
+            mean=mean,
+        )
+
+    @classmethod
+    def of_frame(cls, frame: Frame) -> Size:
+        """Return the size of data with these antennas, baselines and channels."""
+        spacings = np.abs(np.diff(frame.frequencies))
+        channels = {"first": frame.frequencies.min(), "width": np.median(spacings) if spacings.size else 0.0}
+        lengths = frame.lengths[~frame.autos]
+        return cls(
+            antennas=frame.n_antennas,
+            times=frame.n_times,
+            # Measured data may have fewer channels than a simulation may.
+            channels=Channels.model_construct(**channels, count=frame.n_channels),
+            polarizations=frame.n_polarizations,
+            longest=float(lengths.max(initial=0.0)),
+            mean=float(lengths.mean()) if lengths.size else 0.0,
+        )
+
+    @property
+    def baselines(self) -> int:
+        """Number of baselines without autocorrelations."""
+        return self.antennas * (self.antennas - 1) // 2
+
+    @property
+    def samples(self) -> int:
+        """Number of visibilities."""
+        return self.baselines * self.times * self.channels.count * self.polarizations
+
+
+def antenna_count(layout: Layout) -> int:
+    """Return how many antennas a layout will have, without making it where that is possible."""
+    if isinstance(layout, HexLayout):
+        return 3 * layout.side * (layout.side - 1) + 1
+    if isinstance(layout, CsvLayout):
+        lines = layout.path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return max(sum(1 for line in lines if line.strip() and not line.startswith("#")) - 1, 2)
+    whole = 128 if layout.kind == "mwa-compact" else 36
+    return layout.count or whole
+
+
+def baseline_lengths(layout: Layout) -> tuple[float, float]:
+    """Return the longest and the mean baseline of a layout, m, about, without making it."""
+    if isinstance(layout, HexLayout):
+        longest = 2 * (layout.side - 1) * layout.spacing
+    elif isinstance(layout, LinearLayout):
+        longest = (layout.count - 1) * layout.spacing
+    elif isinstance(layout, RectangularLayout):
+        longest = layout.max_baseline
+    elif isinstance(layout, GolombLayout):
+        longest = GOLOMB_LENGTH * layout.count**2 * layout.spacing
+    elif isinstance(layout, CsvLayout):
+        longest = _extent(layout.path)
+    else:
+        return MWA_LENGTHS[layout.kind]
+    return longest, MEAN_OVER_LONGEST * longest
+
+
+def _extent(path: Path) -> float:
+    """Return the diagonal of the box that holds the antennas of a layout file, m; zero if it is no layout.
+
+    That it is one is checked when it is read to make the layout.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as table:
+            rows = list(csv.DictReader(table))
+        axes = [[float(row[name]) for row in rows] for name in ("east_m", "north_m")]
+        extent = float(sum((max(axis) - min(axis)) ** 2 for axis in axes) ** 0.5)
+    except (csv.Error, KeyError, TypeError, ValueError, OverflowError):
+        return 0.0
+    return extent if math.isfinite(extent) else 0.0

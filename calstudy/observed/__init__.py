@@ -1,0 +1,1 @@
+"""Calibration of measured data: reading, selection, output."""

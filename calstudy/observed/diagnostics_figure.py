@@ -1,0 +1,160 @@
+"""What one looks at after a calibration: data, model and residual in delay, the gains, and how the solves converged."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy.signal.windows import blackmanharris
+
+from calstudy.plotting import style
+from calstudy.power.delay import horizon_delay
+
+NOTE_CHARACTERS = 150
+MAX_ANTENNAS = 8
+"""Gains are drawn of at most so many antennas; more would be a tangle."""
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """The arrays of the figure, for one polarization.
+
+    Attributes
+    ----------
+    polarization
+        Its name.
+    unit
+        Of the visibilities.
+    delay
+        s, ascending, (Ndelays,).
+    lengths
+        Baseline lengths in m, ascending, (Nbls,).
+    data, model, residual
+        Delay transform after a Blackman-Harris taper, rms over integrations, (Nbls, Ndelays); flagged samples are zero.
+    frequency
+        Hz, (Nfreqs,).
+    antennas
+        Names of the antennas that are drawn, (Nshown,).
+    gains
+        Complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs).
+    losses
+        Loss after each step over the first loss of its own solve, one array for each solve.
+    converged
+        Whether each solve did, (Nsolves,).
+    """
+
+    polarization: str
+    unit: str
+    delay: np.ndarray
+    lengths: np.ndarray
+    data: np.ndarray
+    model: np.ndarray
+    residual: np.ndarray
+    frequency: np.ndarray
+    antennas: np.ndarray
+    gains: np.ndarray
+    losses: tuple[np.ndarray, ...]
+    converged: np.ndarray
+
+
+def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.ndarray:
+    """Return the tapered delay transform's rms over integrations.
+
+    Parameters
+    ----------
+    cube
+        Visibilities, zero where flagged, (Ntimes, Nbls, Nfreqs).
+    positions
+        Channel numbers on an even grid, (Nfreqs,).
+    n_channels
+        Length of the grid.
+
+    Returns
+    -------
+    ndarray, (Nbls, n_channels), normalized so that a tone at a delay of the transform keeps its amplitude.
+    """
+    taper = blackmanharris(n_channels)
+    power = np.zeros((cube.shape[1], n_channels))
+    for integration in cube:
+        spectra = np.zeros((cube.shape[1], n_channels), complex)
+        spectra[:, positions] = integration
+        power += np.abs(np.fft.fftshift(np.fft.ifft(spectra * taper, axis=-1), axes=-1)) ** 2
+    return np.sqrt(power / len(cube)) * n_channels / taper.sum()
+
+
+@style.journal_style()
+def draw_diagnostics(found: Diagnostics, notes: Sequence[str] = ()) -> Figure:
+    """Draw three rows: delay spectra by baseline length, their mean and convergence, and the gains.
+
+    The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
+    samples count as zero, which spreads over all delays.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 6.6)
+    grid = figure.subplot_mosaic([list("dddmmmrrr"), list("pppppllll"), list("aaaaaffff")])
+    _draw_images(figure, [grid[key] for key in "dmr"], found)
+    _draw_profile(grid["p"], found)
+    _draw_convergence(grid["l"], found)
+    for key, values, label in (("a", np.abs(found.gains), r"$|g|$"), ("f", np.angle(found.gains), r"arg $g$ (rad)")):
+        for name, row in zip(found.antennas, values, strict=True):
+            grid[key].plot(found.frequency / 1e6, row, linewidth=0.7, label=str(name))
+        grid[key].set(xlabel=style.FREQUENCY, ylabel=label)
+        grid[key].margins(x=0)
+    grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, title="antenna", title_fontsize=style.SMALL_SIZE)
+    if notes:
+        lines = [line for note in notes for line in textwrap.wrap(note, width=NOTE_CHARACTERS)]
+        figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=style.NOTE_SIZE, color=style.GREY)
+    return figure
+
+
+def _draw_images(figure: Figure, panels: list[Axes], found: Diagnostics) -> None:
+    peak = max(found.data.max(), np.finfo(float).tiny)
+    edges = np.linspace(found.delay[0], found.delay[-1], found.delay.size) * 1e9
+    rows = np.arange(found.lengths.size)
+    meshes = []
+    for axes, values, title in zip(
+        panels, (found.data, found.model, found.residual), ("data", "model", "residual"), strict=True
+    ):
+        level = 20 * np.log10(np.maximum(values / peak, 1e-9))
+        meshes.append(
+            axes.pcolormesh(edges, rows, level, vmin=-80, vmax=0, shading="nearest", cmap="inferno", rasterized=True)
+        )
+        for sign in (-1, 1):
+            horizon = sign * horizon_delay(found.lengths) * 1e9
+            axes.plot(horizon, rows, color="white", linestyle="--", linewidth=0.7)
+        axes.set(title=f"{title}, {found.polarization}", xlabel=style.DELAY, xlim=(edges[0], edges[-1]))
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    panels[0].set_ylabel("baseline, by length")
+    figure.colorbar(meshes[-1], ax=panels, label="dB of the peak", pad=0.01, aspect=15)
+
+
+def _draw_profile(axes: Axes, found: Diagnostics) -> None:
+    for values, colour, label in (
+        (found.data, style.BLACK, "data"),
+        (found.model, style.BLUE, "model"),
+        (found.residual, style.ORANGE, "residual"),
+    ):
+        mean = np.sqrt(np.mean(values**2, axis=0))
+        axes.plot(found.delay * 1e9, np.where(mean > 0, mean, np.nan), color=colour, label=label)
+    for sign in (-1, 1):
+        longest = sign * horizon_delay(float(found.lengths.max())) * 1e9
+        axes.axvline(longest, color=style.GREY, linestyle="--", linewidth=0.7)
+    visible = found.data.max() > 0
+    axes.set(xlabel=style.DELAY, ylabel=f"rms over baselines ({found.unit})", yscale="log" if visible else "linear")
+    axes.margins(x=0)
+    axes.legend(loc="upper right")
+
+
+def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
+    for losses, converged in zip(found.losses, found.converged, strict=True):
+        positive = np.where(losses > 0, losses, np.nan)
+        axes.plot(positive, color=style.BLUE if converged else style.RED, linewidth=0.7, marker=".", markersize=2)
+    good, count = int(np.sum(found.converged)), len(found.converged)
+    visible = any((losses > 0).any() for losses in found.losses)
+    axes.set(xlabel="step", ylabel="loss / first loss", yscale="log" if visible else "linear")
+    axes.set_title(f"{good} of {count} solves converged (blue)")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))

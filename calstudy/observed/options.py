@@ -1,0 +1,76 @@
+"""The calibrator and its settings, from a file and from what was typed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.calibrate.interface import CALIBRATORS, Calibrator
+from calstudy.experiment.files import input_files, override, parse_override, read_mapping
+from calstudy.experiment.messages import sentences
+
+DEFAULT = "calamity"
+
+
+def read_calibrator(
+    path: Path | None, changes: Mapping[str, Any], defaults: Mapping[str, Any], overrides: Sequence[str]
+) -> Calibrator:
+    """Return the calibrator of a YAML file, or the default one, with changes; a value of None changes nothing.
+
+    Parameters
+    ----------
+    path
+        A file whose content is that of a `calibration` section, or that has one.
+    changes
+        Dotted path to value, applied first.
+    defaults
+        Likewise, where the calibrator has such a field: what is not asked for, and another calibrator need not know.
+    overrides
+        ``path=value`` texts, applied last. Relative paths start at the working directory.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, there is no such calibrator, or a field holds what is not allowed.
+    """
+    typed = [parse_override(text) for text in overrides]
+    asked = [(field, value) for field, value in changes.items() if value is not None]
+    try:
+        found, _ = CALIBRATORS.class_of(_changed(path, [*asked, *typed]), DEFAULT, None)
+    except InputError as error:
+        raise InputError(f"calibration.calibrator: {error}") from None
+    assumed = [(key, value) for key, value in defaults.items() if value is not None and key in found.model_fields]
+    content = _changed(path, [*asked, *assumed, *typed])
+    try:
+        calibrator = CALIBRATORS.make(content, DEFAULT)
+    except ValidationError as error:
+        raise ExperimentError([f"calibration.{sentence}" for sentence in sentences(error, found, content)]) from None
+    for field, section, name in input_files(calibrator):
+        if not (file := getattr(section, name)).exists():
+            raise InputError(f"calibration.{field} = {str(file)!r}: no such file")
+    return calibrator
+
+
+def _changed(path: Path | None, changes: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the content of a file with changes."""
+    content = _content(path)
+    for field, value in changes:
+        content = override(content, field, value)
+    return content
+
+
+def _content(path: Path | None) -> dict[str, Any]:
+    """Return the calibration section of a file; the path of a calibrator in it starts at the file."""
+    if path is None:
+        return {}
+    content = dict(read_mapping(path))
+    section = content.get("calibration", content)
+    content = {CALIBRATORS.tag: section} if isinstance(section, str) else dict(section)
+    reference = content.get(CALIBRATORS.tag)
+    if isinstance(reference, str) and ".py" in reference:
+        content[CALIBRATORS.tag] = str(path.parent / Path(reference).expanduser())
+    return content

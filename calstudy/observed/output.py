@@ -1,0 +1,114 @@
+"""Write what a calibration gives, in standard formats, and never over something else unasked."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calstudy import __version__
+from calstudy.base.errors import InputError
+from calstudy.calibrate.records import CalibrationResult
+
+GAINS, CALFITS, MODEL, RESIDUAL = "gains.calh5", "gains.calfits", "model.uvh5", "residual.uvh5"
+SOLUTION, FIGURE, EXPECTED = "solution.json", "diagnostics", "expected-transfer"
+FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
+
+
+def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
+    """Raise InputError if a file that will be written exists and may not be replaced.
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    extras
+        What is written besides the usual: `CALFITS`, `EXPECTED`.
+    overwrite
+        Whether files may be replaced.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--output {folder}: is a file, not a folder")
+    names = [GAINS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES, *([CALFITS] if CALFITS in extras else [])]
+    present = [name for name in names if (folder / name).exists()]
+    if EXPECTED in extras:
+        present += [path.name for path in sorted(folder.glob(f"{EXPECTED}.*.h5"))]
+    if present and not overwrite:
+        raise InputError(f"--output {folder}: holds {', '.join(present)} already; use --overwrite or another folder")
+
+
+def describe(result: CalibrationResult, context: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of solution.json: what was asked, what was changed in the data, and every solve.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    context
+        JSON types: settings, notes and the like.
+    """
+    summary = result.summary()
+    return {
+        "calstudy": __version__,
+        **context,
+        "solves": summary["solves"],
+        "by_status": summary["by_status"],
+        "seconds": summary["seconds"],
+        "records": [record.detail() for record in result.solutions],
+    }
+
+
+def write_result(
+    result: CalibrationResult,
+    description: dict[str, Any],
+    folder: Path,
+    figure: Any,
+    extras: Sequence[str] = (),
+    expected: Mapping[str, Any] | None = None,
+) -> list[Path]:
+    """Write gains, model, residual, solution.json and the diagnostic figure; all of them or none.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    description
+        From `describe`.
+    folder
+        Made if it does not exist; files of the same names are replaced.
+    figure
+        A matplotlib figure and its arrays.
+    extras
+        `CALFITS` if the gains are to be written as calfits as well.
+    expected
+        Expected transfer functions, by polarization.
+
+    Returns
+    -------
+    The paths.
+    """
+    from calstudy.plotting.save import save_figure
+    from calstudy.power.tables import save_spectrum
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as temporary:
+        work = Path(temporary)
+        result.gains.write_calh5(str(work / GAINS))
+        if CALFITS in extras:
+            result.gains.write_calfits(str(work / CALFITS))
+        for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
+            uvd.write_uvh5(str(work / name), data_write_dtype=np.dtype(np.complex64))
+        (work / SOLUTION).write_text(json.dumps(description, indent=1, allow_nan=False), encoding="utf-8")
+        for polarization, transfer in (expected or {}).items():
+            save_spectrum(work / f"{EXPECTED}.{polarization}.h5", transfer)
+        picture, arrays = figure
+        save_figure(picture, arrays, work, FIGURE)
+        written = sorted(work.iterdir())
+        for path in written:
+            shutil.move(path, folder / path.name)
+    return [folder / path.name for path in written]

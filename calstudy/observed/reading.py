@@ -1,0 +1,236 @@
+"""Read visibilities of any format and bring them into the shape that calibration needs.
+
+Nothing is invented: samples that the shape needs and the data lack are flagged, and each change is reported in a note.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+from pyuvdata import UVData
+
+from calstudy.base.errors import InputError
+from calstudy.calibrate.standard_formats import PARALLEL_HANDS
+from calstudy.observed.selection import Selection, select
+
+logger = logging.getLogger(__name__)
+
+# With fewer of its samples present, a data set has no common times and baselines worth speaking of.
+MIN_PRESENT = 0.5
+EVERYTHING = Selection()
+
+
+def read_visibilities(paths: Sequence[Path]) -> UVData:
+    """Read one data set from a file or folder, or from several that belong together.
+
+    Raises
+    ------
+    InputError
+        If a path does not exist, pyuvdata cannot read it, or its antennas have no place.
+    """
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+    names = [str(path) for path in paths]
+    try:
+        data = UVData.from_file(names[0] if len(names) == 1 else names)
+    # Readers of eight formats raise whatever their libraries do; a file that cannot be read is the user's to mend.
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError) as error:
+        raise InputError(f"{', '.join(names)}: cannot be read as visibilities ({_first_sentence(error)})") from None
+    if data.data_array is None:
+        raise InputError(f"{', '.join(names)}: holds no visibilities")
+    if not np.isfinite(data.telescope.antenna_positions).all():
+        raise InputError(f"{', '.join(names)}: antenna positions are not finite")
+    return data
+
+
+def _first_sentence(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else 'no reason given'}"
+
+
+def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:
+    """Select, unphase, order and fill a data set; the given one is not changed.
+
+    Parameters
+    ----------
+    data
+        Visibilities as read.
+    selection
+        The part to keep.
+
+    Returns
+    -------
+    data
+        Parallel hands only, drift-scan, every baseline once at every time in time-major order; samples that were
+        missing or not finite are flagged.
+    notes
+        One sentence for each thing that was changed.
+
+    Raises
+    ------
+    InputError
+        If nothing is left, the polarizations are not of feeds, or baselines have hardly any times in common.
+    """
+    notes: list[str] = []
+    data = select(data, replace(selection, times=None)).copy()
+    _keep_parallel_hands(data, notes)
+    if data.flex_spw_polarization_array is not None:
+        raise InputError("data: spectral windows of different polarizations are not supported; convert the file first")
+    _name_feeds(data, notes)
+    if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
+        data.unproject_phase()
+        notes.append("The data were phased to a source; they are calibrated, and written, as a drift scan.")
+    _share_times(data, notes)
+    data.reorder_freqs(channel_order="freq", run_check=False)
+    data.reorder_blts(order="time", minor_order="baseline", run_check=False)
+    data = select(_filled(data, notes), Selection(times=selection.times))
+    bad = ~np.isfinite(data.data_array) & ~data.flag_array
+    if bad.any():
+        data.flag_array |= bad
+        notes.append(f"{bad.sum()} samples are not finite (NaN or infinite) and were flagged.")
+    for note in notes:
+        logger.info(note)
+    return data, notes
+
+
+def _keep_parallel_hands(data: UVData, notes: list[str]) -> None:
+    numbers = np.asarray(data.polarization_array)
+    wanted = np.isin(numbers, list(PARALLEL_HANDS))
+    if not wanted.any():
+        raise InputError(
+            f"data: polarizations {', '.join(data.get_pols())} have no parallel hands of feeds "
+            f"({', '.join(PARALLEL_HANDS.values())}), which have gains"
+        )
+    if not wanted.all():
+        dropped = [name for name, keep in zip(data.get_pols(), wanted, strict=True) if not keep]
+        data.select(polarizations=numbers[wanted], run_check=False)
+        notes.append(f"Polarizations {', '.join(dropped)} are not calibrated.")
+
+
+def _name_feeds(data: UVData, notes: list[str]) -> None:
+    """Gains need to know which feeds they belong to; old files do not say."""
+    if data.telescope.feed_array is None:
+        linear = bool(np.all(data.polarization_array <= -5))
+        data.telescope.set_feeds_from_x_orientation(
+            "east", feeds=["x", "y"] if linear else ["r", "l"], polarization_array=data.polarization_array
+        )
+        notes.append("The file does not tell the orientation of its feeds; x is taken to be east.")
+
+
+def _share_times(data: UVData, notes: list[str]) -> None:
+    """Undo averaging in time that differs between baselines."""
+    integration = np.asarray(data.integration_time)
+    shortest = float(integration.min())
+    if np.allclose(integration, shortest, rtol=0.01):
+        return
+    with redirect_stdout(StringIO()):
+        data.upsample_in_time(shortest * 1.001, blt_order="time", minor_order="baseline")
+    notes.append(
+        f"Baselines were averaged over {shortest:.3g} to {integration.max():.3g} s; all are copied to the shortest."
+    )
+    middle = np.asarray(data.time_array)
+    tolerance = 0.4 * shortest / 86400
+    times = np.unique(middle)
+    starts = np.concatenate([[True], np.diff(times) > tolerance])
+    data.time_array = times[starts][np.cumsum(starts)[np.searchsorted(times, middle)] - 1]
+    data.set_lsts_from_time_array()
+    data.Ntimes = np.unique(data.time_array).size
+
+
+def _filled(data: UVData, notes: list[str]) -> UVData:
+    """Return data with every baseline at every time, missing samples flagged; ordered by time, then baseline."""
+    times, time_index = np.unique(data.time_array, return_inverse=True)
+    baselines, baseline_index = np.unique(data.baseline_array, return_inverse=True)
+    place = time_index * baselines.size + baseline_index
+    total = times.size * baselines.size
+    if np.unique(place).size != data.Nblts:
+        raise InputError("data: some baselines occur twice at the same time")
+    if data.Nblts < MIN_PRESENT * total:
+        raise InputError(
+            f"data: of {baselines.size} baselines at {times.size} times only {100 * data.Nblts / total:.0f} % of the "
+            "samples are present; calibration needs baselines at common times"
+        )
+    if data.Nblts == total:
+        return _reindexed(data, np.argsort(place), np.argsort(place))
+    source = np.full(total, -1)
+    source[place] = np.arange(data.Nblts)
+    missing = source < 0
+    # A missing sample takes what belongs to its time from one sample, and what belongs to its baseline from another.
+    of_time, of_baseline = np.empty(times.size, int), np.empty(baselines.size, int)
+    of_time[time_index], of_baseline[baseline_index] = np.arange(data.Nblts), np.arange(data.Nblts)
+    by_time = np.where(missing, np.repeat(of_time, baselines.size), source)
+    by_baseline = np.where(missing, np.tile(of_baseline, times.size), source)
+    result = _reindexed(data, by_time, by_baseline)
+    result.data_array[missing] = 0
+    result.flag_array[missing] = True
+    result.nsample_array[missing] = 0
+    notes.append(f"{missing.sum()} of {total} samples of a baseline at a time were missing and are flagged.")
+    return result
+
+
+OF_BASELINE = ("ant_1_array", "ant_2_array", "baseline_array", "uvw_array", "integration_time")
+
+
+def _reindexed(data: UVData, by_time: np.ndarray, by_baseline: np.ndarray) -> UVData:
+    """Return data whose sample i is made of sample by_baseline[i], and of by_time[i] in what belongs to the time."""
+    result = data.copy()
+    for parameter in data:
+        values, form = getattr(data, parameter), getattr(data, parameter).form
+        if isinstance(form, tuple) and form[:1] == ("Nblts",) and values.value is not None:
+            own = parameter.lstrip("_") in OF_BASELINE
+            setattr(result, values.name, np.array(values.value[by_baseline if own else by_time]))
+    result.Nblts, result.Ntimes = by_time.size, np.unique(result.time_array).size
+    result.Nbls = result.Nblts // result.Ntimes
+    result.blt_order = ("time", "baseline")
+    return result
+
+
+def match_sky_model(sky: UVData, data: UVData) -> UVData:
+    """Return the part of a prepared sky model that belongs to prepared data, in their order.
+
+    Raises
+    ------
+    InputError
+        If baselines, integrations, channels or polarizations of the data are missing from the sky model.
+    """
+    sky = sky.copy()
+    wanted = set(np.unique(data.baseline_array).tolist())
+    reverse = np.array(
+        [data.antnums_to_baseline(int(b), int(a)) for a, b in zip(sky.ant_1_array, sky.ant_2_array, strict=True)]
+    )
+    turned = np.flatnonzero(~np.isin(sky.baseline_array, list(wanted)) & np.isin(reverse, list(wanted)))
+    if turned.size:
+        sky.conjugate_bls(turned)
+    missing = wanted - set(sky.baseline_array.tolist())
+    if missing:
+        a, b = data.baseline_to_antnums(min(missing))
+        raise InputError(f"sky model: lacks {len(missing)} baseline(s) of the data, such as ({a}, {b})")
+    times = [_closest(sky.time_array, time, 1e-6) for time in np.unique(data.time_array)]
+    if None in times:
+        raise InputError("sky model: lacks integrations of the data (times must agree within 0.1 s)")
+    width = float(np.min(data.channel_width))
+    channels = [_closest(sky.freq_array, frequency, 0.1 * width) for frequency in data.freq_array]
+    if None in channels:
+        raise InputError("sky model: lacks channels of the data")
+    if not np.isin(data.polarization_array, sky.polarization_array).all():
+        raise InputError(f"sky model: has polarizations {', '.join(sky.get_pols())}, data {', '.join(data.get_pols())}")
+    rows = np.isin(sky.baseline_array, list(wanted)) & np.isin(sky.time_array, sky.time_array[times])
+    sky.select(blt_inds=np.flatnonzero(rows), freq_chans=channels, polarizations=data.polarization_array)
+    sky.reorder_pols(order=np.argsort(sky.polarization_array)[_ranks(data.polarization_array)], run_check=False)
+    sky.reorder_blts(order="time", minor_order="baseline", run_check=False)
+    return sky
+
+
+def _closest(values: np.ndarray, wanted: float, tolerance: float) -> int | None:
+    index = int(np.abs(values - wanted).argmin())
+    return index if abs(values[index] - wanted) <= tolerance else None
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    return np.argsort(np.argsort(values))

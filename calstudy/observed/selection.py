@@ -1,0 +1,166 @@
+"""Which part of a data set is calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic_core import PydanticCustomError
+
+from calstudy.base.errors import InputError
+from calstudy.base.units import parse_quantity
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+KEYS = {
+    "antennas": "antennas=0,1,12",
+    "lengths": "lengths=14 m..60 m",
+    "times": "times=0..9",
+    "frequencies": "frequencies=120 MHz..180 MHz",
+    "polarizations": "polarizations=xx,yy",
+}
+"""What can be selected, with an example each."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Part of a data set; None everywhere means all of it. Ranges include both ends, None is an open end.
+
+    Attributes
+    ----------
+    antennas
+        Antenna numbers or names.
+    lengths
+        Baseline lengths in m.
+    times
+        Indices of integrations, counted from zero.
+    frequencies
+        Channel centres in Hz.
+    polarizations
+        Names such as ``xx`` or ``ee``.
+    """
+
+    antennas: tuple[str, ...] | None = None
+    lengths: tuple[float | None, float | None] | None = None
+    times: tuple[int | None, int | None] | None = None
+    frequencies: tuple[float | None, float | None] | None = None
+    polarizations: tuple[str, ...] | None = None
+
+
+def parse_selection(texts: Sequence[str]) -> Selection:
+    """Read ``key=value`` texts as given to --select; see `KEYS` for what each key takes.
+
+    Raises
+    ------
+    InputError
+        If a key is unknown or given twice, or a value cannot be read.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = (part.strip() for part in text.partition("="))
+        if not equals or key not in KEYS or not value:
+            raise InputError(f"--select {text}: write one of {'; '.join(KEYS.values())}")
+        if key in found:
+            raise InputError(f"--select {key}: given twice")
+        found[key] = _value(key, value, f"--select {text}")
+    return Selection(**found)
+
+
+def _value(key: str, value: str, where: str) -> Any:
+    if key in ("antennas", "polarizations"):
+        return tuple(item.strip() for item in value.split(",") if item.strip())
+    ends = value.split("..")
+    if len(ends) != 2:
+        raise InputError(f"{where}: write a range such as {KEYS[key]}; either end may be left out")
+    try:
+        return tuple(_end(key, end.strip()) for end in ends)
+    except (PydanticCustomError, ValueError) as error:
+        reason = error.message() if isinstance(error, PydanticCustomError) else "not a whole number"
+        raise InputError(f"{where}: {reason}") from None
+
+
+def _end(key: str, text: str) -> float | int | None:
+    if not text:
+        return None
+    if key == "times":
+        return int(text)
+    return parse_quantity(text, "m", "14 m") if key == "lengths" else parse_quantity(text, "Hz", "120 MHz")
+
+
+def select(data: UVData, selection: Selection) -> UVData:
+    """Return the selected part of a data set; the data are not changed.
+
+    Raises
+    ------
+    InputError
+        If an antenna or polarization is not in the data, or nothing is left.
+    """
+    chosen: dict[str, Any] = {}
+    if selection.antennas is not None:
+        chosen["antenna_nums"] = [_antenna(data, antenna) for antenna in selection.antennas]
+    if selection.lengths is not None:
+        low, high = selection.lengths
+        chosen["bl_lengths"] = low, high
+    if selection.times is not None:
+        times = np.unique(data.time_array)
+        chosen["times"] = times[_within(np.arange(times.size), selection.times, "times", "integrations")]
+    if selection.frequencies is not None:
+        chosen["freq_chans"] = np.flatnonzero(
+            _within(np.ravel(data.freq_array), selection.frequencies, "frequencies", "channels")
+        )
+    if selection.polarizations is not None:
+        chosen["polarizations"] = [_polarization(data, name) for name in selection.polarizations]
+    lengths = chosen.pop("bl_lengths", None)
+    if lengths is not None:
+        chosen["blt_inds"] = np.flatnonzero(_of_length(data, lengths))
+    if not chosen:
+        return data
+    try:
+        return data.select(inplace=False, **chosen)
+    except ValueError as error:
+        raise InputError(f"--select: nothing is left of the data ({error})") from None
+
+
+def _within(values: np.ndarray, ends: tuple[Any, Any], key: str, what: str) -> np.ndarray:
+    low, high = ends
+    inside = (values >= (-np.inf if low is None else low)) & (values <= (np.inf if high is None else high))
+    if not inside.any():
+        raise InputError(f"--select {key}: no {what} in this range; the data have {values.min():g} to {values.max():g}")
+    return inside
+
+
+def _of_length(data: UVData, ends: tuple[float | None, float | None]) -> np.ndarray:
+    """Return which samples belong to baselines of these lengths; autocorrelations have length zero."""
+    positions = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
+    pairs = zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True)
+    lengths = np.array([np.linalg.norm(positions[b] - positions[a]) for a, b in pairs])
+    return _within(lengths, ends, "lengths", "baselines (m)")
+
+
+def _antenna(data: UVData, name: str) -> int:
+    numbers, names = data.telescope.antenna_numbers.tolist(), list(data.telescope.antenna_names)
+    present = set(data.ant_1_array.tolist()) | set(data.ant_2_array.tolist())
+    number = numbers[names.index(name)] if name in names else int(name) if name.isdecimal() else None
+    if number is None or number not in present:
+        raise InputError(
+            f"--select antennas: {name!r} is not in the data, which have {', '.join(map(str, sorted(present)))}"
+        )
+    return number
+
+
+def _polarization(data: UVData, name: str) -> int:
+    from pyuvdata.utils import polnum2str
+
+    numbers = {}
+    for number in data.polarization_array:
+        numbers[polnum2str(int(number)).lower()] = int(number)
+    for shown, number in zip(data.get_pols(), list(data.polarization_array), strict=True):
+        numbers[shown.lower()] = int(number)
+    if name.lower() not in numbers:
+        raise InputError(
+            f"--select polarizations: {name!r} is not in the data, which have {', '.join(data.get_pols())}"
+        )
+    return numbers[name.lower()]

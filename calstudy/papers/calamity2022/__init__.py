@@ -1,0 +1,164 @@
+"""CALAMITY: Ewall-Wice et al. 2022, calibration with foregrounds modelled by DPSS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+from calstudy.calibrate.settings import FirstOrderSettings, GainFit, Solver
+from calstudy.claims.paper import Paper
+from calstudy.corrupt.settings import NoNoise
+from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from calstudy.claims.results import RunResults
+    from calstudy.experiment.model import Experiment
+    from calstudy.verdicts.statement import Statement
+
+REDUNDANT_FROM = 0.5
+"""An array is redundant if this part of its baselines has a redundant partner."""
+EOR_LEVEL = -40.0
+"""Of the foregrounds, dB of brightness."""
+NOISE_FACTORS = {"times-eor": 10.0, "times-foregrounds": 0.1}
+SAME_NOISE = 0.1
+"""A run of fewer integrations has the paper's noise if, averaged over all of them, it is that close to the paper's."""
+PAPER_RATE = 0.01
+LEAST_STEPS = 1000
+"""First-order steps below which foregrounds are hardly fitted: the paper's solver takes thousands."""
+NOT_THE_METHOD = ("calibrator", "solver", "chunks", "models_at_once")
+"""Fields of a calibrator that do not decide what is fitted: they may be other than the paper's."""
+
+
+class Calamity2022(Paper):
+    """The statements of Ewall-Wice et al. 2022 on its two arrays, the low-SNR case, and run times."""
+
+    citation = (
+        "Ewall-Wice, A., et al. 2022, Precision calibration of radio interferometers for 21 cm cosmology with no "
+        "redundancy and little knowledge of antenna beams and the radio sky"
+    )
+    roles: ClassVar[Mapping[str, str]] = {
+        "minimally_redundant": "a run of an array that is not redundant, with gains per channel",
+        "redundant": "a run of a redundant array, each baseline modelled by itself",
+        "redundant_modelling": "a run of the redundant array with one model per group (calibrator: calamity-redundant)",
+        "low_snr": "a run with reflection gains alone",
+        "paper_solver": "a run of the minimally redundant array with the paper's solver (solver: adamax)",
+        "run_time": "a run of experiments/runtime.yaml",
+    }
+    usual_members: ClassVar[Mapping[str, str]] = {
+        "minimally_redundant": "minredundant",
+        "redundant": "redundant",
+        "redundant_modelling": "redundant-modelling",
+        "low_snr": "lowsnr",
+        "paper_solver": "paper-solver",
+    }
+
+    def statements(self) -> Sequence[Statement]:
+        """Return the statements, in the order of the paper's sections."""
+        from calstudy.papers.calamity2022 import calibration, computation, low_snr, redundant, window
+        from calstudy.verdicts.statement import Statement
+
+        modules = (calibration, window, redundant, low_snr, computation)
+        return [item for module in modules for item in vars(module).values() if isinstance(item, Statement)]
+
+    def refusal(self, role: str, experiment: Experiment) -> str | None:
+        """Return which setting of an experiment is not that of the role, or None if all are.
+
+        Defaults of experiments are the paper's values. Antennas, channels, integrations and sources may be fewer, and
+        what stands in for the sky and the beam is told with the results.
+        """
+        if role == "run_time":
+            return "an experiment measures no run times"
+        checks = (_other_calibrator, _other_gains, _other_noise, _other_data, _too_few_steps)
+        found = next((refusal for check in checks if (refusal := check(role, experiment)) is not None), None)
+        return _other_solver(experiment) if found is None and role == "paper_solver" else found
+
+    def refusal_of_run(self, role: str, results: RunResults) -> str | None:
+        """Return which setting of a run, or which property of its array, is not that of the role, or None."""
+        refusal = self.refusal(role, results.experiment)
+        if refusal is not None or role == "low_snr":
+            return refusal
+        fraction = results.redundant_fraction
+        if fraction is None:
+            return "the run has no calibrated variant 'residual' of foregrounds and noise, or no variant 'noise'"
+        wanted = role in ("redundant", "redundant_modelling")
+        if (fraction >= REDUNDANT_FROM) == wanted:
+            return None
+        verdict = "few" if wanted else "many"
+        return f"too {verdict} of the baselines have a redundant partner ({100 * fraction:.0f} %)"
+
+    def substitutions(self, experiment: Experiment) -> tuple[str, ...]:
+        """Return one short sentence for each ingredient that an experiment uses in place of the paper's own."""
+        return substitutions(experiment)
+
+
+def _changed(section: BaseModel, path: str, free: tuple[str, ...] = ()) -> str | None:
+    """Return in words which field of a section is not the paper's, that is its default; None if all others are."""
+    written = section.model_dump(mode="json")
+    for name, field in type(section).model_fields.items():
+        value, papers = getattr(section, name), field.get_default(call_default_factory=True)
+        if name in free or value == papers:
+            continue
+        if type(value) is type(papers) and name in written and isinstance(written[name], dict):
+            return _changed(value, f"{path}.{name}")
+        return f"{path}.{name} is {written[name]}, not the paper's"
+    return None
+
+
+def _other_calibrator(role: str, experiment: Experiment) -> str | None:
+    wanted = "calamity-redundant" if role == "redundant_modelling" else "calamity"
+    if experiment.calibration.calibrator != wanted:
+        return f"calibration.calibrator is {experiment.calibration.calibrator!r}, not {wanted!r}"
+    return _changed(experiment.calibration, "calibration", NOT_THE_METHOD)
+
+
+def _other_gains(role: str, experiment: Experiment) -> str | None:
+    wanted = "reflection-gains" if role == "low_snr" else "per-channel-gains"
+    effects = experiment.corruption.effects
+    if [effect.kind for effect in effects] != [wanted]:
+        named = ", ".join(effect.label for effect in effects) or "empty"
+        return f"corruption.effects is {named}, not {wanted} alone"
+    return _changed(effects[0], "corruption.effects.0", ("kind", "seed"))
+
+
+def _other_noise(role: str, experiment: Experiment) -> str | None:
+    noise, wanted = experiment.corruption.noise, "times-foregrounds" if role == "low_snr" else "times-eor"
+    if isinstance(noise, NoNoise) or noise.kind != wanted:
+        return f"corruption.noise is {noise.kind!r}, not {wanted!r}"
+    papers = NOISE_FACTORS[wanted]
+    averaged = noise.factor / papers * (PAPER_TIMES / experiment.instrument.times.count) ** 0.5
+    if noise.factor != papers and abs(averaged - 1) > SAME_NOISE:
+        return (
+            f"corruption.noise.factor is {noise.factor:g}, not {papers:g} or as much in the mean of fewer integrations"
+        )
+    return None
+
+
+def _other_data(role: str, experiment: Experiment) -> str | None:
+    del role
+    if experiment.corruption.eor_level != EOR_LEVEL:
+        return f"corruption.eor_level is not {EOR_LEVEL:g} dB"
+    papers = type(experiment).model_fields["variants"].get_default(call_default_factory=True)
+    others = [name for name, variant in experiment.variants.items() if papers.get(name, variant) != variant]
+    return f"variants.{others[0]} is not the paper's" if others else None
+
+
+def _solver(experiment: Experiment) -> Solver | None:
+    return experiment.calibration.solver if isinstance(experiment.calibration, GainFit) else None
+
+
+def _too_few_steps(role: str, experiment: Experiment) -> str | None:
+    del role
+    solver = _solver(experiment)
+    if isinstance(solver, FirstOrderSettings) and solver.max_steps < LEAST_STEPS:
+        return f"calibration.solver.max_steps is {solver.max_steps}, and {solver.name} takes thousands of steps"
+    return None
+
+
+def _other_solver(experiment: Experiment) -> str | None:
+    solver = _solver(experiment)
+    papers = ("adamax", PAPER_RATE, "constant")
+    if not isinstance(solver, FirstOrderSettings) or (solver.name, solver.learning_rate, solver.schedule) != papers:
+        return f"calibration.solver is not the paper's (adamax at a constant rate of {PAPER_RATE})"
+    return None

@@ -1,0 +1,177 @@
+"""Claims on run time and memory (paper §Computational Runtime)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calstudy.bench.scaling import PowerLaw, fit_power_law
+from calstudy.claims.run_times import RunTimes
+from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
+from calstudy.verdicts.statement import Source
+
+COMPUTATION = Source("Computational Runtime", ("run_time",))
+QUARTER = 0.25
+QUADRATIC, LINEAR, CONSTANT = (Within(power - QUARTER, power + QUARTER) for power in (2, 1, 0))
+QUARTER_WHY = "the exponent, to a quarter"
+HUNDREDS = 300
+"""Antennas that stand for hundreds, as the text has it."""
+MINUTES = AtMost(600)
+MINUTES_WHY = "ten minutes are still minutes"
+AROUND_HUNDRED = 100
+HALF_ORDER = 10**0.5
+
+
+def _exponent(law: PowerLaw) -> Finding:
+    return Finding(law.exponent, law.error)
+
+
+QUADRATIC_SENTENCE = "the computational time for a gradient update follows quadratic scaling with N_ant"
+
+
+@COMPUTATION.states(
+    QUADRATIC_SENTENCE,
+    "exponent of the median time of the paper's step against the number of antennas, one core",
+    QUADRATIC,
+    QUARTER_WHY,
+)
+def paper_step_quadratic_in_antennas(run: RunTimes) -> Finding:
+    return _exponent(run.scaling("rows", "paper-step"))
+
+
+@COMPUTATION.states(
+    QUADRATIC_SENTENCE, "the same of this project's own Adamax step, without padding", QUADRATIC, QUARTER_WHY
+)
+def own_step_quadratic_in_antennas(run: RunTimes) -> Finding:
+    return _exponent(run.scaling("rows", "adamax-step"))
+
+
+LINEAR_SENTENCE = "the linear scaling of the gradient update computations with maximum baseline length ∝ N_vec^max"
+
+
+@COMPUTATION.states(
+    LINEAR_SENTENCE,
+    "exponent of the median time of the paper's step against the longest baseline, 10 antennas, one core",
+    LINEAR,
+    QUARTER_WHY,
+)
+def paper_step_linear_in_longest_baseline(run: RunTimes) -> Finding:
+    return _exponent(run.scaling("line", "paper-step"))
+
+
+@COMPUTATION.states(
+    LINEAR_SENTENCE,
+    "the same against the number of foreground vectors of the longest baseline, which the buffer keeps above zero",
+    LINEAR,
+    QUARTER_WHY,
+)
+def paper_step_linear_in_vectors(run: RunTimes) -> Finding:
+    return _exponent(run.scaling("line", "paper-step", "vectors"))
+
+
+@COMPUTATION.states(
+    "the computational cost of each gradient update step is dominated by the sum over u A",
+    "time of that sum and its gradient alone over that of the paper's step, largest array, one core",
+    AtLeast(0.5),
+    "more than all the rest",
+)
+def sum_dominates_step(run: RunTimes) -> Finding:
+    return Finding(float(run.medians("rows", "paper-sum")[-1] / run.medians("rows", "paper-step")[-1]), 0.0)
+
+
+MEMORY_SENTENCE = "memory use is dominated by the N_vec N_freq N_bl element A matrix"
+
+
+@COMPUTATION.states(
+    MEMORY_SENTENCE,
+    "bytes of A over the memory that the paper's step takes in all, temporaries of its size included; largest array",
+    AtLeast(0.5),
+    "more than all the rest",
+)
+def basis_dominates_memory(run: RunTimes) -> Finding:
+    return Finding(float(run.column("rows", "basis_bytes")[-1] / run.column("rows", "paper_memory")[-1]), 0.0)
+
+
+@COMPUTATION.states(
+    MEMORY_SENTENCE,
+    "exponent of the memory that the paper's step takes against the bytes of A, over the arrays in rows",
+    LINEAR,
+    QUARTER_WHY,
+)
+def memory_grows_like_basis(run: RunTimes) -> Finding:
+    return _exponent(fit_power_law(run.column("rows", "basis_bytes"), run.column("rows", "paper_memory")))
+
+
+THOUSANDS_SENTENCE = "given a learning rate of 0.01, CALAMITY requires thousands of gradient descent steps to converge"
+THOUSANDS, THOUSANDS_WHY = Within(1e3, 1e4), "thousands, not hundreds or tens of thousands"
+
+
+@COMPUTATION.states(
+    THOUSANDS_SENTENCE, "steps until the loss is within 5 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
+)
+def thousands_of_steps_to_five_percent(run: RunTimes) -> Finding:
+    return Finding(run.steps_to("0.05"), 0.0)
+
+
+@COMPUTATION.states(
+    THOUSANDS_SENTENCE, "steps until the loss is within 1 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
+)
+def thousands_of_steps_to_one_percent(run: RunTimes) -> Finding:
+    return Finding(run.steps_to("0.01"), 0.0)
+
+
+@COMPUTATION.states(
+    "CALAMITY performs ≳ 30 times faster on a GPU than on a CPU on arrays with hundreds of antennas",
+    "median time of the paper's step on one core over that on the GPU, largest array",
+    AtLeast(30),
+    "the paper's factor",
+)
+def gpu_thirty_times_faster(run: RunTimes) -> Finding:
+    on_gpu = run.medians("rows", "paper-step", "gpu")[-1]
+    return Finding(float(run.medians("rows", "paper-step")[-1] / on_gpu), 0.0)
+
+
+@COMPUTATION.states(
+    "gradient update steps on the GPU run on the order of 20-30 ms for arrays with ∼ 100 antennas",
+    "median time of the paper's step on the GPU, the array closest to 100 antennas, s",
+    Within(0.02 / HALF_ORDER, 0.03 * HALF_ORDER),
+    "20 to 30 ms, to half an order of magnitude either way",
+)
+def gpu_step_at_hundred_antennas(run: RunTimes) -> Finding:
+    closest = int(np.argmin(np.abs(run.column("rows", "antennas", "gpu") - AROUND_HUNDRED)))
+    return Finding(float(run.medians("rows", "paper-step", "gpu")[closest]), 0.0)
+
+
+@COMPUTATION.states(
+    "the run time on the GPU appears constant",
+    "exponent of the median time of the paper's step against the longest baseline, 10 antennas, GPU",
+    CONSTANT,
+    QUARTER_WHY,
+)
+def gpu_step_constant_in_longest_baseline(run: RunTimes) -> Finding:
+    return _exponent(run.scaling("line", "paper-step", device="gpu"))
+
+
+MINUTES_SENTENCE = "solutions for arrays with hundreds of antennas within minutes on a single computer node with a GPU"
+
+
+@COMPUTATION.states(
+    MINUTES_SENTENCE,
+    f"paper's steps on the GPU to 1 % above the minimum, extrapolated to {HUNDREDS} antennas, s",
+    MINUTES,
+    MINUTES_WHY,
+)
+def paper_solve_in_minutes(run: RunTimes) -> Finding:
+    law = run.scaling("rows", "paper-step", device="gpu")
+    return Finding(run.steps_to("0.01") * float(law.at(HUNDREDS)), 0.0)
+
+
+@COMPUTATION.states(
+    MINUTES_SENTENCE,
+    f"the default solver's whole solve on one core without a GPU, extrapolated to {HUNDREDS} antennas, s",
+    MINUTES,
+    MINUTES_WHY,
+)
+def default_solve_in_minutes(run: RunTimes) -> Finding:
+    law = run.scaling("rows", "default-solve")
+    seconds = float(law.at(HUNDREDS))
+    return Finding(seconds, seconds * law.error * float(np.log(HUNDREDS / run.column("rows", "antennas").mean())))

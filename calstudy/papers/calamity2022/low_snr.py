@@ -1,0 +1,99 @@
+"""Claims on gain errors below the noise of a single baseline (paper §The Low Signal-to-Noise regime)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calstudy.claims.results import RunResults
+from calstudy.corrupt.effects.reflection_gains import ReflectionGains
+from calstudy.papers.calamity2022.bins import SIGMAS_95, bins_at_delays, fraction_within, used_bins
+from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
+from calstudy.power.spectra import SphericalSpectrum
+from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
+from calstudy.verdicts.statement import Source, Unevaluated
+
+LOW_SNR = Source("The Low Signal-to-Noise regime", ("low_snr",))
+WIDTH = 2
+"""The reflection is looked for within this many standard deviations of its mean delay."""
+TENFOLD = Within(10**0.5, 10**1.5)
+TENFOLD_WHY = "≈ 10, to half an order of magnitude"
+
+
+def reflection_bins(run: RunResults, spectrum: SphericalSpectrum) -> np.ndarray:
+    """Return the bins of k, (Nk,) bool, that the delays of the reflections fall into; raises Unevaluated if none."""
+    gains = run.experiment.corruption.gains
+    if not isinstance(gains, ReflectionGains):
+        raise Unevaluated("the gains have no reflections")
+    low, high = (gains.delay + sign * WIDTH * gains.delay_scatter for sign in (-1, 1))
+    return bins_at_delays(spectrum, run.wedge("noise"), low, high)
+
+
+def _artefact(run: RunResults) -> float:
+    spectrum = run.spherical("uncalibrated", "outside-wedge")
+    chosen = reflection_bins(run, spectrum)
+    return float(np.max(spectrum.power.real[chosen] / spectrum.noise_error[chosen]))
+
+
+ARTEFACT = "with no calibration, reflection artifacts exceed the thermal noise level by a factor of ≈ 10"
+
+
+@LOW_SNR.states(
+    "a reflection feature is clearly visible in our uncalibrated visibilities",
+    "largest P^V near 1200 ns over the standard deviation of the noise; that it exceeds it, by whatever factor",
+    AtLeast(10),
+    "the paper's factor, as the least",
+)
+def artefact_visible_above_noise(run: RunResults) -> Finding:
+    return Finding(_artefact(run), 1.0)
+
+
+@LOW_SNR.states(ARTEFACT, "largest P^V near 1200 ns over the standard deviation of the noise", TENFOLD, TENFOLD_WHY)
+def artefact_tenfold_above_noise(run: RunResults) -> Finding:
+    return Finding(_artefact(run), 1.0)
+
+
+@LOW_SNR.states(ARTEFACT, "largest P^V near 1200 ns over the 95 % level of the noise", TENFOLD, TENFOLD_WHY)
+def artefact_tenfold_above_noise_bars(run: RunResults) -> Finding:
+    return Finding(_artefact(run) / SIGMAS_95, 1 / SIGMAS_95)
+
+
+REMOVED = (
+    "CALAMITY removes the reflection artifacts so that the residual is still consistent with noise only simulations"
+)
+
+
+@LOW_SNR.states(
+    REMOVED, "mean P^R near 1200 ns, in standard deviations of the noise", Equal(0), "no artefact beyond the noise"
+)
+def artefact_removed(run: RunResults) -> Finding:
+    spectrum = run.spherical("residual", "outside-wedge")
+    chosen = reflection_bins(run, spectrum)
+    error = spectrum.noise_error[chosen]
+    return Finding(float(np.sum(spectrum.power.real[chosen] / error**2) / np.sqrt(np.sum(error**-2.0))), 1.0)
+
+
+@LOW_SNR.states(
+    REMOVED,
+    "part of the bins at k >= 0.2 outside the wedge in which P^R is within 95 % of the noise",
+    AtLeast(0.9),
+    "95 % by chance alone; a tenth may miss",
+)
+def residual_consistent_with_noise(run: RunResults) -> Finding:
+    spectrum = run.spherical("residual", "outside-wedge")
+    used = used_bins(spectrum, k_min=0.2)
+    return fraction_within(spectrum.power.real[used], spectrum.noise_error[used])
+
+
+SINGLE = "the gain corrupted visibilities, residuals, and noise are all at a similar level for a single baseline"
+
+
+@LOW_SNR.states(SINGLE, "rms of V over that of N, delays outside the wedge; median", Within(0.5, 2), FACTOR_OF_TWO)
+def data_at_noise_on_single_baseline(run: RunResults) -> Finding:
+    found = run.measured("data_over_noise_outside")
+    return Finding(found.value, found.scatter)
+
+
+@LOW_SNR.states(SINGLE, "rms of R over that of N, delays outside the wedge; median", Within(0.5, 2), FACTOR_OF_TWO)
+def residual_at_noise_on_single_baseline(run: RunResults) -> Finding:
+    found = run.measured("residual_over_noise_outside")
+    return Finding(found.value, found.scatter)

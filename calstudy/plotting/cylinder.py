@@ -1,0 +1,134 @@
+"""What figures over baseline length and delay have in common: cells, the horizon, axes of metres and nanoseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from calstudy.plotting import style
+from calstudy.power.delay import horizon_delay
+
+
+class Cylinder(Protocol):
+    """The axes of quantities per baseline length and delay, as in `calstudy.power.spectra.CylindricalSpectrum`."""
+
+    @property
+    def baseline_length(self) -> np.ndarray:
+        """Mean baseline length of each bin in m, (Nb,)."""
+
+    @property
+    def bin_edges(self) -> np.ndarray:
+        """Edges of the bins of baseline length in m, (Nb, 2)."""
+
+    @property
+    def k_perp(self) -> np.ndarray:
+        """k_perp of each bin in h/Mpc, (Nb,)."""
+
+    @property
+    def delay(self) -> np.ndarray:
+        """Delays in s, (Nd,)."""
+
+    @property
+    def k_parallel(self) -> np.ndarray:
+        """k_parallel of each delay in h/Mpc, (Nd,)."""
+
+
+def length_cells(cylinder: Cylinder) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges (M + 1,) in m of contiguous cells, and which of them each bin of lengths fills, (Nb,) int.
+
+    Cells between bins that are not adjacent hold no baselines.
+    """
+    edges = np.unique(cylinder.bin_edges)
+    return edges, np.searchsorted(edges, cylinder.bin_edges[:, 0])
+
+
+def delay_edges(centres: np.ndarray) -> np.ndarray:
+    """Return the (N + 1,) edges halfway between (N,) increasing centres >= 0; none is below 0."""
+    middle = (centres[1:] + centres[:-1]) / 2
+    return np.concatenate([[max(2 * centres[0] - middle[0], 0.0)], middle, [2 * centres[-1] - middle[-1]]])
+
+
+def cells(cylinder: Cylinder, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return edges in k_perp and k_parallel, and the values (Nb, Nd) on them with NaN where there are no baselines."""
+    lengths, filled = length_cells(cylinder)
+    grid = np.full((cylinder.delay.size, lengths.size - 1), np.nan)
+    grid[:, filled] = values.T
+    return lengths * ratio(cylinder.k_perp, cylinder.baseline_length), delay_edges(cylinder.k_parallel), grid
+
+
+def draw_horizon(axes: Axes, cylinder: Cylinder, buffer: float, colour: str = "black") -> None:
+    """Draw the horizon and, dashed, the delay `buffer` (s) beyond it.
+
+    Parameters
+    ----------
+    axes
+        Of k_perp and k_parallel, h/Mpc.
+    cylinder
+        Gives lengths and delays.
+    buffer
+        Of the dashed line, s.
+    colour
+        Of both lines.
+    """
+    lengths = cylinder.bin_edges[[0, -1], [0, 1]]
+    k_perp = lengths * ratio(cylinder.k_perp, cylinder.baseline_length)
+    per_second = ratio(cylinder.k_parallel, cylinder.delay)
+    for extra, line, label in ((0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")):
+        edge = (horizon_delay(lengths) + extra) * per_second
+        axes.plot(k_perp, edge, line, color=colour, linewidth=0.8, label=label)
+
+
+def ratio(numerator: np.ndarray, denominator: np.ndarray) -> float:
+    """Return the constant factor between two proportional axes."""
+    return float(numerator[-1] / denominator[-1])
+
+
+def _scaled_by(factor: float) -> tuple[Callable[[ArrayLike], np.ndarray], Callable[[ArrayLike], np.ndarray]]:
+    """Return the transform to an axis that is `factor` times another, and its inverse."""
+
+    def forward(values: ArrayLike) -> np.ndarray:
+        return np.asarray(values) * factor
+
+    def inverse(values: ArrayLike) -> np.ndarray:
+        return np.asarray(values) / factor
+
+    return forward, inverse
+
+
+def label_axes(axes: Axes, cylinder: Cylinder, max_delay: float | None) -> None:
+    """Set limits and label k_perp below and metres above; delays end at `max_delay` (s), if that is not None.
+
+    Parameters
+    ----------
+    axes
+        Of k_perp and k_parallel, h/Mpc.
+    cylinder
+        Gives lengths and delays.
+    max_delay
+        Upper end, s; all delays if None or larger than those.
+    """
+    metres = ratio(cylinder.baseline_length, cylinder.k_perp)
+    shortest, longest = cylinder.bin_edges[[0, -1], [0, 1]]
+    top = delay_edges(cylinder.k_parallel)[-1]
+    if max_delay is not None:
+        top = min(top, max_delay * ratio(cylinder.k_parallel, cylinder.delay))
+    axes.set(xlim=(shortest / metres, longest / metres), ylim=(0, top), xlabel=style.K_PERPENDICULAR)
+    axes.tick_params(which="both", top=False, right=False, direction="out")
+    axes.locator_params(axis="x", nbins=3)
+    lengths = axes.secondary_xaxis("top", functions=_scaled_by(metres))
+    lengths.set_xlabel(style.BASELINE_LENGTH, fontsize=style.SMALL_SIZE, labelpad=2)
+    lengths.tick_params(direction="out", labelsize=style.SMALL_SIZE, pad=1)
+    lengths.xaxis.set_major_locator(MaxNLocator(nbins=3))
+
+
+def delay_axis(axes: Axes, cylinder: Cylinder) -> None:
+    """Add an axis of delays in ns on the right."""
+    to_wavenumber, to_delay = _scaled_by(ratio(cylinder.k_parallel, cylinder.delay) * 1e-9)
+    delays = axes.secondary_yaxis("right", functions=(to_delay, to_wavenumber))
+    delays.set_ylabel(style.DELAY)
+    delays.tick_params(direction="out")

@@ -1,0 +1,51 @@
+"""One quantity in frequency and in delay, as the calibration figures show it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from calstudy.power.delay import channel_width, delay_transform, delays, make_taper
+
+TAPER = "blackman-harris"
+FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
+
+
+@dataclass(frozen=True)
+class TwoDomains:
+    """One or more spectra in both domains.
+
+    Attributes
+    ----------
+    frequency
+        Channel centres, (Nfreqs,), Hz.
+    delay
+        Ascending delays, (Nfreqs,), s.
+    values
+        The spectra, (..., Nfreqs) complex.
+    transform
+        Their Blackman-Harris delay transforms, (..., Nfreqs) complex, in the unit of `values`: a constant spectrum has
+        the transform of its own value at zero delay.
+    """
+
+    frequency: np.ndarray
+    delay: np.ndarray
+    values: np.ndarray
+    transform: np.ndarray
+
+
+def in_two_domains(frequency: np.ndarray, values: np.ndarray) -> TwoDomains:
+    """Transform spectra (..., Nfreqs) on equally spaced channels `frequency` (Nfreqs,) Hz to delay.
+
+    Raises
+    ------
+    ValueError
+        If the channels are not equally spaced and ascending or do not match the spectra.
+    """
+    values = np.asarray(values)
+    width = channel_width(frequency)
+    integral = width * make_taper(TAPER, frequency.size).sum()
+    transform = delay_transform(values, frequency, TAPER) / integral
+    return TwoDomains(frequency, delays(frequency.size, width), values, transform)

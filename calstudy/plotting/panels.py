@@ -1,0 +1,60 @@
+"""Axes shared by the calibration figures: frequency on the left, delay on the right."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calstudy.plotting import style
+
+
+def frequency_and_delay(rows: int = 2) -> tuple[Figure, list[Axes], Axes]:
+    """Return a figure with `rows` axes against frequency stacked on the left, and one against delay on the right."""
+    figure = style.new_figure(style.TWO_COLUMNS, 1.7 + 0.8 * rows)
+    axes = figure.subplot_mosaic([[str(row), "delay"] for row in range(rows)])
+    stacked = [axes[str(row)] for row in range(rows)]
+    for upper in stacked[:-1]:
+        upper.sharex(stacked[-1])
+        upper.tick_params(labelbottom=False)
+    stacked[-1].set_xlabel(style.FREQUENCY)
+    stacked[-1].margins(x=0)
+    return figure, stacked, axes["delay"]
+
+
+def delay_panel(axes: Axes, delay: np.ndarray, label: str) -> None:
+    """Finish axes of amplitudes against `delay` (Ndelays,) s, logarithmic.
+
+    Parameters
+    ----------
+    axes
+        To finish.
+    delay
+        Ascending, s, (Ndelays,).
+    label
+        Of the amplitudes.
+    """
+    axes.set(yscale="log", xlabel=style.DELAY, ylabel=label, xlim=(delay[0] * 1e9, delay[-1] * 1e9))
+
+
+def mark_horizon(axes: Axes, horizon: float) -> None:
+    """Draw the edges of the wedge, ± `horizon` in s, as vertical dashed lines."""
+    for sign in (-1, 1):
+        axes.axvline(sign * horizon * 1e9, color=style.BLACK, linestyle="--", linewidth=0.7, zorder=1)
+
+
+def name_baseline(axes: Axes, antennas: tuple[int, int], baseline_length: float) -> None:
+    """Write the antennas and the length in m of a baseline into the upper right corner.
+
+    Parameters
+    ----------
+    axes
+        To write on.
+    antennas
+        The two antenna numbers.
+    baseline_length
+        m.
+    """
+    a, b = antennas
+    label = rf"({a}, {b}), $|\mathbf{{b}}| = {baseline_length:.1f}$ m"
+    axes.text(0.97, 0.95, label, transform=axes.transAxes, ha="right", va="top", fontsize=style.SMALL_SIZE + 0.5)

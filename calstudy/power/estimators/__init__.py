@@ -1,0 +1,1 @@
+"""The power spectrum estimators, one in each module."""

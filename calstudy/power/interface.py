@@ -1,0 +1,120 @@
+"""What an estimator of power spectra is: from two averaged data sets to delay spectra."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar, Protocol, cast
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin, guarded
+from calstudy.power.settings import ESTIMATORS, PowerSettings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pyuvdata import UVData
+
+    from calstudy.power.spectra import DelaySpectra
+
+
+class PowerBeam(Protocol):
+    """The part of the beam interface that estimators use (`calstudy.instrument.beams`)."""
+
+    def solid_angles(self, frequencies: np.ndarray, pol: str) -> tuple[np.ndarray, np.ndarray]:
+        """Integrals over the sky in sr of the power beam and of its square, (Nfreqs,) each, for "xx" or "yy"."""
+
+
+class Estimator(Plugin, ABC):
+    """An estimator of delay power spectra. Fields of a subclass are its settings."""
+
+    registry: ClassVar = ESTIMATORS
+
+    kind: str = Field("", description="Name of an estimator, or a file.py.")
+
+    @abstractmethod
+    def estimate(self, even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings) -> DelaySpectra:
+        """Return the delay spectra of even times odd.
+
+        Parameters
+        ----------
+        even, odd
+            One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy with
+            V_xx = 1/2 int A I. They share the sky but not the noise. Not to be changed. `odd` is `even` where the power
+            of one data set is asked for.
+        beam
+            Of the array.
+        settings
+            The `power` section: taper, pairs, redundancy tolerance, cosmology. Bins, `wedge_buffer` and `length_bin`
+            have their defaults: they apply later, when spectra are averaged.
+        """
+
+    def estimate_and_export(
+        self, even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings, folder: Path
+    ) -> DelaySpectra:
+        """Return what `estimate` does, and write what else there is, in formats of its own, into an empty folder.
+
+        Parameters
+        ----------
+        even, odd, beam, settings
+            As for `estimate`.
+        folder
+            Empty.
+        """
+        del folder
+        return self.estimate(even, odd, beam, settings)
+
+
+def estimate_spectra(
+    even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings, folder: Path | None = None
+) -> DelaySpectra:
+    """Return the delay spectra of even times odd by the estimator of the settings, checked.
+
+    Parameters
+    ----------
+    even, odd, beam, settings
+        As for `Estimator.estimate`.
+    folder
+        Where the estimator may write files of its own; nowhere if None.
+
+    Raises
+    ------
+    InputError
+        If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`.
+    """
+    estimator = cast(Estimator, settings.estimator)
+    with guarded(estimator):
+        if folder is None:
+            found = estimator.estimate(even, odd, beam, settings)
+        else:
+            found = estimator.estimate_and_export(even, odd, beam, settings, folder)
+    if (fault := _fault(found)) is not None:
+        raise InputError(f"estimator {estimator.label!r}: {fault}")
+    return found
+
+
+def _fault(found: object) -> str | None:
+    """Return what is wrong with what an estimator returned, or None."""
+    from calstudy.power.delay import TAPERS
+    from calstudy.power.spectra import DelaySpectra
+
+    if not isinstance(found, DelaySpectra):
+        return f"returned a {type(found).__name__}, expected DelaySpectra"
+    units, n_delays = len(found.n_pairs), len(found.delay)
+    expected = {
+        "power": (units, n_delays),
+        "vectors": (units, 3),
+        "k_perp": (units,),
+        "k_parallel": (n_delays,),
+    }
+    for name, shape in expected.items():
+        values = getattr(found, name)
+        if values.shape != shape:
+            return f"its {name} has shape {values.shape}, expected {shape} for {units} units and {n_delays} delays"
+        if not np.isfinite(values).all():
+            return f"its {name} is not finite somewhere"
+    if (np.diff(found.delay) <= 0).any():
+        return "its delays do not ascend"
+    return None if found.taper in TAPERS else f"its taper {found.taper!r} is none of {', '.join(TAPERS)}"

@@ -1,0 +1,107 @@
+"""How far the calibration of the variant `residual` agrees with the truth of the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.products import calibration, corruption, simulation
+from calstudy.products.files import DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+AGREEMENT = "agreement.json"
+
+
+@once
+def agreement(graph: Graph) -> Task | None:
+    """Return the task that measures how far the calibration of variant `residual` agrees with the truth.
+
+    None if there is nothing to measure: no such calibrated variant of foregrounds and noise, or no variant of noise
+    alone to compare with.
+    """
+    variants, foregrounds = graph.experiment.variants, simulation.foregrounds(graph)
+    residual, noise = variants.get("residual"), variants.get("noise")
+    if foregrounds is None or residual is None or noise is None or noise.components != ("noise",):
+        return None
+    if not (residual.effects and residual.calibrate and {"foregrounds", "noise"} <= set(residual.components)):
+        return None
+    power = graph.experiment.power
+    settings = {"buffer": power.wedge_buffer, "redundancy_tolerance": power.redundancy_tolerance}
+    inputs = {
+        "data": corruption.data(graph, residual, "even"),
+        "noise": corruption.data(graph, noise, "even"),
+        "foregrounds": foregrounds,
+        "gains": corruption.gains(graph),
+        "calibration": calibration.calibration(graph, residual, "even"),
+    }
+    return Task(MEASURE_AGREEMENT, "calibration against truth", settings, inputs)
+
+
+def measure(job: Job) -> Mapping[str, Any]:
+    """Write the measurements of the first polarization, and how redundant the array is, to agreement.json."""
+    import numpy as np
+
+    from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
+    from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth
+    from calstudy.products.selection import read_gains
+
+    data = read_visibilities(job.inputs["data"] / DATA)
+    true, fitted = read_gains(job.inputs["gains"]), read_gains(job.inputs["calibration"])
+    solved = ~fitted.flags.any(axis=(1, 2))
+    vectors = baseline_vectors(data)
+    baselines = Baselines(
+        antennas=np.searchsorted(fitted.numbers, antenna_pairs(data)),
+        lengths=np.linalg.norm(vectors, axis=1),
+        frequency=data.freq_array,
+        buffer=job.settings["buffer"],
+    )
+    truth = Truth(
+        gains=true.of(fitted.numbers)[0],
+        foregrounds=_cube(job.inputs["foregrounds"] / VISIBILITIES)[solved],
+        noise=_cube(job.inputs["noise"] / DATA)[solved],
+        data=to_cube(data)[solved, ..., 0],
+    )
+    model, residual = (_cube(job.inputs["calibration"] / name)[solved] for name in (MODEL, RESIDUAL))
+    found = compare_with_truth(truth, Fit(fitted.values[solved], model, residual), baselines)
+    write_json(
+        job.output / AGREEMENT,
+        {
+            "measurements": as_json(found),
+            "redundant_fraction": _redundant_fraction(vectors, job.settings["redundancy_tolerance"]),
+            "integrations": int(solved.sum()),
+            "integrations_without_solution": int((~solved).sum()),
+        },
+    )
+    return {}
+
+
+def _cube(path: Path) -> np.ndarray:
+    """Return the first polarization of a product, (Ntimes, Nbls, Nfreqs)."""
+    from calstudy.base.visibilities import to_cube
+
+    return to_cube(read_visibilities(path))[..., 0]
+
+
+def _redundant_fraction(vectors: np.ndarray, tolerance: float) -> float:
+    """Return which part of the baselines has a redundant partner."""
+    import numpy as np
+
+    from calstudy.instrument.layouts import redundant_groups
+
+    groups = redundant_groups(vectors, tolerance)
+    return float(np.mean(np.bincount(groups.index)[groups.index] > 1))
+
+
+def _cost(task: Task) -> Cost:
+    samples = size_of(task).samples
+    return Cost(2 + samples * 1e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
+
+
+MEASURE_AGREEMENT = Stage(name="agreement", version=2, make=measure, cost=_cost)

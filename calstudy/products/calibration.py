@@ -1,0 +1,154 @@
+"""The calibration under test: gains, foreground models and residuals, solved in pieces of consecutive integrations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.execution import cost_of
+from calstudy.experiment.model import Variant
+from calstudy.products import corruption, simulation
+from calstudy.products.files import (
+    DATA,
+    GAINS,
+    MODEL,
+    RESIDUAL,
+    SOLUTION,
+    VISIBILITIES,
+    read_json,
+    read_visibilities,
+    write_json,
+    write_visibilities,
+)
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+
+@once
+def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
+    """Return the task of the calibration of one noise realization of a variant.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    variant
+        What is calibrated.
+    parity
+        "even" or "odd".
+    """
+    data = corruption.data(graph, variant, parity)
+    settings = graph.experiment.calibration
+    solves = -(-graph.experiment.instrument.times.count // settings.integrations_per_solve)
+    count = min(settings.chunks, solves)
+    inputs = {"data": data}
+    if (foregrounds := simulation.foregrounds(graph)) is not None:
+        inputs["sky_model"] = foregrounds
+    chunks = {
+        f"chunk{index:03d}": Task(
+            CALIBRATE_CHUNK,
+            f"{data.label} {index + 1}/{count}",
+            {"calibration": settings, "index": index, "count": count},
+            inputs,
+            temporary=True,
+        )
+        for index in range(count)
+    }
+    return Task(CALIBRATE, data.label, {}, chunks)
+
+
+def _integrations(data: UVData, index: int, count: int, together: int) -> UVData:
+    """Return run number `index` of `count` runs of consecutive integrations, as equal as can be.
+
+    A run ends where one group of integrations that are solved `together` ends.
+    """
+    import numpy as np
+
+    together = min(together, data.Ntimes)
+    groups = -(-data.Ntimes // together)
+    edges = np.linspace(0, groups, count + 1).round().astype(int) * together
+    first, last = edges[index] * data.Nbls, min(edges[index + 1], data.Ntimes) * data.Nbls
+    return data.select(blt_inds=np.arange(first, last), inplace=False, run_check=False)
+
+
+def calibrate_chunk(job: Job) -> Mapping[str, Any]:
+    """Calibrate a run of consecutive integrations."""
+    from calstudy.calibrate.execution import run_calibrator
+
+    index, count, settings = (job.settings[name] for name in ("index", "count", "calibration"))
+    together = settings.integrations_per_solve
+    data = _integrations(read_visibilities(job.inputs["data"] / DATA), index, count, together)
+    sky_model = None
+    if "sky_model" in job.inputs:
+        sky_model = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
+        sky_model = _integrations(sky_model, index, count, together)
+    result = run_calibrator(settings, data, sky_model)
+    result.gains.write_calh5(job.output / GAINS)
+    for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
+        write_visibilities(uvd, job.output / name, single=True)
+    summary = result.summary()
+    write_json(job.output / SOLUTION, summary)
+    return {"by_status": summary["by_status"]}
+
+
+def assemble(job: Job) -> Mapping[str, Any]:
+    """Join the runs of integrations into one set of gains, model, residual and solution log."""
+    import numpy as np
+    from pyuvdata import UVCal
+
+    folders = [job.inputs[name] for name in sorted(job.inputs, key=lambda name: int(name.removeprefix("chunk")))]
+    gains = UVCal.from_file([str(folder / GAINS) for folder in folders], axis="time")
+    gains.write_calh5(job.output / GAINS)
+    for name in (MODEL, RESIDUAL):
+        parts = [read_visibilities(folder / name) for folder in folders]
+        joined = parts[0].fast_concat(parts[1:], "blt", inplace=False) if len(parts) > 1 else parts[0]
+        write_visibilities(joined, job.output / name, single=True)
+    records = [record for folder in folders for record in read_json(folder / SOLUTION)["records"]]
+    records.sort(key=lambda record: (record["polarization"], record["time"]))
+    by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
+    for record in records:
+        by_status[record["status"]] += 1
+        record["integration"] = int(np.abs(gains.time_array - record["time"]).argmin())
+    write_json(job.output / SOLUTION, {"by_status": by_status, "records": records})
+    seconds = [record["seconds"] for record in records]
+    steps = [record["n_steps"] for record in records if record["n_steps"] is not None]
+    return {
+        "by_status": by_status,
+        **({"median_steps": float(np.median(steps))} if steps else {}),
+        "median_seconds_per_solve": float(np.median(seconds)),
+        "warnings": _warnings(by_status, records),
+    }
+
+
+def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) -> list[str]:
+    unconverged = len(records) - by_status.get("converged", 0)
+    if not unconverged:
+        return []
+    example = next(record for record in records if record["status"] != "converged")
+    return [
+        f"{unconverged} of {len(records)} solves did not converge "
+        f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
+        f"{example['integration']}: {example['message']}"
+    ]
+
+
+def _cost_of_chunk(task: Task) -> Cost:
+    size, pieces = size_of(task), task.settings["count"]
+    solves = cost_of(task.settings["calibration"], replace(size, times=-(-size.times // pieces)))
+    # Files are read whole, with flags and sample counts; results are made for the piece.
+    files = (COMPLEX64 + COMPLEX128 + 10) * size.samples + 8 * COMPLEX128 * size.samples / pieces
+    return Cost(solves.seconds, solves.memory + files, 2 * size.samples * COMPLEX64 / pieces)
+
+
+def _cost(task: Task) -> Cost:
+    disk = 2 * size_of(task).samples * COMPLEX64
+    return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 3 * disk, disk)
+
+
+CALIBRATE_CHUNK = Stage(name="calibrate-chunk", version=4, make=calibrate_chunk, cost=_cost_of_chunk)
+CALIBRATE = Stage(name="calibrate", version=2, make=assemble, cost=_cost)

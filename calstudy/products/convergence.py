@@ -1,0 +1,175 @@
+"""How much of the foregrounds two noise realizations have in common after so many steps of a solver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.errors import InputError
+from calstudy.base.resources import LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.cost import FIRST_ORDER_STEP, PAPER_SAMPLES
+from calstudy.experiment.model import Variant
+from calstudy.products import corruption, simulation
+from calstudy.products.corruption import PARITIES
+from calstudy.products.files import DATA, VISIBILITIES, read_visibilities, write_json
+from calstudy.products.graph import Graph, size_of
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from calstudy.calibrate.agreement import Baselines
+    from calstudy.calibrate.bias import Realization
+    from calstudy.calibrate.settings import Solver
+    from calstudy.calibrate.trace import Checkpoint
+
+PATHS = "convergence.json"
+
+
+def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
+    """Return the task that follows one solver on one integration of both realizations of a variant.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    name
+        Of the variant.
+    solver
+        Settings of the solver, in place of the experiment's own.
+    integration
+        Counted from 0.
+    """
+    experiment = graph.experiment
+    variant = experiment.variants[name]
+    noise = Variant(components=("noise",))
+    inputs = {f"data {parity}": corruption.data(graph, variant, parity) for parity in PARITIES}
+    if "noise" in variant.components:
+        inputs |= {f"noise {parity}": corruption.data(graph, noise, parity) for parity in PARITIES}
+    inputs["eor"] = corruption.data(graph, Variant(components=("eor",)), "even")
+    if variant.effects:
+        inputs["gains"] = corruption.gains(graph)
+    if (foregrounds := simulation.foregrounds(graph)) is not None:
+        inputs["sky_model"] = foregrounds
+    settings = {
+        "calibration": experiment.calibration.model_copy(update={"solver": solver}),
+        "integration": integration,
+        "steps": list(experiment.outputs.convergence.steps),
+        "buffer": experiment.power.wedge_buffer,
+    }
+    return Task(CONVERGENCE, f"{solver.name} on {name}, integration {integration}", settings, inputs)
+
+
+def follow(job: Job) -> Mapping[str, Any]:
+    """Solve one integration of both realizations, and write what they have in common after so many steps.
+
+    Powers are sums over the delays outside the wedge, one per baseline, of the first polarization.
+    """
+    import numpy as np
+
+    from calstudy.calibrate.bias import cross_power
+    from calstudy.calibrate.problem import gain_products
+
+    paths, realizations = {}, {}
+    for parity in PARITIES:
+        realizations[parity], paths[parity], baselines = _solved(job, parity)
+    signal = _integration(job, "eor")
+    rows = []
+    for even, odd in _abreast(paths["even"], paths["odd"], job.settings["steps"]):
+        left = [
+            realizations[parity].residual_without_noise(gain_products(point.gains, baselines.antennas), point.model)
+            for parity, point in zip(PARITIES, (even, odd), strict=True)
+        ]
+        rows.append(
+            {
+                "steps": [even.n_steps, odd.n_steps],
+                "power": cross_power(left[0], left[1], baselines).tolist(),
+                "newton_decrement": [even.newton_decrement, odd.newton_decrement],
+                "decrement_rms": [even.decrement_rms, odd.decrement_rms],
+            }
+        )
+    power = cross_power(signal, signal, baselines)
+    write_json(
+        job.output / PATHS,
+        {
+            "checkpoints": rows,
+            "antennas": baselines.antennas.tolist(),
+            "signal": power.tolist(),
+            "signal_rms": float(np.sqrt(np.mean(np.abs(signal) ** 2))),
+        },
+    )
+    return {"steps": [row["steps"][0] for row in rows]}
+
+
+def _abreast(
+    even: list[Checkpoint], odd: list[Checkpoint], steps: Sequence[int]
+) -> Iterator[tuple[Checkpoint, Checkpoint]]:
+    """Yield what both realizations held after the same numbers of steps; one that has ended stays where it is."""
+    last = max(even[-1].n_steps, odd[-1].n_steps)
+    seen = -1
+    for step in sorted({step for step in steps if step < last} | {last}):
+        first, second = (next((point for point in path if point.n_steps >= step), path[-1]) for path in (even, odd))
+        if max(first.n_steps, second.n_steps) > seen:
+            seen = max(first.n_steps, second.n_steps)
+            yield first, second
+
+
+def _integration(job: Job, name: str) -> np.ndarray:
+    """Return one integration of the first polarization of an input, (Nbls, Nfreqs)."""
+    from calstudy.base.visibilities import to_cube
+
+    return to_cube(read_visibilities(job.inputs[name] / DATA))[job.settings["integration"], ..., 0]
+
+
+def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Baselines]:
+    """Return a realization, what the solver held on the way, as often as is asked for, and the baselines."""
+    import numpy as np
+
+    from calstudy.base.observation import Observation
+    from calstudy.calibrate.agreement import Baselines
+    from calstudy.calibrate.bias import Realization
+    from calstudy.calibrate.calamity import make_solver
+    from calstudy.calibrate.interface import Assumed
+    from calstudy.calibrate.preparation import make_problem, prepare
+    from calstudy.calibrate.problem import gain_products
+    from calstudy.calibrate.trace import trace
+    from calstudy.products.selection import read_gains
+
+    settings = job.settings["calibration"]
+    index, steps = job.settings["integration"], job.settings["steps"]
+    data = read_visibilities(job.inputs[f"data {parity}"] / DATA)
+    chosen = np.arange(index * data.Nbls, (index + 1) * data.Nbls)
+    data = data.select(blt_inds=chosen, inplace=False, run_check=False)
+    sky = None
+    if "sky_model" in job.inputs:
+        sky = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
+        sky = sky.select(blt_inds=chosen, inplace=False, run_check=False)
+    assumed = Assumed(None if sky is None else Observation(sky))
+    prepared = prepare(Observation(data), settings, assumed)
+    problem = make_problem(prepared, settings, slice(0, 1), 0)
+    if isinstance(problem, str):
+        raise InputError(f"outputs.convergence: integration {index} cannot be calibrated: {problem}")
+    antennas = prepared.structure.antennas
+    products = np.ones(problem.visibilities.shape, complex)
+    if "gains" in job.inputs:
+        products = gain_products(read_gains(job.inputs["gains"]).of(prepared.data.numbers)[0], antennas)
+    noise = np.zeros_like(products)
+    if f"noise {parity}" in job.inputs:
+        noise = _integration(job, f"noise {parity}")
+    baselines = Baselines(antennas, prepared.data.lengths, prepared.data.frequencies, job.settings["buffer"])
+    if not prepared.fitted.all():
+        raise InputError("outputs.convergence: autocorrelations cannot be among the data")
+    found = trace(problem, make_solver(settings), steps)
+    return Realization(problem.visibilities, noise, products), found, baselines
+
+
+def _cost(task: Task) -> Cost:
+    size, solver = size_of(task), task.settings["calibration"].solver
+    work = size.baselines * size.channels.count / PAPER_SAMPLES
+    step = 0.3 if solver.name == "gauss-newton" else FIRST_ORDER_STEP
+    steps = 10 if solver.name == "gauss-newton" else min(solver.max_steps, max(task.settings["steps"]))
+    data = 4 * size.samples * 8
+    return Cost(20 + 2 * steps * step * work, LIBRARIES_MEMORY + 1.5e9 * work + data, 1e6)
+
+
+CONVERGENCE = Stage(name="convergence", version=3, make=follow, cost=_cost)

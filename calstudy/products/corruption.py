@@ -1,0 +1,219 @@
+"""From simulated components to measurements: the levels of EoR and noise, what effects draw, and what they do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.corrupt.interface import GainEffect
+from calstudy.corrupt.settings import NoNoise
+from calstudy.experiment.model import Variant
+from calstudy.products import simulation
+from calstudy.products.files import (
+    DATA,
+    GAINS,
+    VISIBILITIES,
+    read_json,
+    read_visibilities,
+    write_json,
+    write_visibilities,
+)
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+PARITIES = ("even", "odd")
+"""Names of the two noise realizations."""
+LEVELS, TRUTH = "levels.json", "truth.h5"
+
+
+def truths(graph: Graph) -> list[Task]:
+    """Return the tasks of what each effect of the experiment draws, in the order of the effects."""
+    return [_truth(graph, place) for place in range(len(graph.experiment.corruption.effects))]
+
+
+@once
+def _truth(graph: Graph, place: int) -> Task:
+    experiment = graph.experiment
+    effect = experiment.corruption.effects[place]
+    settings = {"instrument": experiment.instrument.without_beams(), "effect": effect}
+    return Task(DRAW_EFFECT, effect.label, settings)
+
+
+@once
+def gains(graph: Graph) -> Task:
+    """Return the task of the true gains: the product of all effects on the gains, unity if there are none."""
+    effects = graph.experiment.corruption.effects
+    drawn = zip(effects, truths(graph), strict=True)
+    factors = [truth for effect, truth in drawn if isinstance(effect, GainEffect)]
+    settings = {"instrument": graph.experiment.instrument.without_beams()}
+    return Task(MULTIPLY_GAINS, "true gains", settings, _numbered(factors))
+
+
+def _numbered(tasks: Sequence[Task]) -> dict[str, Task]:
+    return {f"truth{place:03d}": task for place, task in enumerate(tasks)}
+
+
+@once
+def levels(graph: Graph) -> Task:
+    """Return the task of the levels: how the EoR and the noise are scaled."""
+    inputs = {"eor": simulation.eor(graph)}
+    if (foregrounds := simulation.foregrounds(graph)) is not None:
+        inputs["foregrounds"] = foregrounds
+    corruption = graph.experiment.corruption.reset("effects")
+    noise = corruption.noise if corruption.noise.kind == "none" else corruption.noise.reset("seeds")
+    settings = {"corruption": corruption.model_copy(update={"noise": noise})}
+    return Task(MEASURE_LEVELS, "levels", settings, inputs)
+
+
+@once
+def data(graph: Graph, variant: Variant, parity: str) -> Task:
+    """Return the task of the measurement of one noise realization of a variant, before any calibration.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    variant
+        Its components, and whether effects happen to them.
+    parity
+        "even" or "odd".
+    """
+    experiment = graph.experiment
+    settings: dict[str, Any] = {
+        "components": sorted(variant.components),
+        "instrument": experiment.instrument.without_beams(),
+    }
+    inputs = {"levels": levels(graph)}
+    label = "+".join(variant.components)
+    if "noise" in variant.components:
+        noise = experiment.corruption.noise
+        if isinstance(noise, NoNoise):
+            raise LookupError(f"{label}: corruption.noise is 'none'")
+        settings["noise_seed"] = noise.seeds[PARITIES.index(parity)]
+        label = f"{label} {parity}"
+    if "foregrounds" in variant.components and (foregrounds := simulation.foregrounds(graph)) is not None:
+        inputs["foregrounds"] = foregrounds
+    if "eor" in variant.components:
+        inputs["eor"] = simulation.eor(graph)
+    if variant.effects and experiment.corruption.effects:
+        settings["effects"] = list(experiment.corruption.effects)
+        inputs |= _numbered(truths(graph))
+        label = f"effects on ({label})"
+    return Task(CORRUPT, label, settings, inputs)
+
+
+def draw_effect(job: Job) -> Mapping[str, Any]:
+    """Write what an effect draws to truth.h5, a data set for each array."""
+    import h5py
+
+    from calstudy.base.observation import Observation
+    from calstudy.corrupt.interface import draw_truth
+    from calstudy.instrument.telescope import make_template
+
+    truth = draw_truth(job.settings["effect"], Observation(make_template(job.settings["instrument"])))
+    with h5py.File(job.output / TRUTH, "w") as file:
+        for name, array in truth.items():
+            file[name] = array
+    return {"arrays": {name: list(array.shape) for name, array in truth.items()}}
+
+
+def read_truth(folder: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a product of the stage `effect`."""
+    import h5py
+
+    with h5py.File(folder / TRUTH, "r") as file:
+        return {name: data[()] for name, data in file.items()}
+
+
+def multiply_gains(job: Job) -> Mapping[str, Any]:
+    """Write the product of the gains of all effects to gains.calh5."""
+    import numpy as np
+
+    from calstudy.base.gains import make_uvcal
+    from calstudy.base.visibilities import antenna_rows
+    from calstudy.instrument.telescope import make_template
+
+    template = make_template(job.settings["instrument"])
+    product = np.ones((template.telescope.Nants, template.Nfreqs, 1, template.Npols), dtype=complex)
+    rows = antenna_rows(template)
+    for folder in job.inputs.values():
+        product[rows] *= read_truth(folder)["gains"]
+    make_uvcal(template, product).write_calh5(job.output / GAINS)
+    return {}
+
+
+def measure_levels(job: Job) -> Mapping[str, Any]:
+    """Write the scales of EoR and noise to levels.json."""
+    from calstudy.base.visibilities import to_cube
+    from calstudy.corrupt.levels import rms, set_levels
+
+    measured = {
+        name: rms(to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))) if name in job.inputs else 0.0
+        for name in ("foregrounds", "eor")
+    }
+    found = asdict(set_levels(measured["foregrounds"], measured["eor"], job.settings["corruption"]))
+    write_json(job.output / LEVELS, found)
+    return {"levels_jy": found, "warnings": _floor_warnings(job)}
+
+
+def _floor_warnings(job: Job) -> list[str]:
+    """Warn if the simulated foregrounds leak more beyond the horizon than the EoR that is put on them."""
+    level = job.settings["corruption"].eor_level
+    if "foregrounds" not in job.inputs or level is None:
+        return []
+    floors = read_json(job.inputs["foregrounds"] / simulation.QUALITY)["delay_floor"]
+    return [
+        f"the simulated foregrounds have a delay floor of {floor['worst_db']} dB beyond the horizon "
+        f"({taper} taper), above the EoR at {level:g} dB"
+        for taper, floor in floors.items()
+        if floor["worst_db"] > level
+    ]
+
+
+def corrupt(job: Job) -> Mapping[str, Any]:
+    """Write the sum of F, S and N, or of those that are asked for, after all effects, to data.uvh5."""
+    import numpy as np
+
+    from calstudy.base.observation import Observation
+    from calstudy.base.visibilities import from_cube, to_cube
+    from calstudy.corrupt.interface import apply_effect
+    from calstudy.corrupt.levels import Levels, rms
+    from calstudy.corrupt.noise import thermal_noise
+    from calstudy.instrument.telescope import make_template
+
+    found = Levels(**read_json(job.inputs["levels"] / LEVELS))
+    template = make_template(job.settings["instrument"])
+    components = job.settings["components"]
+    cube = np.zeros((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), dtype=np.complex128)
+    for name, factor in (("foregrounds", 1.0), ("eor", found.eor_factor)):
+        if name in components:
+            cube += factor * to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))
+    if "noise" in components:
+        cube += thermal_noise(cube.shape, found.noise_std, job.settings["noise_seed"])
+    observation = Observation(template)
+    for place, effect in enumerate(job.settings.get("effects", ())):
+        cube = apply_effect(effect, cube, observation, read_truth(job.inputs[f"truth{place:03d}"]))
+    write_visibilities(from_cube(template, cube), job.output / DATA, single=True)
+    return {"rms_jy": rms(cube)}
+
+
+def _cost_of_corruption(task: Task) -> Cost:
+    samples = size_of(task).samples
+    return Cost(1 + samples * 1e-7, LIBRARIES_MEMORY + 5 * samples * COMPLEX128, samples * COMPLEX64)
+
+
+def _cost_of_levels(task: Task) -> Cost:
+    return Cost(2, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e3)
+
+
+DRAW_EFFECT = Stage(name="effect", version=1, make=draw_effect, cost=lambda task: Cost(1, disk=1e6))
+MULTIPLY_GAINS = Stage(name="gains", version=2, make=multiply_gains, cost=lambda task: Cost(1, disk=1e6))
+MEASURE_LEVELS = Stage(name="levels", version=2, make=measure_levels, cost=_cost_of_levels)
+CORRUPT = Stage(name="corrupt", version=2, make=corrupt, cost=_cost_of_corruption)

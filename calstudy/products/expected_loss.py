@@ -1,0 +1,101 @@
+"""What the fit of one integration is expected to leave of the EoR, from its own tangent space."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from calstudy.base.errors import InputError
+from calstudy.base.resources import LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.cost import PAPER_SAMPLES
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.products import calibration, corruption, simulation
+from calstudy.products.files import DATA, MODEL, VISIBILITIES, read_visibilities
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+EXPECTED = "expected-loss.h5"
+# Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
+# further within a bin.
+PROBES = 16
+
+
+@once
+def expected_loss(graph: Graph) -> Task:
+    """Return the task that predicts T for the middle integration of the variant `residual`."""
+    residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
+    inputs = {
+        "data": corruption.data(graph, residual, "even"),
+        "calibration": calibration.calibration(graph, residual, "even"),
+    }
+    if (foregrounds := simulation.foregrounds(graph)) is not None:
+        inputs["sky_model"] = foregrounds
+    settings = {
+        "calibration": graph.experiment.calibration,
+        "power": graph.experiment.power.reset("pairs", "redundancy_tolerance"),
+        "integration": graph.experiment.instrument.times.count // 2,
+        "probes": PROBES,
+    }
+    return Task(EXPECTED_LOSS, "expected signal loss", settings, inputs)
+
+
+def expect(job: Job) -> Mapping[str, Any]:
+    """Write the expected T of one calibrated integration, in bins of k and of baseline length and delay."""
+    import numpy as np
+
+    from calstudy.base.observation import Observation
+    from calstudy.base.visibilities import to_cube
+    from calstudy.calibrate.expected_loss import DelayModes, expected_transfer
+    from calstudy.calibrate.interface import Assumed
+    from calstudy.calibrate.preparation import make_problem, prepare
+    from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
+    from calstudy.power.expected import BaselineModes, bin_expected
+    from calstudy.power.spherical import make_bin_edges
+    from calstudy.power.tables import save_spectrum
+    from calstudy.products.selection import read_gains
+
+    settings, power = job.settings["calibration"], job.settings["power"]
+    index = job.settings["integration"]
+    data = read_visibilities(job.inputs["data"] / DATA)
+    chosen = np.arange(index * data.Nbls, (index + 1) * data.Nbls)
+    sky = None
+    if "sky_model" in job.inputs:
+        sky = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
+        sky = sky.select(blt_inds=chosen, inplace=False, run_check=False)
+    assumed = Assumed(None if sky is None else Observation(sky))
+    chosen_data = Observation(data.select(blt_inds=chosen, inplace=False, run_check=False))
+    prepared = prepare(chosen_data, settings, assumed)
+    problem = make_problem(prepared, settings, slice(0, 1), 0)
+    fitted = read_gains(job.inputs["calibration"])
+    if isinstance(problem, str) or fitted.flags[index].any():
+        raise InputError(f"expected-loss: integration {index} was not calibrated in all antennas and channels")
+    model = to_cube(read_visibilities(job.inputs["calibration"] / MODEL))[index, ..., 0]
+    frequency = np.asarray(data.freq_array, float)
+    modes = DelayModes(frequency, power.taper)
+    expected = expected_transfer(problem, fitted.of(prepared.data.numbers)[index], model, modes, job.settings["probes"])
+    cosmology, centre = make_cosmology(power.cosmology), float(frequency.mean())
+    lengths = prepared.data.lengths
+    binned = bin_expected(
+        BaselineModes(
+            transfer=expected.transfer,
+            error=expected.error,
+            length=lengths,
+            k_perp=k_perpendicular(cosmology, lengths, centre),
+            delay=expected.delay,
+            k_parallel=k_parallel(cosmology, expected.delay, centre),
+        ),
+        make_bin_edges(power.bins),
+        power.wedge_buffer,
+        power.length_bin,
+    )
+    save_spectrum(job.output / EXPECTED, binned)
+    return {"integration": index, "probes": job.settings["probes"]}
+
+
+def _cost(task: Task) -> Cost:
+    size = size_of(task)
+    work = size.baselines * size.channels.count / PAPER_SAMPLES
+    return Cost(6 + 0.8 * task.settings["probes"] * work, LIBRARIES_MEMORY + 1.5e9 * work, 1e6)
+
+
+EXPECTED_LOSS = Stage(name="expected-loss", version=2, make=expect, cost=_cost)

@@ -1,0 +1,76 @@
+"""Read and write the files that products consist of."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pyuvdata import UVData
+
+VISIBILITIES, DATA, GAINS, AVERAGE = "visibilities.uvh5", "data.uvh5", "gains.calh5", "average.uvh5"
+MODEL, RESIDUAL, SOLUTION = "model.uvh5", "residual.uvh5", "solution.json"
+"""Files of simulated components, measurements, gains, averages and calibrations."""
+
+
+def spectrum_file(name: str, kind: str) -> str:
+    """Return the name of the file that holds an averaged power spectrum or a transfer function.
+
+    Parameters
+    ----------
+    name
+        A variant, or one of the names in `calstudy.products.signal_loss`.
+    kind
+        "wedge" for the cylindrical one; "all-modes", "outside-wedge" or "inside-wedge" for spherical ones.
+    """
+    return f"{name}.{kind}.h5"
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Send the warnings of libraries to the log instead of the terminal."""
+    logging.captureWarnings(True)
+    try:
+        yield
+    finally:
+        logging.captureWarnings(False)
+
+
+def read_visibilities(path: Path) -> UVData:
+    """Read a UVH5 product as it was written."""
+    from pyuvdata import UVData
+
+    return UVData.from_file(path, file_type="uvh5", run_check=False)
+
+
+def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:
+    """Write UVH5; `single` stores complex64, whose rounding (6e-8) is far below any noise that a study adds.
+
+    Parameters
+    ----------
+    uvd
+        Visibilities in Jy.
+    path
+        Of the file.
+    single
+        Whether complex64 is stored.
+    """
+    uvd.write_uvh5(path, data_write_dtype=np.dtype(np.complex64 if single else np.complex128))
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON file; NaN and infinity are refused, for they are not JSON."""
+    path.write_text(json.dumps(value, indent=1, allow_nan=False), encoding="utf-8")

@@ -1,0 +1,64 @@
+"""The graph of an experiment: its tasks, each made once however many others need it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from calstudy.experiment.model import Experiment
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.size import Size
+from calstudy.run.task import Task
+
+Made = TypeVar("Made")
+Arguments = ParamSpec("Arguments")
+
+
+class Graph:
+    """The tasks of one experiment; the modules of this package make them, each those of its own products.
+
+    Parameters
+    ----------
+    experiment
+        Validated.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment = experiment
+        self.size = Size.of(experiment.instrument)
+        self._made: dict[Hashable, Any] = {}
+
+
+def once(make: Callable[Concatenate[Graph, Arguments], Made]) -> Callable[Concatenate[Graph, Arguments], Made]:
+    """Make ``make(graph, ...)`` return the same task whenever it is called with the same graph and arguments."""
+
+    @wraps(make)
+    def task(graph: Graph, *arguments: Arguments.args, **named: Arguments.kwargs) -> Made:
+        key = (make, arguments, tuple(named.items()))
+        if key not in graph._made:
+            graph._made[key] = make(graph, *arguments, **named)
+        return graph._made[key]
+
+    return task
+
+
+def required(task: Task | None) -> Task:
+    """Return the task of a product that an experiment may lack, where it must have it; raises LookupError if not."""
+    if task is None:
+        raise LookupError("the experiment does not have a product that is needed of it")
+    return task
+
+
+def size_of(task: Task) -> Size:
+    """Return the size of the data that a task works on: of its instrument, or of the nearest it is made from."""
+    instrument = _instrument_of(task)
+    if instrument is None:
+        raise LookupError(f"{task.stage.name} ({task.label}): made from no instrument")
+    return Size.of(instrument)
+
+
+def _instrument_of(task: Task) -> InstrumentSettings | None:
+    if "instrument" in task.settings:
+        return task.settings["instrument"]
+    return next((found for found in map(_instrument_of, task.needs.values()) if found is not None), None)

@@ -1,0 +1,143 @@
+"""Read from products the part that concerns single antennas and baselines; of several polarizations, the first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pyuvdata import UVCal, UVData
+
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import antenna_pairs, to_cube
+from calstudy.calibrate.degeneracy import align
+from calstudy.instrument import settings as section
+from calstudy.instrument.layouts import Layout, make_layout
+from calstudy.products.files import GAINS
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Gains of all antennas.
+
+    Attributes
+    ----------
+    numbers
+        Antenna numbers, ascending, (Nants,).
+    frequency
+        Channel centres, Hz, (Nfreqs,).
+    values
+        Complex, (Ntimes, Nants, Nfreqs); one time stands for all.
+    flags
+        Where there is no solution, of the same shape.
+    """
+
+    numbers: np.ndarray
+    frequency: np.ndarray
+    values: np.ndarray
+    flags: np.ndarray
+
+    def of(self, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Return the gains of some antennas, (Ntimes, len(numbers), Nfreqs)."""
+        return self.values[:, np.searchsorted(self.numbers, numbers)]
+
+
+@dataclass(frozen=True)
+class AlignedGains:
+    """True and fitted gains of one integration, all antennas, the fit brought closest to the truth.
+
+    Attributes
+    ----------
+    numbers, frequency
+        Antenna numbers (Nants,) and channel centres (Nfreqs,), Hz.
+    true, fitted
+        Complex, (Nants, Nfreqs).
+    scale
+        What the fitted gains were multiplied by; the fitted model is to be divided by its square.
+    """
+
+    numbers: np.ndarray
+    frequency: np.ndarray
+    true: np.ndarray
+    fitted: np.ndarray
+    scale: float
+
+    def rows(self, numbers: Sequence[int]) -> np.ndarray:
+        """Return where antennas are in `true` and `fitted`."""
+        return np.searchsorted(self.numbers, numbers)
+
+
+def read_gains(folder: Path) -> Gains:
+    """Read the gains of a product of stage `gains` or `calibrate`."""
+    cal = UVCal.from_file(folder / GAINS)
+    order = np.argsort(cal.ant_array)
+    values, flags = (np.moveaxis(array[order][..., 0], 2, 0) for array in (cal.gain_array, cal.flag_array))
+    return Gains(cal.ant_array[order], cal.freq_array, values, flags)
+
+
+def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGains:
+    """Read true and fitted gains, and align the fit with the truth.
+
+    Parameters
+    ----------
+    true, fitted
+        Folders of products of the stages `gains` and `calibrate`.
+    integration
+        Index of the integration.
+
+    Raises
+    ------
+    InputError
+        If this integration has no solution.
+    """
+    truth, fit = read_gains(true), read_gains(fitted)
+    if fit.flags[integration].any():
+        raise InputError(
+            f"outputs.inspect.integration = {integration}: it was not calibrated in all antennas and channels; "
+            "choose one that was"
+        )
+    reference = truth.of(fit.numbers)[0]
+    aligned, scale = align(fit.values[integration], reference)
+    return AlignedGains(fit.numbers, fit.frequency, reference, aligned, scale)
+
+
+def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Read single baselines of a UVH5 product.
+
+    Parameters
+    ----------
+    path
+        The file.
+    pairs
+        Antenna numbers (a, b), in the order in which the product has them.
+
+    Returns
+    -------
+    Visibilities in Jy, complex, (len(pairs), Ntimes, Nfreqs).
+    """
+    uvd = UVData.from_file(path, file_type="uvh5", bls=list(pairs), run_check=False)
+    found = [tuple(pair) for pair in antenna_pairs(uvd).tolist()]
+    cube = to_cube(uvd)[..., 0]
+    return np.stack([cube[:, found.index(tuple(pair))] for pair in pairs])
+
+
+def layout_of(settings: section.Layout) -> Layout:
+    """Return the layout that settings describe."""
+    return make_layout(settings)
+
+
+def baseline(layout: Layout, places: Sequence[int]) -> tuple[tuple[int, int], float]:
+    """Return antenna numbers (a, b), as products have them, and length in m of the baseline between two places."""
+    first, second = sorted(places)
+    length = float(np.linalg.norm(layout.enu[second] - layout.enu[first]))
+    return (int(layout.numbers[first]), int(layout.numbers[second])), length
+
+
+def spread_in_length(layout: Layout, count: int) -> list[tuple[int, int]]:
+    """Return the places of the antennas of `count` baselines, from short to long, evenly among all lengths."""
+    first, second = np.triu_indices(len(layout.numbers), 1)
+    lengths = np.linalg.norm(layout.enu[second] - layout.enu[first], axis=1)
+    order = np.argsort(lengths, kind="stable")
+    chosen = order[((np.arange(count) + 0.5) / count * lengths.size).astype(int)]
+    return [(int(first[index]), int(second[index])) for index in dict.fromkeys(chosen.tolist())]

@@ -1,0 +1,121 @@
+"""Signal loss: the response of the residual to the EoR, its power, and the transfer function T = P^R / P^S."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from calstudy.base.resources import Cost
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.products import spectra
+from calstudy.products.corruption import PARITIES
+from calstudy.products.files import AVERAGE, read_visibilities, spectrum_file, write_visibilities
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+REGIONS = {"outside-wedge": False, "inside-wedge": True}
+"""Names of the parts of Fourier space, and whether each is inside the wedge."""
+TRANSFER = "transfer"
+BAND = "transfer-bands"
+
+
+@once
+def transfer(graph: Graph) -> Task | None:
+    """Return the task that measures T, or None if the experiment does not calibrate data with the EoR and without."""
+    if not graph.experiment.measures_signal_loss:
+        return None
+    residual, without, eor = (graph.experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS)
+    responses = {
+        parity: Task(
+            DIFFERENCE,
+            f"response to the EoR {parity}",
+            {},
+            {
+                "with_signal": spectra.average(graph, residual, parity),
+                "without_signal": spectra.average(graph, without, parity),
+            },
+        )
+        for parity in PARITIES
+    }
+    signal = spectra.average(graph, eor, "even")
+    inputs = {
+        "signal": spectra.power(graph, "eor"),
+        "response": spectra.crossed(graph, "response to the EoR", responses),
+        "cross": spectra.crossed(graph, "EoR x response", {"even": signal, "odd": responses["odd"]}),
+        "spectra": spectra.spectra(graph),
+    }
+    return Task(TRANSFER_STAGE, "signal loss", {"power": graph.experiment.power}, inputs)
+
+
+def difference(job: Job) -> Mapping[str, Any]:
+    """Write the response of an averaged residual to the signal to average.uvh5."""
+    from calstudy.power.transfer import signal_response
+
+    with_signal, without = (read_visibilities(job.inputs[name] / AVERAGE) for name in ("with_signal", "without_signal"))
+    write_visibilities(signal_response(with_signal, without), job.output / AVERAGE)
+    return {}
+
+
+def measure(job: Job) -> Mapping[str, Any]:
+    """Write T per k outside and inside the wedge and per (|b|, tau), and the residual's power corrected by it."""
+    from calstudy.power.spherical import make_bin_edges
+    from calstudy.power.tables import save_spectrum, write_transfer_csv
+    from calstudy.power.transfer import BANDS, Injection, cylindrical_transfer, spherical_transfer
+
+    settings = job.settings["power"]
+    delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
+    injection = Injection(**delays)
+    fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
+    summary = {}
+    for region, inside in REGIONS.items():
+        for name, edges in ((TRANSFER, fine), (BAND, BANDS)):
+            found = spherical_transfer(injection, edges, buffer, inside)
+            save_spectrum(job.output / spectrum_file(name, region), found)
+            write_transfer_csv(job.output / f"{name}.{region}.csv", found)
+        summary[region] = [
+            {"k": [low, high], "transfer": _json(value), "error": _json(error)}
+            for low, high, value, error in zip(BANDS[:-1], BANDS[1:], found.transfer, found.transfer_error, strict=True)
+        ]
+    save_spectrum(job.output / spectrum_file(TRANSFER, "wedge"), cylindrical_transfer(injection, settings.length_bin))
+    _write_corrected(job)
+    return {"transfer": summary}
+
+
+def _json(value: float) -> float | None:
+    return round(float(value), 4) if math.isfinite(value) else None
+
+
+def _write_corrected(job: Job) -> None:
+    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.tables import load_spectrum, write_columns
+    from calstudy.power.transfer import TransferFunction, correct
+
+    found = load_spectrum(job.output / spectrum_file(TRANSFER, "outside-wedge"), TransferFunction)
+    residual, signal = (
+        load_spectrum(job.inputs["spectra"] / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
+        for name in ("residual", "eor")
+    )
+    power, error = correct(residual, found)
+    unit = "[mK2 h-3 Mpc3]"
+    write_columns(
+        job.output / "residual-corrected.outside-wedge.csv",
+        {
+            "k [h/Mpc]": found.k,
+            f"residual {unit}": residual.power.real,
+            f"residual error {unit}": residual.error,
+            "transfer": found.transfer,
+            "transfer error": found.transfer_error,
+            f"corrected {unit}": power,
+            f"corrected error {unit}": error,
+            f"eor {unit}": signal.power.real,
+        },
+    )
+
+
+def _cost_of_difference(task: Task) -> Cost:
+    return Cost(1, disk=size_of(task).baselines * 1e4)
+
+
+DIFFERENCE = Stage(name="difference", version=2, make=difference, cost=_cost_of_difference)
+TRANSFER_STAGE = Stage(name="transfer", version=2, make=measure, cost=lambda task: Cost(4, disk=1e6))

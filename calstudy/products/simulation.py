@@ -1,0 +1,160 @@
+"""The simulated components: the foreground visibilities F and the EoR visibilities S."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.instrument.size import Size
+from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
+from calstudy.products.graph import Graph, once
+from calstudy.run.task import Job, Stage, Task
+from calstudy.simulate.interface import SimulationSize
+from calstudy.sky.settings import Eor
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+    from calstudy.simulate.component import Component
+    from calstudy.simulate.floor import DelayFloor
+    from calstudy.sky.settings import Foregrounds
+
+CHUNK = "chunk.uvh5"
+QUALITY = "quality.json"
+TOLERATED = 100
+"""Interpolation errors up to this times the tolerance, which bounds a typical one, go without a warning."""
+
+SOURCES = 546_000
+TIME_NODES, FREQUENCY_NODES = 16, 96
+
+
+@once
+def foregrounds(graph: Graph) -> Task | None:
+    """Return the task of the foreground visibilities F, or None if the sky has none."""
+    settings = graph.experiment.sky.foregrounds
+    return None if settings.kind == "none" else _simulation(graph, "foregrounds", settings)
+
+
+@once
+def eor(graph: Graph) -> Task:
+    """Return the task of the EoR visibilities S, in absolute units."""
+    return _simulation(graph, "eor", graph.experiment.sky.eor)
+
+
+def _simulation(graph: Graph, component: str, sky: Foregrounds | Eor) -> Task:
+    experiment = graph.experiment
+    settings: dict[str, Any] = {"instrument": experiment.instrument, "simulation": experiment.simulation, "sky": sky}
+    if isinstance(sky, Eor):
+        settings["cosmology"] = experiment.power.cosmology
+    count = min(experiment.simulation.chunks, experiment.instrument.channels.count)
+    pieces = {
+        f"chunk{index:03d}": Task(
+            SIMULATE_CHUNK,
+            f"{component} {index + 1}/{count}",
+            {**settings, "chunks": experiment.simulation.chunks, "index": index},
+            temporary=True,
+        )
+        for index in range(count)
+    }
+    return Task(SIMULATE, component, settings, pieces=pieces)
+
+
+def _component(job: Job) -> Component:
+    from calstudy.simulate.component import Component
+
+    settings = job.settings
+    return Component(
+        settings["instrument"], settings["simulation"], settings["sky"], settings.get("cosmology", "Planck15")
+    )
+
+
+def simulate_chunk(job: Job) -> Mapping[str, Any]:
+    """Write a block of frequency nodes at all integrations to chunk.uvh5; a piece beyond the nodes stays empty."""
+    from calstudy.base.visibilities import from_cube
+    from calstudy.instrument.telescope import subset_template
+    from calstudy.simulate.chunks import simulate_chunk as simulate
+    from calstudy.simulate.nodes import integration_times
+
+    component = _component(job)
+    if job.settings["index"] >= len(component.chunks):
+        return {"empty": True}
+    chunk = component.chunks[job.settings["index"]]
+    sky = component.sky(chunk.channels if component.is_eor else slice(None))
+    cube = simulate(component.engine, sky, component.beam, component.template, chunk)
+    frame = subset_template(component.template, integration_times(component.template), chunk.frequencies)
+    write_visibilities(from_cube(frame, cube), job.output / CHUNK)
+    return {"frequencies": len(chunk.frequencies), "components": int(sky.Ncomponents)}
+
+
+def assemble(job: Job) -> Mapping[str, Any]:
+    """Write the visibilities at all channels to visibilities.uvh5, and measures of their quality to quality.json."""
+    from calstudy.base.visibilities import from_cube, to_cube
+    from calstudy.simulate.chunks import assemble as join
+
+    component = _component(job)
+    count = len(component.chunks)
+    cubes = [to_cube(read_visibilities(job.inputs[f"chunk{index:03d}"] / CHUNK)) for index in range(count)]
+    data = from_cube(component.template, join(component.chunks, cubes))
+    quality: dict[str, Any] = {"interpolation": component.interpolation_error(to_cube(data))}
+    if not component.is_eor:
+        quality["delay_floor"] = _floors(data)
+    write_visibilities(data, job.output / VISIBILITIES)
+    write_json(job.output / QUALITY, quality)
+    return {**quality, "stand_ins": component.stand_ins, "warnings": _warnings(component, quality)}
+
+
+def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
+    """Warn of an interpolation error far above the tolerance, as a beam much wider than `beam_extent` makes."""
+    check, nodes = quality["interpolation"], component.simulation.nodes
+    if check is None or check["max_error"] <= TOLERATED * nodes.tolerance:
+        return []
+    return [
+        f"interpolation between simulation nodes errs by {check['max_error']:.1e} of the rms, where simulation.nodes."
+        f"tolerance is {nodes.tolerance:.0e}: raise simulation.nodes.beam_extent, or set simulation.nodes.enabled=false"
+    ]
+
+
+def _floors(data: UVData) -> dict[str, Any]:
+    """Measure the delay floor with both tapers, where the band leaves delays beyond the horizon for them."""
+    from calstudy.simulate.floor import delay_floor, floor_buffers
+
+    return {
+        taper: _as_json(delay_floor(data, buffer=buffer, taper=taper)) for taper, buffer in floor_buffers(data).items()
+    }
+
+
+def _as_json(floor: DelayFloor) -> dict[str, Any]:
+    """Return the floor with lists for arrays, and null for bins without baselines."""
+    rounded = {
+        name: [None if value != value else round(float(value), 2) for value in getattr(floor, name)]
+        for name in ("edges", "rms_db", "max_db")
+    }
+    return {**rounded, "buffer_s": floor.buffer, "worst_db": round(floor.worst_db, 2)}
+
+
+def _cost_of_chunk(task: Task) -> Cost:
+    instrument, simulation, sky = (task.settings[name] for name in ("instrument", "simulation", "sky"))
+    size, nodes = Size.of(instrument), simulation.nodes.enabled
+    channels = size.channels.count
+    pieces = min(simulation.chunks, channels)
+    times = min(size.times, TIME_NODES) if nodes else size.times
+    if isinstance(sky, Eor):
+        sources, spectral = 12 * sky.nside**2, channels / simulation.chunks
+    else:
+        sources, spectral = min(getattr(sky, "count", None) or SOURCES, SOURCES), 0.0
+        channels = min(channels, FREQUENCY_NODES) if nodes else channels
+    work = SimulationSize(sources, times * channels / pieces, size.antennas, 1 + len(instrument.antenna_beams))
+    engine = simulation.engine.cost(work)
+    disk = size.samples / size.channels.count * channels / pieces * COMPLEX128
+    memory = engine.memory + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
+    return Cost(6 + engine.seconds, memory, disk)
+
+
+def _cost(task: Task) -> Cost:
+    disk = Size.of(task.settings["instrument"]).samples * COMPLEX128
+    return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 4 * disk, disk)
+
+
+SIMULATE_CHUNK = Stage(name="simulate-chunk", version=2, make=simulate_chunk, cost=_cost_of_chunk)
+SIMULATE = Stage(name="simulate", version=2, make=assemble, cost=_cost)

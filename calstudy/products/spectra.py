@@ -1,0 +1,179 @@
+"""From visibilities to power spectra: coherent averages, delay spectra even x odd, wedge and spherical averages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.experiment.model import Component, Variant
+from calstudy.products import calibration, corruption
+from calstudy.products.corruption import PARITIES
+from calstudy.products.files import AVERAGE, DATA, RESIDUAL, read_visibilities, spectrum_file, write_visibilities
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from calstudy.power.spectra import DelaySpectra
+
+# Inputs of the spectra besides the variants, whose names cannot hold a colon.
+EOR_REFERENCE, NOISE_REFERENCE = "reference:eor", "reference:noise"
+EXCISION = {"all-modes": False, "outside-wedge": True}
+"""Names of the spherical averages, and whether each leaves the wedge out."""
+BINNING = ("bins", "wedge_buffer", "length_bin")
+"""Fields of the power section that apply to the spectra later, when they are averaged."""
+DELAY_SPECTRA = "delay-spectra.h5"
+
+
+@once
+def average(graph: Graph, variant: Variant, parity: str) -> Task:
+    """Return the task of one realization of a variant, fringe-stopped and averaged over the run.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    variant
+        Its components and effects, and whether it is calibrated.
+    parity
+        "even" or "odd".
+    """
+    make = calibration.calibration if variant.calibrate else corruption.data
+    source = make(graph, variant, parity)
+    label = f"R of {source.label}" if variant.calibrate else source.label
+    file = RESIDUAL if variant.calibrate else DATA
+    return Task(AVERAGE_STAGE, label, {"file": file}, {"data": source})
+
+
+def power(graph: Graph, name: str) -> Task:
+    """Return the task of the delay power spectra of a variant, even x odd."""
+    return variant_power(graph, name, graph.experiment.variants[name])
+
+
+@once
+def variant_power(graph: Graph, label: str, variant: Variant) -> Task:
+    """Return the task of the delay power spectra of data that need not be among the experiment's variants.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    label
+        What the data are, in a few words.
+    variant
+        Its components and effects, and whether it is calibrated.
+    """
+    return crossed(graph, label, {parity: average(graph, variant, parity) for parity in PARITIES})
+
+
+def crossed(graph: Graph, label: str, averages: Mapping[str, Task]) -> Task:
+    """Return the task of the delay power spectra of two averaged data sets, "even" x "odd".
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    label
+        What the data are, in a few words.
+    averages
+        Tasks of the averaged data, by parity.
+    """
+    instrument = graph.experiment.instrument
+    settings = {
+        "beam": instrument.beam,
+        "channels": instrument.channels,
+        "power": graph.experiment.power.reset(*BINNING),
+    }
+    return Task(POWER, label, settings, averages)
+
+
+@once
+def spectra(graph: Graph) -> Task:
+    """Return the task of the wedge and spherical spectra of all variants, with errors."""
+    variants = graph.experiment.variants
+    inputs = {name: power(graph, name) for name in variants}
+    inputs[EOR_REFERENCE] = _reference(graph, "eor")
+    if any("noise" in variant.components for variant in variants.values()):
+        inputs[NOISE_REFERENCE] = _reference(graph, "noise")
+    return Task(SPECTRA, "wedge and spherical", {"power": graph.experiment.power, "variants": variants}, inputs)
+
+
+def _reference(graph: Graph, component: Component) -> Task:
+    """Return the spectra of one component alone, which give the errors of all variants that contain it."""
+    return variant_power(graph, component, Variant(components=(component,)))
+
+
+def make_average(job: Job) -> Mapping[str, Any]:
+    """Write the fringe-stopped average of a data set to average.uvh5."""
+    from calstudy.power.average import fringe_stop_and_average
+
+    data = read_visibilities(job.inputs["data"] / job.settings["file"])
+    write_visibilities(fringe_stop_and_average(data), job.output / AVERAGE)
+    return {}
+
+
+def estimate(job: Job) -> Mapping[str, Any]:
+    """Write the delay spectra even x odd to delay-spectra.h5, and what the estimator itself exports."""
+    from calstudy.instrument.beams import make_beam
+    from calstudy.power.interface import estimate_spectra
+    from calstudy.power.tables import save_spectrum
+
+    even, odd = (read_visibilities(job.inputs[parity] / AVERAGE) for parity in PARITIES)
+    beam = make_beam(job.settings["beam"], job.settings["channels"])
+    found = estimate_spectra(even, odd, beam, job.settings["power"], job.output)
+    save_spectrum(job.output / DELAY_SPECTRA, found)
+    return {"units": len(found.n_pairs), "pairs": int(found.n_pairs.sum())}
+
+
+def read_delay_spectra(folder: Path) -> DelaySpectra:
+    """Read a product of the stage `power`."""
+    from calstudy.power.spectra import DelaySpectra
+    from calstudy.power.tables import load_spectrum
+
+    return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
+
+
+def average_spectra(job: Job) -> Mapping[str, Any]:
+    """Write, for every variant, wedge.h5 and the two spherical spectra with their errors, as HDF5 and CSV.
+
+    The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
+    (paper section Reduction of Simulation Products); each enters the variants that contain its component.
+    """
+    from calstudy.power.cylindrical import cylindrical_average
+    from calstudy.power.errors import noise_level, with_errors
+    from calstudy.power.spherical import spherical_average
+    from calstudy.power.tables import save_spectrum, write_csv
+
+    settings = job.settings["power"]
+    delays = {name: read_delay_spectra(folder) for name, folder in job.inputs.items()}
+    sigma_noise = noise_level(delays[NOISE_REFERENCE]) if NOISE_REFERENCE in delays else 0.0
+    signals = {name: spherical_average(delays[EOR_REFERENCE], settings, excise) for name, excise in EXCISION.items()}
+    for name, variant in job.settings["variants"].items():
+        save_spectrum(job.output / spectrum_file(name, "wedge"), cylindrical_average(delays[name], settings))
+        for modes, excise in EXCISION.items():
+            spectrum = with_errors(
+                spherical_average(delays[name], settings, excise),
+                noise=sigma_noise if "noise" in variant.components else 0.0,
+                signal=signals[modes] if "eor" in variant.components else None,
+            )
+            save_spectrum(job.output / spectrum_file(name, modes), spectrum)
+            write_csv(job.output / f"{name}.{modes}.csv", spectrum)
+    return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
+
+
+def _cost_of_average(task: Task) -> Cost:
+    size = size_of(task)
+    disk = size.samples / size.times * COMPLEX128
+    return Cost(1 + size.samples * 5e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
+
+
+def _cost_of_power(task: Task) -> Cost:
+    size = size_of(task)
+    return Cost(6, 1.6e9, 2 * size.baselines * size.channels.count * COMPLEX128)
+
+
+AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)
+POWER = Stage(name="power", version=3, make=estimate, cost=_cost_of_power)
+SPECTRA = Stage(name="spectra", version=2, make=average_spectra, cost=lambda task: Cost(10, disk=5e6))

@@ -1,0 +1,1 @@
+"""Tasks, their keys, the store of products, and their execution; knows no physics."""

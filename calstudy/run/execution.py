@@ -1,0 +1,256 @@
+"""Run the tasks of an experiment that are not done yet, as a dask graph, on this machine or on a cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calstudy.base import ranks
+from calstudy.base.errors import InputError
+from calstudy.base.identity import digest_json
+from calstudy.base.resources import cores
+from calstudy.run.perform import WorkOrder, perform
+from calstudy.run.store import Product, Store
+from calstudy.run.task import Task, unique
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+logger = logging.getLogger(__name__)
+
+QUIET_TENSORFLOW = {"TF_CPP_MIN_LOG_LEVEL": "3", "TF_ENABLE_ONEDNN_OPTS": "0"}
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Which tasks of a run must be made, and which products are there already.
+
+    Attributes
+    ----------
+    todo
+        Tasks to make, every one after its inputs.
+    ready
+        Products that the run needs and that are intact.
+    damaged
+        Tasks whose product was there, but not as it was written; they are in `todo`.
+    """
+
+    todo: tuple[Task, ...]
+    ready: dict[str, Product]
+    damaged: tuple[Task, ...]
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The processes that make the products.
+
+    Attributes
+    ----------
+    count
+        Worker processes to start on this machine; with one, the work is done in this process.
+    log
+        File to which worker processes of this machine append what they write to standard error.
+    scheduler
+        Address of a running dask scheduler whose workers to use instead, or None.
+    """
+
+    count: int
+    log: Path
+    scheduler: str | None = None
+
+
+def schedule(targets: Iterable[Task], store: Store) -> Schedule:
+    """Find out what must be made: the targets and what they need, as far as it is not in the store, intact."""
+    todo: dict[str, Task] = {}
+    ready: dict[str, Product] = {}
+    damaged: list[Task] = []
+
+    def visit(task: Task) -> None:
+        if task.key in todo or task.key in ready:
+            return
+        product = store.verify(task.stage.name, task.key)
+        if product is not None:
+            ready[task.key] = product
+            return
+        if store.exists(task.stage.name, task.key):
+            damaged.append(task)
+        for needed in task.needs.values():
+            visit(needed)
+        todo[task.key] = task
+
+    for task in targets:
+        visit(task)
+    return Schedule(tuple(todo.values()), ready, tuple(damaged))
+
+
+def _write_errors_to(path: Path) -> None:
+    """Append what this process and its libraries write to standard error to a file from now on."""
+    with path.open("a") as file:
+        os.dup2(file.fileno(), 2)
+
+
+@contextmanager
+def _errors_written_to(path: Path) -> Iterator[None]:
+    """Append what is written to standard error within the block to a file."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        _write_errors_to(path)
+        yield
+    finally:
+        sys.stderr.flush()
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+@contextmanager
+def _local_client(workers: int, log: Path) -> Iterator[Client]:
+    """Start workers on this machine: a thread of this process if there is one, else processes that share the cores."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    threads = str(max(1, cores() // workers))
+    environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TF_NUM_INTRAOP_THREADS"), threads)
+    environment |= QUIET_TENSORFLOW
+    settings = {
+        "distributed.nanny.pre-spawn-environ": environment,
+        "distributed.admin.tick.limit": "10 m",
+        "distributed.worker.memory.terminate": False,
+        "distributed.comm.timeouts.connect": "60 s",
+        "distributed.scheduler.allowed-failures": 2,
+    }
+    with (
+        dask.config.set(settings),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=workers > 1,
+            memory_limit=0,
+            # The scheduler serves HTTP in any case: to this machine only, on any free port.
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        if workers > 1:
+            client.run(_write_errors_to, log)
+        with _errors_written_to(log) if workers == 1 else nullcontext():
+            yield client
+
+
+@contextmanager
+def _client(workers: Workers) -> Iterator[Client]:
+    if workers.scheduler is None:
+        with _local_client(workers.count, workers.log) as client:
+            yield client
+        return
+    from distributed import Client
+
+    try:
+        client = Client(workers.scheduler, timeout="20 s")
+    except (OSError, ValueError) as error:
+        raise InputError(f"--scheduler {workers.scheduler}: cannot connect ({error})") from None
+    with client:
+        yield client
+
+
+def _submit(tasks: Sequence[Task], store: Store, client: Client) -> dict[Future, Task]:
+    futures: dict[str, Future] = {}
+    for priority, task in enumerate(tasks):
+        needed = [futures[item.key] for item in task.needs.values() if item.key in futures]
+        futures[task.key] = client.submit(
+            _perform_after,
+            WorkOrder.of(task, store),
+            needed,
+            key=f"{task.stage.name}-{task.key}-{digest_json(str(store.root))[:8]}",
+            priority=-priority,
+            pure=False,
+        )
+    return {futures[task.key]: task for task in tasks}
+
+
+def _perform_after(order: WorkOrder, needed: list[Product]) -> Product:
+    """Make a product once those it needs (which dask passes, and so waits for) are made."""
+    del needed
+    return perform(order)
+
+
+def execute(
+    tasks: Sequence[Task],
+    store: Store,
+    workers: Workers,
+    done: Callable[[Task, Product], None] = lambda task, product: None,
+) -> dict[str, Product]:
+    """Make the products of `tasks`, which are in an order that respects their inputs.
+
+    Parameters
+    ----------
+    tasks
+        From `schedule`.
+    store
+        Where they go; on a file system that all workers share.
+    workers
+        Who does the work.
+    done
+        Called after each product.
+
+    Returns
+    -------
+    dict
+        The products by key.
+
+    Raises
+    ------
+    InputError
+        If the scheduler cannot be reached, a worker dies repeatedly, or a stage refuses its input.
+    """
+    products: dict[str, Product] = {}
+    if not tasks:
+        return products
+    if ranks.count() > 1:
+        return _execute_here(tasks, store, done)
+    from distributed import KilledWorker, as_completed
+
+    with _client(workers) as client:
+        futures = _submit(tasks, store, client)
+        for future in as_completed(futures):
+            task = futures[future]
+            try:
+                product = future.result()
+            except KilledWorker:
+                raise InputError(
+                    f"{task.stage.name} ({task.label}): its worker process died repeatedly, most likely for want of "
+                    "memory; use fewer --workers, or smaller chunks, and run again: finished products are kept"
+                ) from None
+            products[task.key] = product
+            done(task, product)
+    return products
+
+
+def _execute_here(tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None]) -> dict[str, Product]:
+    """Make products one after the other in the main thread, where MPI may be used."""
+    os.environ.update(QUIET_TENSORFLOW)
+    products = {}
+    for task in tasks:
+        products[task.key] = perform(WorkOrder.of(task, store))
+        done(task, products[task.key])
+    return products
+
+
+def drop_temporary(tasks: Iterable[Task], store: Store) -> None:
+    """Remove the temporary products whose consumers have all been made; a store that can only be read keeps them."""
+    tasks = unique(tasks)
+    consumers: dict[str, list[Task]] = {}
+    for task in tasks:
+        for needed in task.needs.values():
+            consumers.setdefault(needed.key, []).append(task)
+    for task in tasks:
+        if task.temporary and all(store.find(user.stage.name, user.key) for user in consumers.get(task.key, [])):
+            with suppress(OSError):
+                store.discard(task.stage.name, task.key)

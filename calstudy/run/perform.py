@@ -1,0 +1,126 @@
+"""Make one product: the unit of work that is sent to a worker."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from calstudy import __version__
+from calstudy.base.errors import InputError
+from calstudy.base.resources import Usage
+from calstudy.base.schema import plain
+from calstudy.run.store import Product, Store
+from calstudy.run.task import Job, Stage, Task
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkOrder:
+    """A task without the tasks behind it: what a worker must know to make its product."""
+
+    stage: Stage
+    key: str
+    label: str
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, tuple[str, str]]
+    store: Path
+
+    @classmethod
+    def of(cls, task: Task, store: Store) -> WorkOrder:
+        """Return the order for `task`."""
+        return cls(
+            stage=task.stage,
+            key=task.key,
+            label=task.label,
+            settings=task.settings,
+            inputs={name: (needed.stage.name, needed.key) for name, needed in task.needs.items()},
+            store=store.root,
+        )
+
+
+def perform(order: WorkOrder) -> Product:
+    """Make the ordered product, or return it if another run has made it meanwhile.
+
+    Raises
+    ------
+    InputError
+        If an input vanished or was damaged, the stage refuses a value, or the store cannot be written. Any other error
+        of a stage is a bug, and passes with its traceback.
+    """
+    store = Store(order.store)
+    try:
+        with store.lock(order.stage.name, order.key):
+            existing = store.verify(order.stage.name, order.key)
+            return existing if existing is not None else _make(order, store)
+    except InputError:
+        raise
+    except SystemExit as error:
+        # It would end the thread of the worker without a word, and the run would wait for it for ever.
+        raise RuntimeError(f"{order.stage.name} ({order.label}): the process was told to exit") from error
+    except (OSError, RuntimeError) as error:
+        reason = _unwritable(error, store.root)
+        if reason is None:
+            raise
+        raise InputError(
+            f"outputs.store = {str(store.root)!r}: {order.stage.name} ({order.label}) could not be written ({reason}); "
+            "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
+        ) from None
+
+
+def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:
+    """Return in words why a file of the store could not be written, or None if that is not what happened.
+
+    HDF5 reports a failed write as a RuntimeError or an OSError without errno, with the number in its message.
+    """
+    name = getattr(error, "filename", None)
+    if isinstance(name, str) and not Path(name).is_relative_to(root):
+        return None
+    number = getattr(error, "errno", None)
+    if number is None and (found := re.search(r"errno = (\d+)", str(error))):
+        number = int(found[1])
+    if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM):
+        return os.strerror(number)
+    return None
+
+
+def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Path]:
+    products = {name: store.verify(*address) for name, address in order.inputs.items()}
+    damaged = [f"{order.inputs[name][0]}/{order.inputs[name][1]}" for name, found in products.items() if found is None]
+    if damaged:
+        raise InputError(
+            f"{order.stage.name} ({order.label}): its input {damaged[0]} was removed or damaged while the run was "
+            "going on; run again to rebuild it"
+        )
+    return {name: product.path for name, product in products.items() if product is not None}
+
+
+def _make(order: WorkOrder, store: Store) -> Product:
+    inputs = _verified_inputs(order, store)
+    started = datetime.now(UTC)
+    logging.captureWarnings(True)
+    with store.building(order.stage.name, order.key) as folder:
+        with Usage() as usage:
+            notes = order.stage.make(Job(settings=order.settings, inputs=inputs, output=folder))
+        record = {
+            "stage": order.stage.name,
+            "stage_version": order.stage.version,
+            "key": order.key,
+            "label": order.label,
+            "settings": plain(order.settings),
+            "inputs": order.inputs,
+            "notes": notes,
+            "calstudy": __version__,
+            "started": started.isoformat(timespec="seconds"),
+            "seconds": round(usage.seconds, 3),
+            "cpu_seconds": round(usage.cpu_seconds, 3),
+            "peak_memory_bytes": usage.peak_memory,
+        }
+        return store.seal(folder, record)

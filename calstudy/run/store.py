@@ -1,0 +1,183 @@
+"""The store of products: content-addressed folders, written atomically, checked before use.
+
+A product is a folder ``<store>/<stage>/<key>/`` of files in standard formats plus ``product.json``, its record: what
+made it, from what, and the SHA-256 of every file. A folder that exists is complete, for it is filled under another name
+and renamed; a folder whose files no longer match its record is damaged, and is made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+from uuid import uuid4
+
+from filelock import FileLock
+
+from calstudy.base.errors import InputError
+
+RECORD = "product.json"
+PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Stages and keys: names of folders, and of nothing above or below."""
+
+
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file's content, in hexadecimal, read anew."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@dataclass(frozen=True)
+class Product:
+    """A complete product: its folder and its record."""
+
+    path: Path
+    record: Mapping[str, Any]
+
+    @property
+    def size(self) -> int:
+        """Bytes of all its files."""
+        return sum(entry["bytes"] for entry in self.record["files"].values())
+
+
+def _inside(name: str) -> bool:
+    """Return whether a recorded file is in its product's folder, and not elsewhere by an absolute path or by dots."""
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts and "\0" not in name
+
+
+class Store:
+    """A folder of products that several runs, on several machines, may use at once.
+
+    Parameters
+    ----------
+    root
+        Need not exist before `prepare`.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.expanduser().resolve()
+
+    def prepare(self) -> None:
+        """Make the folder, if it is not there, and try that it can be written.
+
+        Raises
+        ------
+        InputError
+            If it cannot.
+        """
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.root):
+                pass
+        except OSError as error:
+            raise InputError(f"outputs.store = {str(self.root)!r}: cannot be written ({error.strerror})") from None
+
+    def folder(self, stage: str, key: str) -> Path:
+        """Return where the product with this stage and key is, or would be.
+
+        Raises
+        ------
+        ValueError
+            If either is not a plain name, so that the folder would be elsewhere.
+        """
+        if not (PLAIN.fullmatch(stage) and PLAIN.fullmatch(key)):
+            raise ValueError(f"stage {stage!r} and key {key!r} of a product must be plain names")
+        return self.root / stage / key
+
+    def find(self, stage: str, key: str) -> Product | None:
+        """Return the product if it exists with all its files at their recorded sizes, without reading them."""
+        folder = self.folder(stage, key)
+        try:
+            record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+            sizes = {name: (folder / name).stat().st_size for name in record["files"]}
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        if not all(_inside(name) for name in sizes):
+            return None
+        if record.get("key") != key or any(sizes[name] != entry["bytes"] for name, entry in record["files"].items()):
+            return None
+        return Product(folder, record)
+
+    def verify(self, stage: str, key: str) -> Product | None:
+        """Return the product if every file still has its recorded SHA-256, else None."""
+        product = self.find(stage, key)
+        if product is None:
+            return None
+        try:
+            intact = all(
+                digest_file(product.path / name) == entry["sha256"] for name, entry in product.record["files"].items()
+            )
+        except OSError:
+            return None
+        return product if intact else None
+
+    def exists(self, stage: str, key: str) -> bool:
+        """Return whether there is anything under this key, intact or damaged."""
+        return self.folder(stage, key).exists()
+
+    def discard(self, stage: str, key: str) -> None:
+        """Remove a product, if it is there; it vanishes at once under its name."""
+        folder = self.folder(stage, key)
+        if folder.exists():
+            grave = folder.parent / f".discarded-{key}-{uuid4().hex}"
+            folder.rename(grave)
+            shutil.rmtree(grave, ignore_errors=True)
+
+    @contextmanager
+    def lock(self, stage: str, key: str) -> Iterator[None]:
+        """Hold the right to make this product; another run that wants it waits, and then finds it made."""
+        locks = self.root / ".locks"
+        locks.mkdir(exist_ok=True)
+        with FileLock(locks / f"{stage}-{key}.lock"):
+            yield
+
+    @contextmanager
+    def building(self, stage: str, key: str) -> Iterator[Path]:
+        """Yield an empty folder to fill; call `seal` on it before leaving. What was left by a killed run is removed.
+
+        Must be used under `lock`.
+        """
+        parent = self.root / stage
+        parent.mkdir(exist_ok=True)
+        for leftover in (*parent.glob(f".building-{key}-*"), *parent.glob(f".discarded-{key}-*")):
+            shutil.rmtree(leftover, ignore_errors=True)
+        folder = parent / f".building-{key}-{uuid4().hex}"
+        folder.mkdir()
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def seal(self, folder: Path, record: Mapping[str, Any]) -> Product:
+        """Record the files of a filled folder and give it its final name.
+
+        Parameters
+        ----------
+        folder
+            From `building`.
+        record
+            JSON-able; must hold `stage` and `key`.
+        """
+        files = {
+            path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": digest_file(path)}
+            for path in sorted(folder.rglob("*"))
+            if path.is_file()
+        }
+        complete = {**record, "files": files}
+        with (folder / RECORD).open("w", encoding="utf-8") as file:
+            json.dump(complete, file, indent=1, sort_keys=True, allow_nan=False)
+            file.flush()
+            os.fsync(file.fileno())
+        final = self.folder(record["stage"], record["key"])
+        self.discard(record["stage"], record["key"])
+        folder.rename(final)
+        return Product(final, complete)

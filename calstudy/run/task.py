@@ -1,0 +1,114 @@
+"""Tasks: which products there are, what each is made from, what it costs, and by which code it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from calstudy.base.identity import digest_json, identity
+from calstudy.base.resources import Cost
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What a stage is given to make one product.
+
+    Attributes
+    ----------
+    settings
+        As in `Task`.
+    inputs
+        Folders of the products it reads.
+    output
+        Empty folder to put its files in.
+    """
+
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, Path]
+    output: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A kind of product.
+
+    Attributes
+    ----------
+    name
+        Names the folder of its products in the store.
+    version
+        Raised when its results change, so that products of older code are not taken for new ones.
+    make
+        Writes the files of one product and returns JSON-able notes about it. A function of a module; libraries that
+        take long to import are imported inside it, for plans are made without them.
+    cost
+        Estimates what one task takes.
+    """
+
+    name: str
+    version: int
+    make: Callable[[Job], Mapping[str, Any]]
+    cost: Callable[[Task], Cost] = lambda task: Cost(3, disk=1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One product to be made.
+
+    Attributes
+    ----------
+    stage
+        What kind of product.
+    label
+        What the product is, in a few words.
+    settings
+        All that the stage reads of the experiment: validated sections, and plain JSON-able values.
+    inputs
+        The tasks whose products it reads, by the names it knows them under.
+    pieces
+        Tasks whose products it puts together, likewise. Its settings and inputs say all that decides the result: how
+        it is cut into pieces changes it by rounding at most, and is not part of the key.
+    temporary
+        Whether the product may be dropped once what needs it is made.
+    """
+
+    stage: Stage
+    label: str
+    settings: Mapping[str, Any]
+    inputs: Mapping[str, Task] = field(default_factory=dict)
+    pieces: Mapping[str, Task] = field(default_factory=dict)
+    temporary: bool = False
+
+    @cached_property
+    def key(self) -> str:
+        """The content address: a digest of stage, version, the identity of the settings, and the inputs' keys."""
+        inputs = {name: task.key for name, task in self.inputs.items()}
+        return digest_json([self.stage.name, self.stage.version, identity(self.settings), inputs])
+
+    @property
+    def needs(self) -> dict[str, Task]:
+        """Inputs and pieces."""
+        return {**self.inputs, **self.pieces}
+
+    @property
+    def cost(self) -> Cost:
+        """What making it takes."""
+        return self.stage.cost(self)
+
+
+def unique(tasks: Iterable[Task]) -> list[Task]:
+    """Return tasks and all they need, once each, every task after what it needs."""
+    found: dict[str, Task] = {}
+
+    def visit(task: Task) -> None:
+        if task.key not in found:
+            for needed in task.needs.values():
+                visit(needed)
+            found[task.key] = task
+
+    for task in tasks:
+        visit(task)
+    return list(found.values())

@@ -1,1 +1,0 @@
-"""Make the products of a graph: store, workers, and run folders."""

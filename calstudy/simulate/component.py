@@ -1,0 +1,106 @@
+"""One component of the sky through one instrument: from the settings to visibilities, in independent pieces."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calstudy.instrument.antenna_beams import make_beams
+from calstudy.instrument.interface import model_of
+from calstudy.instrument.telescope import make_template
+from calstudy.power.cosmology import make_cosmology
+from calstudy.simulate.chunks import Chunk, check_interpolation, plan_chunks
+from calstudy.simulate.interface import simulate_with
+from calstudy.sky.eor import EorField
+from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.sky.settings import Eor
+
+if TYPE_CHECKING:
+    from pyradiosky import SkyModel
+
+    from calstudy.instrument.settings import InstrumentSettings
+    from calstudy.simulate.settings import SimulationSettings
+    from calstudy.sky.settings import Foregrounds
+
+SMOOTH_SPECTRA = ("flat", "spectral_index")
+CHECKED = 2
+"""Integrations, and channels, at which interpolated visibilities are compared with directly simulated ones."""
+
+
+class Component:
+    """The instrument and one component of the sky; what is costly is made when it is asked for.
+
+    Parameters
+    ----------
+    instrument, simulation
+        Sections of the experiment.
+    sky
+        Settings of the foregrounds or of the EoR.
+    cosmology
+        Name of the cosmology, which turns the EoR's P(k) into brightness.
+    """
+
+    def __init__(
+        self,
+        instrument: InstrumentSettings,
+        simulation: SimulationSettings,
+        sky: Foregrounds | Eor,
+        cosmology: str,
+    ) -> None:
+        self._sky, self._cosmology = sky, cosmology
+        self.is_eor = isinstance(sky, Eor)
+        self.instrument, self.simulation = instrument, simulation
+        self.template = make_template(instrument)
+        self.beam = make_beams(instrument, self.template.telescope.Nants)
+        self.engine = simulation.engine
+        self.stand_ins = [self.beam.stand_in] if self.beam.stand_in else []
+
+    @cached_property
+    def _field(self) -> EorField | None:
+        if not isinstance(self._sky, Eor):
+            return None
+        return EorField(self._sky, self.template.freq_array, make_cosmology(self._cosmology))
+
+    @cached_property
+    def _foregrounds(self) -> SkyModel:
+        if isinstance(self._sky, Eor):
+            raise TypeError("the EoR has no foregrounds")
+        foregrounds = make_foregrounds(self._sky, self.template.freq_array)
+        self.stand_ins = [note for note in (foregrounds.stand_in, self.beam.stand_in) if note]
+        return foregrounds.sky
+
+    @property
+    def smooth(self) -> bool:
+        """Whether sky and beam vary smoothly from channel to channel, so that frequency nodes suffice."""
+        beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
+        smooth = all(model_of(beam).smooth for beam in beams)
+        return not self.is_eor and smooth and self._foregrounds.spectral_type in SMOOTH_SPECTRA
+
+    @cached_property
+    def chunks(self) -> list[Chunk]:
+        """The pieces of the simulation; there may be fewer than asked for."""
+        return plan_chunks(self.template, self.simulation, self.smooth)
+
+    def sky(self, channels: slice | np.ndarray) -> SkyModel:
+        """Return the sky, of the EoR only the given channels."""
+        return self._foregrounds if self._field is None else self._field.sky(channels)
+
+    def interpolation_error(self, cube: np.ndarray) -> dict[str, Any] | None:
+        """Return how far interpolated visibilities are from directly simulated ones; None if none are interpolated.
+
+        Parameters
+        ----------
+        cube
+            The visibilities, (Ntimes, Nbls, Nfreqs, Npols), Jy.
+        """
+        grid = self.chunks[0].grid
+        if grid.at_integrations and grid.at_channels:
+            return None
+        # Of the EoR, whose channels are independent, only the last block is drawn again.
+        channels = slice(-CHECKED, None) if self.is_eor else slice(None)
+        sky = self.sky(np.arange(self.template.Nfreqs)[channels])
+        simulate = partial(simulate_with, self.engine, sky, self.beam)
+        return asdict(check_interpolation(simulate, self.template, cube, grid, channels=channels, count=CHECKED))

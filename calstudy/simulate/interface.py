@@ -1,0 +1,135 @@
+"""The interface of visibility simulators."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.base.resources import Cost
+
+if TYPE_CHECKING:
+    from pyradiosky import SkyModel
+    from pyuvdata import UVBeam, UVData
+    from pyuvdata.analytic_beam import AnalyticBeam
+
+    from calstudy.instrument.antenna_beams import AntennaBeams
+
+
+class BeamSource(Protocol):
+    """A beam at any frequencies, such as `calstudy.instrument.beams.make_beam` returns."""
+
+    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
+        """Return the E-field beam, tabulated at these frequencies (Hz) or in closed form."""
+
+
+@dataclass(frozen=True)
+class SimulationSize:
+    """How much there is to simulate.
+
+    Attributes
+    ----------
+    sources
+        Components of the sky, above and below the horizon.
+    slots
+        Combinations of time and frequency.
+    antennas
+        Of the array.
+    beams
+        Different ones.
+    """
+
+    sources: float
+    slots: float
+    antennas: int
+    beams: int
+
+
+class Engine(Plugin, ABC):
+    """A simulator: computes visibilities from a sky and beams. Fields of a subclass are its settings.
+
+    Its module is imported when an experiment file is read: import libraries that take long inside the methods.
+
+    Attributes
+    ----------
+    shares_ranks
+        Whether it shares its work between MPI ranks (`calstudy.base.ranks`).
+    """
+
+    registry: ClassVar[Registry[Engine]] = Registry(
+        "engine", "calstudy.simulate.engines", "calstudy.simulate.interface:Engine"
+    )
+    shares_ranks: ClassVar[bool] = False
+
+    kind: str = Field("", description="Name of an engine, or a file.py.")
+
+    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+        """Return the reason why this engine does not support a simulation, or None if it does; see `simulate`.
+
+        By default it supports everything.
+
+        Parameters
+        ----------
+        sky, beam, template
+            As for `simulate`.
+        """
+        del sky, beam, template
+        return None
+
+    @abstractmethod
+    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+        """Simulate every time, baseline, frequency and polarization of the template; change none of the arguments.
+
+        Only called with what `refusal` does not refuse.
+
+        Parameters
+        ----------
+        sky
+            Points or HEALPix, in Jy or K, of any spectral type.
+        beam
+            One for all antennas, or `AntennaBeams`.
+        template
+            Rectangular observation without data (see `calstudy.base.visibilities`).
+
+        Returns
+        -------
+        (Ntimes, Nbls, Nfreqs, Npols) complex128
+            Uncalibrated drift-scan visibilities in Jy, V_xx = 1/2 int A I, in the template's order.
+        """
+
+    def cost(self, size: SimulationSize) -> Cost:
+        """Return what a simulation takes, besides what sky and visibilities do; by default as for matrix products."""
+        return Cost((3e-6 + 3.2e-9 * size.antennas**2) * size.sources * size.slots)
+
+
+def simulate_with(engine: Engine, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+    """Return an engine's visibilities, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy, checked.
+
+    Parameters
+    ----------
+    engine
+        Any.
+    sky, beam, template
+        As for `Engine.simulate`.
+
+    Raises
+    ------
+    InputError
+        If the engine refuses or fails, or returns visibilities of another shape or that are not finite.
+    """
+    with guarded(engine):
+        reason = engine.refusal(sky, beam, template)
+        if reason is not None:
+            raise InputError(f"simulation.engine = {engine.label!r}: {reason}")
+        found = engine.simulate(sky, beam, template)
+    shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
+    if np.shape(found) != shape:
+        raise InputError(f"engine {engine.label!r}: returned visibilities of shape {np.shape(found)}, expected {shape}")
+    if not np.isfinite(found).all():
+        raise InputError(f"engine {engine.label!r}: returned visibilities that are not finite")
+    return np.asarray(found, dtype=np.complex128)

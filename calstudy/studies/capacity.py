@@ -1,0 +1,137 @@
+"""Fit a run to the machine: how many workers, and how finely the simulations are cut, for the memory there is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from calstudy.base import ranks
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import guarded
+from calstudy.base.resources import LIBRARIES_MEMORY, cores, free_memory, parse_memory
+from calstudy.experiment.model import Experiment
+from calstudy.products.calibration import CALIBRATE_CHUNK
+from calstudy.products.simulation import SIMULATE_CHUNK
+from calstudy.run.store import Store
+from calstudy.run.task import Stage, Task
+from calstudy.studies.study import Budget
+
+Targets = Callable[[Experiment], Sequence[Task]]
+"""Which products of an experiment are wanted."""
+
+
+def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Experiment, int]:
+    """Choose the number of workers, and cut simulations finely enough for them, within the memory.
+
+    How many chunks a simulation is cut into changes its visibilities by rounding only, and not the key under which
+    they are stored.
+
+    Parameters
+    ----------
+    experiment
+        Validated.
+    budget
+        Workers and memory.
+    targets
+        Which products are to be made.
+
+    Returns
+    -------
+    experiment
+        The same, perhaps with more `simulation.chunks` and a calibrator that needs less memory.
+    workers
+        Not more than the memory holds; those that were asked for, if no memory was given.
+
+    Raises
+    ------
+    InputError
+        If a single task is estimated to need more than there is, `max_memory` is not an amount of memory, or MPI ranks
+        cannot help; before anything has started.
+    """
+    workers, scheduler = budget.workers, budget.scheduler
+    if ranks.count() > 1:
+        _require_sharing(experiment, workers, scheduler)
+    if scheduler is not None:
+        return experiment, workers or 1
+    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
+    # The parent process holds the libraries, too.
+    memory -= LIBRARIES_MEMORY
+    hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
+    cut = _stream(_cut(experiment, memory / hoped, targets), memory / hoped, targets)
+    needs = {task: task.cost.memory for task in _missing(cut, targets)}
+    if not needs:
+        return cut, workers or hoped
+    largest = max(needs, key=needs.__getitem__)
+    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
+    if ranks.count() > 1:
+        return cut, 1
+    fitting = max(1, int(memory // needs[largest]))
+    if workers is not None and budget.max_memory is None:
+        return cut, workers
+    return cut, min(hoped, fitting)
+
+
+def _require_room(largest: Task, need: float, budget: float, source: str) -> None:
+    if need > budget:
+        raise InputError(
+            f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
+            f"needs about {need / 1e9:.1f} GB; give it more with --max-memory, or use fewer antennas, channels, "
+            "integrations or sources"
+        )
+
+
+def _require_sharing(experiment: Experiment, workers: int | None, scheduler: str | None) -> None:
+    engine = experiment.simulation.engine
+    if not engine.shares_ranks:
+        raise InputError(
+            f"simulation.engine = {engine.label!r} does not share its work between MPI ranks; leave out "
+            "mpiexec and use --workers, or add --set simulation.engine=pyuvsim"
+        )
+    if scheduler is not None or workers not in (None, 1):
+        raise InputError(
+            "--workers and --scheduler: under mpiexec the ranks are the workers; leave both out and choose the number "
+            "of ranks with -n"
+        )
+
+
+def _cut(experiment: Experiment, share: float, targets: Targets) -> Experiment:
+    """Double the number of simulation chunks until each takes no more than its share, or they are single channels."""
+    cut = experiment
+    while cut.simulation.chunks < cut.instrument.channels.count and _largest(cut, targets, SIMULATE_CHUNK) > share:
+        chunks = min(2 * cut.simulation.chunks, cut.instrument.channels.count)
+        finer = cut.model_copy(update={"simulation": cut.simulation.model_copy(update={"chunks": chunks})})
+        if _largest(finer, targets, SIMULATE_CHUNK) > 0.95 * _largest(cut, targets, SIMULATE_CHUNK):
+            break  # What is left is the sky itself.
+        cut = finer
+    return cut
+
+
+def _stream(experiment: Experiment, share: float, targets: Targets) -> Experiment:
+    """Let the calibrator use less memory until a solve takes no more than its share."""
+    fitted = experiment
+    while _largest(fitted, targets, CALIBRATE_CHUNK) > share:
+        with guarded(fitted.calibration):
+            leaner = fitted.calibration.leaner()
+        if leaner is None:
+            break
+        fitted = fitted.model_copy(update={"calibration": leaner})
+    return fitted
+
+
+def _largest(experiment: Experiment, targets: Targets, stage: Stage) -> float:
+    missing = _missing(experiment, targets)
+    return max((task.cost.memory for task in missing if task.stage is stage), default=0.0)
+
+
+def _missing(experiment: Experiment, targets: Targets) -> Sequence[Task]:
+    """Return the tasks whose products a run would have to make, by a quick look into the store."""
+    store, found = Store(experiment.outputs.store), {}
+
+    def visit(task: Task) -> None:
+        if task.key not in found and store.find(task.stage.name, task.key) is None:
+            found[task.key] = task
+            for needed in task.needs.values():
+                visit(needed)
+
+    for task in targets(experiment):
+        visit(task)
+    return tuple(found.values())

@@ -1,0 +1,112 @@
+"""An experiment as a study: its figures, tables and claims."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+from calstudy.base.identity import identity
+from calstudy.claims.paper import stand_ins
+from calstudy.claims.product import claims
+from calstudy.experiment.files import dump
+from calstudy.experiment.model import Experiment, Outputs
+from calstudy.figures import figure_task, figures_of
+from calstudy.products.agreement import agreement
+from calstudy.products.graph import Graph
+from calstudy.products.signal_loss import transfer
+from calstudy.products.spectra import spectra
+from calstudy.run.provenance import seeds
+from calstudy.run.task import Task
+from calstudy.studies.capacity import fit
+from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
+from calstudy.studies.preflight import require_calibration
+from calstudy.studies.study import Budget, Made, Study
+
+
+class ExperimentStudy(Study):
+    """One experiment.
+
+    Parameters
+    ----------
+    experiment
+        Validated, without a sweep.
+    folder
+        Its run folder, if it is a part of another study that has it elsewhere.
+    """
+
+    def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
+        self.experiment = experiment
+        self.name, self.description = experiment.name, experiment.description
+        self.graph = Graph(experiment)
+        self._folder = folder
+
+    @property
+    def outputs(self) -> Outputs:
+        """Store and folder of runs."""
+        return self.experiment.outputs
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self._folder or experiment_folder(self.experiment)
+
+    def fitted(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study with simulations and solves cut to the memory, and the number of workers."""
+        require_calibration(self.experiment)
+        experiment, count = fit(self.experiment, budget, targets_of)
+        return type(self)(experiment, self._folder), count
+
+    @cached_property
+    def stand_ins(self) -> tuple[str, ...]:
+        """What is used in place of the papers' own ingredients."""
+        return stand_ins(self.experiment)
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The figures asked for."""
+        return [figure_task(self.graph, figure, self.stand_ins) for figure in figures_of(self.experiment)]
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The products whose files are the tables of a run."""
+        found = (spectra(self.graph), agreement(self.graph), transfer(self.graph))
+        return [task for task in found if task is not None]
+
+    @cached_property
+    def claims(self) -> Task | None:
+        """The statements of the papers that the experiment names, or None."""
+        return claims(self.graph, self.stand_ins)
+
+    @property
+    def targets(self) -> list[Task]:
+        """Figures, tables and claims."""
+        return [*self.figures, *self.tables, *([self.claims] if self.claims else [])]
+
+    def fill(self, made: Made) -> None:
+        """Write figures, tables, claims, the resolved experiment and the manifest."""
+        folder, products = self.folder, made.products
+        publish([products[task.key] for task in self.figures], folder / "figures")
+        publish([products[task.key] for task in self.tables], folder / "tables")
+        if self.claims is not None:
+            publish([products[self.claims.key]], folder)
+        write(folder / EXPERIMENT, dump(self.experiment))
+        fields = {
+            "stand_ins": list(self.stand_ins),
+            "captions": {figure.label: figure.caption for figure in figures_of(self.experiment)},
+            "seeds": seeds(self.experiment.model_dump(mode="json")),
+            "products": product_entries(self.tasks, made.products, made.tasks),
+        }
+        write_manifest(folder, self.name, fields)
+
+
+def targets_of(experiment: Experiment) -> list[Task]:
+    """Return the products that a run of an experiment is for."""
+    return ExperimentStudy(experiment).targets
+
+
+def experiment_folder(experiment: Experiment) -> Path:
+    """Return the run folder of an experiment: its name, and a digest of what it says but for where results go."""
+    outputs = experiment.outputs.reset("store", "runs")
+    content = identity(experiment.model_copy(update={"outputs": outputs}).reset("scales"))
+    return run_folder(experiment.outputs.runs, experiment.name, content)

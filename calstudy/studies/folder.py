@@ -1,0 +1,143 @@
+"""Run folders: what a run leaves for people, written whole or not at all, never in a folder that holds other files."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from calstudy.base.errors import InputError
+from calstudy.base.identity import digest_json
+from calstudy.run.provenance import git_commit, machine, package_versions
+from calstudy.run.store import Product
+from calstudy.run.task import Task
+
+MANIFEST, EXPERIMENT, LOG = "manifest.json", "experiment.yaml", "run.log"
+POINTS = "points"
+"""Folder of the run folders of a sweep's points."""
+
+
+def run_folder(runs: Path, name: str, content: Any) -> Path:
+    """Return the folder of a study's runs: its name and a digest of all that it says.
+
+    The same study has the same folder; a changed one never overwrites it.
+
+    Parameters
+    ----------
+    runs
+        Folder of run folders.
+    name
+        Of the study.
+    content
+        JSON-able: what decides its results.
+    """
+    return runs.expanduser().resolve() / f"{name}-{digest_json(content)[:8]}"
+
+
+def open_folder(folder: Path) -> None:
+    """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
+    results = {"report.html", "figures", "tables", POINTS, "claims.json", "claims.md", "regression.json"}
+    known = results | {MANIFEST, EXPERIMENT, LOG}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        strangers = sorted(path.name for path in folder.iterdir() if path.name not in known and path.name[0] != ".")
+        (folder / LOG).touch()
+    except OSError as error:
+        raise InputError(f"outputs.runs = {str(folder.parent)!r}: cannot be written ({error.strerror})") from None
+    if strangers:
+        raise InputError(
+            f"outputs.runs: {folder} holds {strangers[0]!r}, which no run wrote; move it or choose another folder"
+        )
+
+
+@contextmanager
+def log_to(path: Path) -> Iterator[None]:
+    """Append what calstudy logs, and warnings, to a file."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root, package = logging.getLogger(), logging.getLogger("calstudy")
+    level = package.level
+    root.addHandler(handler)
+    package.setLevel(logging.INFO)
+    logging.captureWarnings(True)
+    try:
+        yield
+    finally:
+        logging.captureWarnings(False)
+        package.setLevel(level)
+        root.removeHandler(handler)
+        handler.close()
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file so that it is there whole or not at all."""
+    partial = path.with_name(f".{path.name}-{uuid4().hex}")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def publish(products: list[Product], folder: Path) -> None:
+    """Copy the files of products into a folder of the run, each whole or not at all."""
+    folder.mkdir(exist_ok=True)
+    for product in products:
+        for name in product.record["files"]:
+            partial = folder / f".{name}-{uuid4().hex}"
+            shutil.copyfile(product.path / name, partial)
+            partial.replace(folder / name)
+
+
+def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
+    """Write manifest.json: the fields of a study, with time, commit, versions and machine.
+
+    Parameters
+    ----------
+    folder
+        Run folder.
+    name
+        Of the study.
+    fields
+        What the study says itself; it may replace the machine.
+    """
+    manifest = {
+        "name": name,
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "git_commit": git_commit(),
+        "versions": package_versions(),
+        "machine": machine(),
+        **fields,
+    }
+    write(folder / MANIFEST, json.dumps(manifest, indent=1))
+
+
+RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_bytes", "started", "inputs")
+"""Fields of a product's record that a manifest repeats."""
+
+
+def product_entries(
+    tasks: Sequence[Task], products: Mapping[str, Product], made: Sequence[Task]
+) -> list[dict[str, Any]]:
+    """Return what a manifest says of every product: what it was made from, what it took, and by which run.
+
+    Parameters
+    ----------
+    tasks
+        Whose products.
+    products
+        By key; tasks without one are left out.
+    made
+        The tasks whose products this run made.
+    """
+    keys = {task.key for task in made}
+    entries = []
+    for task in tasks:
+        if task.key in products:
+            record = products[task.key].record
+            entry = {"stage": task.stage.name, **{field: record[field] for field in RECORDED}}
+            entries.append({**entry, "made_by_this_run": task.key in keys})
+    return entries

@@ -1,0 +1,44 @@
+"""Read a file, and return the study that it describes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from calstudy.base.package_files import find_experiment
+from calstudy.experiment.files import load, read_mapping
+from calstudy.studies import collection, runtime
+from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.study import Study
+from calstudy.studies.sweep import expand
+
+
+def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Study:
+    """Read an experiment, a sweep, a collection or a run-time study, whichever the file holds.
+
+    Parameters
+    ----------
+    path
+        The YAML file, or the name of a published one, such as ``quickstart``. One with the key `experiments` is a
+        collection, one with `runtime` a run-time study, and an experiment with the key `sweep` is the family of its
+        points.
+    scale
+        Name of a set of overrides in the file's `scales`.
+    overrides
+        ``path=value`` texts, applied after the scale; those of a collection go to every member.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, or a scale or override cannot be applied.
+    ExperimentError
+        If fields are unknown, missing, or hold values that are not allowed.
+    """
+    path = find_experiment(path)
+    data = read_mapping(path)
+    if runtime.KEY in data:
+        return runtime.load_runtime(path, data, scale, overrides)
+    if collection.KEY in data:
+        return collection.load_collection(path, data, scale, overrides)
+    experiment = load(path, scale, overrides)
+    return expand(experiment) if experiment.sweep else ExperimentStudy(experiment)

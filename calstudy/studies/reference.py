@@ -1,0 +1,208 @@
+"""The reference of all fields of an experiment file, written from the schema itself."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
+from calstudy.experiment.model import Experiment, Variant
+from calstudy.instrument.settings import AntennaBeam
+from calstudy.studies.collection import CollectionFile, Member
+from calstudy.studies.runtime import RuntimeFile
+
+
+def _alternatives(annotation: Any) -> list[Any]:
+    if get_origin(annotation) is Annotated:
+        return _alternatives(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return [found for member in get_args(annotation) for found in _alternatives(member)]
+    return [annotation]
+
+
+def _blocks(annotation: Any) -> list[type[BaseModel]]:
+    return [item for item in _alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
+
+
+def _registry(info: FieldInfo) -> Registry[Any] | None:
+    """Return the registry of the things that a field holds, one or a list of them; None for other fields."""
+    items = [data for item in get_args(info.annotation) for data in getattr(item, "__metadata__", ())]
+    return next((data.registry for data in [*info.metadata, *items] if isinstance(data, PluginField)), None)
+
+
+def _unit(info: FieldInfo) -> str | None:
+    """Return the unit of a physical quantity, also where it may be null instead; None for other fields."""
+    fields = [info, *(data for item in get_args(info.annotation) for data in getattr(item, "__metadata__", ()))]
+    extras = [field.json_schema_extra for field in fields if isinstance(field, FieldInfo)]
+    return next((str(extra["unit"]) for extra in extras if isinstance(extra, dict) and "unit" in extra), None)
+
+
+def _kind(info: FieldInfo) -> str:
+    """Write what a field takes: its choices, its unit, or its type."""
+    if (unit := _unit(info)) is not None:
+        return f"quantity in {unit}"
+    words = []
+    for item in _alternatives(info.annotation):
+        if get_origin(item) is Literal:
+            words.append(" \\| ".join(f"`{value}`" for value in get_args(item)))
+        elif get_origin(item) is tuple:
+            choices = " \\| ".join(f"`{value}`" for value in get_args(get_args(item)[0]) if isinstance(value, str))
+            words.append(f"list of {choices}" if choices else "list")
+        elif get_origin(item) is dict:
+            words.append("block")
+        else:
+            words.append(
+                {int: "whole number", float: "number", bool: "true or false", str: "text", Path: "path"}.get(item, "")
+            )
+    return ", or ".join(word for word in words if word)
+
+
+def _default(info: FieldInfo) -> str:
+    if info.default is PydanticUndefined:
+        return "built in" if info.default_factory is not None else "required"
+    if info.default is None:
+        return "null"
+    if isinstance(info.default, BaseModel):
+        return "see below"
+    unit = f" {_unit(info)}" if _unit(info) else ""
+    value = info.default
+    if isinstance(value, tuple):
+        value = [item.label if isinstance(item, Plugin) else item for item in value]
+    return f"`{value:g}{unit}`" if isinstance(value, float) else f"`{value}{unit}`"
+
+
+def _rows(model: type[BaseModel]) -> Iterator[str]:
+    tag = model.registry.tag if issubclass(model, Plugin) else None
+    for name, info in model.model_fields.items():
+        if name != tag and not _blocks(info.annotation):
+            yield f"| `{name}` | {_kind(info)} | {_default(info)} | {info.description or ''} |"
+
+
+def _plain_section(model: type[BaseModel]) -> Iterator[str]:
+    yield (model.__doc__ or "").strip().replace("\n    ", "\n")
+    yield ""
+    rows = list(_rows(model))
+    if rows:
+        yield from ("| field | takes | default | |", "|---|---|---|---|", *rows, "")
+
+
+def _section(model: type[BaseModel], path: str, listed: dict[str, str]) -> Iterator[str]:
+    """Write a block and all blocks in it; `listed` has the path under which each kind of thing was listed before."""
+    yield from _plain_section(model)
+    for name, info in model.model_fields.items():
+        yield from _blocks_of(info, f"{path}.{name}" if path else name, listed)
+
+
+def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[str]:
+    """Write the block or blocks that a field takes; nothing for a field that takes none."""
+    blocks = _blocks(info.annotation)
+    if (registry := _registry(info)) is not None:
+        yield from (f"## `{path}`: {'one' if blocks else 'a list, each'} of", "")
+        yield from _plugins(registry, path, listed)
+    elif len(blocks) == 1:
+        yield from (f"## `{path}`", "")
+        yield from _section(blocks[0], path, listed)
+    elif blocks:
+        yield from (f"## `{path}`: one of", "")
+        for block in blocks:
+            tag = next(key for key in ("kind", "name") if key in block.model_fields)
+            tags = get_args(block.model_fields[tag].annotation)
+            yield from (f"### `{path}: {' | '.join(map(str, tags))}`", "")
+            yield from _section(block, path, listed)
+
+
+def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iterator[str]:
+    """Write all things of a kind, those of installed packages included; blocks that several share are written once."""
+    if registry.noun in listed:
+        yield from (f"See `{listed[registry.noun]}`.", "")
+        return
+    listed[registry.noun] = path
+    yield from (f"`{registry.tag}` is the name of {registry.a_noun}, or the path of a Python file that holds one.", "")
+    shared: dict[str, FieldInfo] = {}
+    for name in registry.names():
+        yield from (f"### `{path}: {{{registry.tag}: {name}}}`", "")
+        try:
+            found = registry.find(name)
+        except InputError as error:
+            yield from (f"Cannot be used here: {error}", "")
+            continue
+        yield from _plain_section(found)
+        blocks = {key: info for key, info in found.model_fields.items() if _blocks(info.annotation)}
+        if blocks:
+            yield from (f"And the blocks {', '.join(f'`{key}`' for key in blocks)}.", "")
+        shared |= blocks
+    for name, info in shared.items():
+        yield from _blocks_of(info, f"{path}.{name}", listed)
+
+
+def plugin_reference(path: Path) -> str:
+    """Return the reference, as Markdown, of the calibrators, figures and the like that a Python file holds.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be run, or holds none.
+    """
+    module = load_file(path)
+    found = [
+        value
+        for value in vars(module).values()
+        if isinstance(value, type) and issubclass(value, Plugin) and value.__module__ == module.__name__
+    ]
+    if not found:
+        raise InputError(
+            f"{path}: holds no calibrator, figure or the like (no subclass of calstudy.base.plugins.Plugin)"
+        )
+    lines = []
+    for plugin in found:
+        tag = plugin.registry.tag
+        lines += [f"# {plugin.registry.noun.capitalize()} `{tag}: {path.name}:{plugin.__name__}`", ""]
+        lines += _section(plugin, "", {})
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def field_reference() -> str:
+    """Return the reference as Markdown: every section, field, unit, default and what it means."""
+    listed: dict[str, str] = {}
+    lines = [
+        "# Experiment files",
+        "",
+        "Written by `python -m calstudy fields`; do not edit. An experiment file is YAML. Everything but `name` has a",
+        "default, which is the paper's value where the paper has one. Physical quantities are written with their unit",
+        '(`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a choice, its name alone stands for it with its defaults:',
+        "`beam: airy` is `beam: {kind: airy}`. Relative paths of input files start at the experiment file.",
+        "",
+        *_section(Experiment, "", listed),
+        "## `variants`: each",
+        "",
+        *_section(Variant, "variants", listed),
+        "## `instrument.antenna_beams`: each",
+        "",
+        *_plain_section(AntennaBeam),
+        "`beam` takes what `instrument.beam` does.",
+        "",
+        "# Collection files",
+        "",
+        "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run",
+        "folder, and what compares them in a folder of the collection; `--scale` and `--set` go to every member.",
+        "",
+        *_section(CollectionFile, "", listed),
+        "## `experiments`: each",
+        "",
+        *_section(Member, "experiments", listed),
+        "",
+        "# Run-time files",
+        "",
+        "A file with the key `runtime` is a run-time study. `python -m calstudy run` times the solvers here,",
+        "one array after the other; what it measured is kept under a key that names the machine.",
+        "",
+        *_section(RuntimeFile, "", listed),
+    ]
+    return "\n".join(lines).rstrip() + "\n"

@@ -1,0 +1,333 @@
+"""Run-time studies: arrays of growing size on which the solvers' steps are timed, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import yaml
+from pydantic import Field, SerializeAsAny, ValidationError, field_validator, model_validator
+
+from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.plugins import Plugin
+from calstudy.base.resources import free_memory, parse_memory
+from calstudy.base.schema import Section, fault
+from calstudy.base.units import Length
+from calstudy.calibrate.settings import BasisSettings
+from calstudy.claims.paper import distinct_papers
+from calstudy.claims.product import run_time_claims
+from calstudy.experiment.files import apply_scale, override, parse_override
+from calstudy.experiment.messages import sentences
+from calstudy.experiment.model import FIGURES, PAPERS
+from calstudy.figures import DRAW
+from calstudy.instrument.settings import Channels, LinearLayout, RectangularLayout
+from calstudy.products.run_times import COUNT_STEPS, SUMMARIZE, TIME_STEPS, TimedArray
+from calstudy.run.provenance import machine, package_versions
+from calstudy.run.task import Task
+from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
+from calstudy.studies.study import Budget, Made, Study
+
+KEY = "runtime"
+"""The key that makes a file a run-time study."""
+
+
+def _require_increasing(sizes: Sequence[float]) -> None:
+    if list(sizes) != sorted(set(sizes)):
+        raise fault("", f"must increase, and name no size twice: {', '.join(f'{size:g}' for size in sizes)}")
+
+
+class RowsOfEight(Section):
+    """Rows of eight antennas, as far apart as the longest baseline allows (paper Fig. ANTPOS_RUNTIME)."""
+
+    antennas: Annotated[
+        tuple[Annotated[int, Field(ge=9)], ...], Field(strict=False, min_length=3, description="Sizes, increasing.")
+    ] = (16, 24, 32, 48, 64, 96, 128)
+    spacing: Length = Field(2.0, gt=0, description="Distance between neighbours in a row.")
+    max_baseline: Length = Field(100.0, gt=0)
+
+    @field_validator("antennas")
+    @classmethod
+    def _increasing(cls, sizes: tuple[int, ...]) -> tuple[int, ...]:
+        _require_increasing(sizes)
+        return sizes
+
+    @model_validator(mode="after")
+    def _rows_fit(self) -> RowsOfEight:
+        if self.max_baseline <= 7 * self.spacing:
+            raise fault(
+                "max_baseline", f"{self.max_baseline:g} m must exceed the length of a row, {7 * self.spacing:g} m"
+            )
+        return self
+
+
+class Line(Section):
+    """Lines of equally spaced antennas of growing length (paper Fig. MAXBL_RUNTIME)."""
+
+    lengths: Annotated[
+        tuple[Annotated[Length, Field(gt=0)], ...],
+        Field(strict=False, min_length=3, description="Longest baselines, increasing."),
+    ] = (20.0, 35.0, 50.0, 75.0, 100.0, 150.0, 200.0)
+    count: int = Field(10, ge=3, description="Antennas of each.")
+
+    @field_validator("lengths")
+    @classmethod
+    def _increasing(cls, sizes: tuple[float, ...]) -> tuple[float, ...]:
+        _require_increasing(sizes)
+        return sizes
+
+
+class SampleCounts(Section):
+    """How often each thing is timed, for every array."""
+
+    steps: int = Field(200, ge=10, description="Single steps of the paper's solver.")
+    calls: int = Field(20, ge=3, description="Calls of our Adamax, of 50 compiled steps each; their means are samples.")
+    solves: int = Field(10, ge=2, description="Whole solves of the default solver, from unity gains.")
+
+
+class DescentSettings(Section):
+    """A run of the paper's solver, Adamax at 0.01, to count the steps it needs."""
+
+    antennas: int = Field(32, ge=9, description="Of a rectangular array like the others.")
+    max_steps: int = Field(20_000, ge=50)
+
+
+class RuntimeSettings(Section):
+    """Run time of one step against the number of antennas and the longest baseline (paper §Computational Runtime).
+
+    The channels are by default 200 of 300 kHz from 120.15 MHz.
+    """
+
+    rows: RowsOfEight = RowsOfEight()
+    line: Line = Line()
+    channels: Channels = Channels(first="120.15 MHz", width="300 kHz", count=200)
+    basis: BasisSettings = BasisSettings()
+    samples: SampleCounts = SampleCounts()
+    descent: DescentSettings = DescentSettings()
+    devices: Annotated[tuple[Literal["cpu", "gpu"], ...], Field(strict=False, min_length=1)] = Field(
+        ("cpu",), description="One core of the processor, in processor seconds; the first GPU, in elapsed seconds."
+    )
+
+    @model_validator(mode="after")
+    def _channels_hold_the_basis(self) -> RuntimeSettings:
+        longest = max(self.rows.max_baseline, *self.line.lengths)
+        delay = max(self.basis.horizon * longest / SPEED_OF_LIGHT, self.basis.min_delay) + self.basis.buffer
+        nyquist = 0.5 / self.channels.width
+        if delay + self.basis.delay_step >= nyquist:
+            raise fault(
+                "channels.width",
+                f"{self.channels.width / 1e3:g} kHz resolves {1e9 * nyquist:.0f} ns, and the foregrounds of a baseline "
+                f"of {longest:g} m reach {1e9 * delay:.0f} ns",
+            )
+        return self
+
+
+class RuntimeOutputs(Section):
+    """Where products and run folders go."""
+
+    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
+    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
+
+
+class RuntimeFile(Section):
+    """Steps of the paper's solver, of our Adamax and of the default solver, timed side by side on this machine."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", description="Names the run folder.")
+    description: str = ""
+    runtime: RuntimeSettings
+    outputs: RuntimeOutputs = RuntimeOutputs()
+    papers: Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)] = Field(
+        (), description="Published papers whose statements on run times are evaluated, such as [calamity2022]."
+    )
+    scales: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
+    )
+
+
+PANELS = ("rows", "line")
+"""Families of arrays, each with a figure: rows of eight of growing number, lines of growing length."""
+TIMED_WITH = ("tensorflow", "numpy", "scipy")
+"""Packages whose version may change a run time."""
+
+
+class RuntimeStudy(Study):
+    """Run times of solvers on this machine.
+
+    Parameters
+    ----------
+    file
+        What the file says.
+    """
+
+    def __init__(self, file: RuntimeFile) -> None:
+        self.file = file
+        self.name, self.description = file.name, file.description
+
+    @cached_property
+    def timed_on(self) -> Mapping[str, Any]:
+        """What the measurements belong to: part of their keys, so that those of another machine are not taken for them.
+
+        Raises InputError if the file wants a GPU and this machine has none.
+        """
+        versions = package_versions()
+        found = {**machine(), **{name: versions[name] for name in TIMED_WITH}}
+        return {**found, "gpu": _gpu()} if "gpu" in self.file.runtime.devices else found
+
+    @property
+    def outputs(self) -> RuntimeOutputs:
+        """Store and folder of runs."""
+        return self.file.outputs
+
+    @property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Nothing: run times need no sky."""
+        return ()
+
+    @property
+    def folder(self) -> Path:
+        """The run folder: the name, and a digest of what the file says and of the machine."""
+        content = {**self.file.model_dump(mode="json", exclude={"outputs", "scales"}), "machine": self.timed_on}
+        return run_folder(self.outputs.runs, self.name, content)
+
+    def fitted(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study itself and one worker; raises InputError for what would spoil or exceed the machine."""
+        if budget.scheduler is not None or budget.workers not in (None, 1):
+            raise InputError(
+                "--workers and --scheduler: run times are measured on this machine, one after the other; leave both out"
+            )
+        memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
+        largest = max(self.timings.values(), key=lambda task: task.cost.memory)
+        if largest.cost.memory > memory:
+            raise InputError(
+                f"run times of {largest.label}: the paper's solver needs about {largest.cost.memory / 1e9:.1f} GB, "
+                f"and there are {memory / 1e9:.1f} GB; name smaller arrays, or fewer channels"
+            )
+        return self, 1
+
+    def _rows(self, antennas: int) -> TimedArray:
+        settings = self.file.runtime
+        layout = RectangularLayout(
+            kind="rectangular",
+            count=antennas,
+            spacing=f"{settings.rows.spacing!r} m",
+            max_baseline=f"{settings.rows.max_baseline!r} m",
+        )
+        return TimedArray(layout=layout, channels=settings.channels, basis=settings.basis)
+
+    def _line(self, length: float) -> TimedArray:
+        settings = self.file.runtime
+        count = settings.line.count
+        layout = LinearLayout(kind="linear", count=count, spacing=f"{length / (count - 1):.15g} m")
+        return TimedArray(layout=layout, channels=settings.channels, basis=settings.basis)
+
+    @cached_property
+    def arrays(self) -> dict[str, tuple[str, float, TimedArray]]:
+        """What is timed: panel, size, and the array, by a name that sorts."""
+        settings = self.file.runtime
+        rows = {f"rows-{count:05d}": ("rows", float(count), self._rows(count)) for count in settings.rows.antennas}
+        line = {f"line-{length:09.3f}": ("line", float(length), self._line(length)) for length in settings.line.lengths}
+        return rows | line
+
+    @cached_property
+    def timings(self) -> dict[str, Task]:
+        """The measurements, by name of the array and device."""
+        devices = self.file.runtime.devices
+        return {f"{name}-{device}": self._timing(name, device) for name in self.arrays for device in devices}
+
+    def _timing(self, name: str, device: str) -> Task:
+        panel, size, array = self.arrays[name]
+        label = f"{size:g} antennas" if panel == "rows" else f"line of {size:g} m"
+        settings = {
+            "machine": self.timed_on,
+            "panel": panel,
+            "size": size,
+            "longest": self.file.runtime.rows.max_baseline if panel == "rows" else size,
+            "array": array,
+            "samples": self.file.runtime.samples.model_dump(mode="json"),
+            "device": device,
+        }
+        return Task(TIME_STEPS, f"{label}, {device}", settings)
+
+    @cached_property
+    def descent(self) -> Task:
+        """How the paper's solver approaches the minimum."""
+        descent = self.file.runtime.descent
+        settings = {
+            "array": self._rows(descent.antennas),
+            "longest": self.file.runtime.rows.max_baseline,
+            "max_steps": descent.max_steps,
+        }
+        return Task(COUNT_STEPS, f"Adamax, {descent.antennas} antennas", settings)
+
+    @cached_property
+    def summary(self) -> Task:
+        """The table of all measurements."""
+        return Task(SUMMARIZE, "run times", {"machine": self.timed_on}, {**self.timings, "descent": self.descent})
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """Time per step against the number of antennas, and against the longest baseline."""
+        return [self._figure(panel) for panel in PANELS]
+
+    def _figure(self, panel: str) -> Task:
+        figure = FIGURES.make({"kind": "runtime", "panel": panel})
+        shown = {name: task for name, task in self.timings.items() if task.settings["panel"] == panel}
+        return Task(DRAW, figure.label, {"figure": figure, "notes": list(self.stand_ins)}, shown)
+
+    @cached_property
+    def claims(self) -> Task | None:
+        """The papers' statements on run times, or None."""
+        return run_time_claims(self.name, distinct_papers(self.file.papers), self.summary)
+
+    @property
+    def targets(self) -> list[Task]:
+        """Figures, the table and claims."""
+        return [*self.figures, self.summary, *([self.claims] if self.claims else [])]
+
+    def fill(self, made: Made) -> None:
+        """Write figures, the table, claims, the file and the manifest."""
+        folder, products = self.folder, made.products
+        publish([products[task.key] for task in self.figures], folder / "figures")
+        publish([products[self.summary.key]], folder / "tables")
+        if self.claims is not None:
+            publish([products[self.claims.key]], folder)
+        text = yaml.safe_dump(self.file.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)
+        write(folder / EXPERIMENT, text)
+        figures = [task.settings["figure"] for task in self.figures]
+        fields = {
+            "description": self.description,
+            "kind": "runtime",
+            "stand_ins": list(self.stand_ins),
+            "captions": {figure.label: figure.caption for figure in figures},
+            "machine": self.timed_on,
+            "products": product_entries(self.tasks, made.products, made.tasks),
+        }
+        write_manifest(folder, self.name, fields)
+
+
+def load_runtime(
+    path: Path, data: Mapping[str, Any], scale: str | None = None, overrides: Sequence[str] = ()
+) -> RuntimeStudy:
+    """Validate the content of a run-time file; parameters and errors as for `calstudy.studies.load.load_study`."""
+    plain = apply_scale(data, scale)
+    for text in overrides:
+        plain = override(plain, *parse_override(text))
+    try:
+        file = RuntimeFile.model_validate(plain, context={"folder": path.resolve().parent})
+    except ValidationError as error:
+        raise ExperimentError(sentences(error, RuntimeFile, plain)) from None
+    return RuntimeStudy(file)
+
+
+def _gpu() -> str:
+    from calstudy.base.quiet import load_tensorflow
+
+    load_tensorflow()
+    import tensorflow as tf
+
+    devices = tf.config.list_physical_devices("GPU")
+    if not devices:
+        raise InputError("runtime.devices = [..., gpu]: TensorFlow finds no GPU on this machine; use [cpu]")
+    return str(tf.config.experimental.get_device_details(devices[0]).get("device_name", "unnamed GPU"))

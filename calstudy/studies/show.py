@@ -1,0 +1,143 @@
+"""Show what a run would do, and what it did, as tables."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from calstudy.base.resources import LIBRARIES_MEMORY, Cost, free_memory
+from calstudy.run.execution import schedule
+from calstudy.run.progress import duration
+from calstudy.run.store import Store
+from calstudy.run.task import Task
+from calstudy.studies.folder import MANIFEST
+from calstudy.studies.study import Budget, Run, Study
+from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
+
+
+def _by_stage(tasks: Sequence[Task]) -> dict[str, list[Task]]:
+    groups: dict[str, list[Task]] = defaultdict(list)
+    for task in tasks:
+        groups[task.stage.name].append(task)
+    return groups
+
+
+def _gigabytes(count: float) -> str:
+    return f"{count / 1e9:.2f} GB" if count >= 1e7 else f"{count / 1e6:.1f} MB"
+
+
+def show_plan(study: Study, budget: Budget, console: Console) -> None:
+    """Print the stages of a study, what is in the store, and what the rest will take.
+
+    Parameters
+    ----------
+    study
+        What is planned.
+    budget
+        Workers and memory.
+    console
+        Where it is written.
+
+    Raises
+    ------
+    InputError
+        If the study does not fit.
+    """
+    study, workers = study.fitted(budget)
+    store = Store(study.outputs.store)
+    plan = schedule(study.targets, store)
+    todo = {task.key for task in plan.todo}
+    table = Table(title=f"{study.name}: plan for {workers} worker(s)", title_justify="left")
+    table.add_column("stage")
+    for heading in ("products", "to make", "cpu time", "memory each", "disk"):
+        table.add_column(heading, justify="right")
+    for stage, tasks in _by_stage(study.tasks).items():
+        costs = [task.cost for task in tasks if task.key in todo]
+        table.add_row(
+            stage,
+            str(len(tasks)),
+            str(len(costs)),
+            duration(sum(cost.seconds for cost in costs)) if costs else "-",
+            _gigabytes(max(cost.memory for cost in costs)) if costs else "-",
+            _gigabytes(sum(cost.disk for cost in costs)) if costs else "-",
+        )
+    console.print(table)
+    for task in plan.damaged:
+        console.print(f"damaged, will be made again: {task.stage.name} ({task.label})", markup=False)
+    _total([task.cost for task in plan.todo], plan.todo, workers, console)
+    for note in study.stand_ins:
+        console.print(f"stand-in: {note}", markup=False)
+    console.print(f"store: {store.root}", markup=False, soft_wrap=True)
+    for folder in study.folders:
+        console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
+
+
+def _total(costs: list[Cost], tasks: Sequence[Task], workers: int, console: Console) -> None:
+    if not costs:
+        console.print("everything is in the store: a run only writes its folder")
+        return
+    kept = sum(cost.disk for cost, task in zip(costs, tasks, strict=True) if not task.temporary)
+    memory = LIBRARIES_MEMORY + workers * max(cost.memory for cost in costs)
+    console.print(
+        f"in all: about {duration(sum(cost.seconds for cost in costs) / workers)}, "
+        f"up to {_gigabytes(memory)} of memory ({_gigabytes(free_memory())} free), "
+        f"{_gigabytes(sum(cost.disk for cost in costs))} of disk while running, {_gigabytes(kept)} kept"
+    )
+
+
+def show_run(run: Run, console: Console) -> None:
+    """Print what a run and its parts made, what they warn of, where the results are, and which claims hold."""
+    for name, part in run.parts.items():
+        console.print(f"\n{name}", markup=False)
+        _show_products(part, console)
+    if run.parts:
+        console.print("")
+    _show_products(run, console)
+    _show_claims(run.folder, console)
+
+
+def _show_products(run: Run, console: Console) -> None:
+    made = {task.key for task in run.made.tasks}
+    if not made:
+        console.print("everything was in the store: nothing was computed")
+    table = Table(title="products", title_justify="left")
+    table.add_column("stage")
+    for heading in ("made", "from store", "cpu time", "peak memory"):
+        table.add_column(heading, justify="right")
+    for stage, tasks in _by_stage(run.tasks).items():
+        records = [run.made.products[task.key].record for task in tasks if task.key in made]
+        stored = sum(task.key in run.made.products and task.key not in made for task in tasks)
+        table.add_row(
+            stage,
+            str(len(records)),
+            str(stored),
+            duration(sum(record["cpu_seconds"] for record in records)) if records else "-",
+            _gigabytes(max(record["peak_memory_bytes"] for record in records)) if records else "-",
+        )
+    console.print(table)
+    for warning in run.warnings:
+        console.print(f"warning: {warning}", markup=False)
+    for figure in sorted((run.folder / "figures").glob("*.png")):
+        console.print(f"figure: {figure}", markup=False)
+    if (run.folder / "tables").is_dir():
+        console.print(f"tables: {run.folder / 'tables'}", markup=False)
+    console.print(f"manifest: {run.folder / MANIFEST}", markup=False)
+
+
+def _show_claims(folder: Path, console: Console) -> None:
+    """Print how many claims hold in a run, which fail, and where all of them are; nothing without claims."""
+    path = folder / CLAIMS_JSON
+    verdicts = from_json(path.read_text(encoding="utf-8")) if path.is_file() else []
+    for verdict in verdicts:
+        if verdict.verdict == "FAIL":
+            text = f"claim FAILS: {verdict.name}: {measured(verdict)}, must be {verdict.threshold}"
+            console.print(text, markup=False)
+    if verdicts:
+        console.print(f"claims: {tally(verdicts)}: {folder / CLAIMS_MARKDOWN}", markup=False)
+    elif path.is_file():
+        text = "claims: none, for the run plays no role in the papers that it names; for the reasons see"
+        console.print(f"{text} {folder / CLAIMS_MARKDOWN}", markup=False)

@@ -1,0 +1,257 @@
+"""What a file can ask for, and the one way in which all of it is run: make its products, then fill its folders."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, Self, TypeVar
+
+from rich.console import Console
+
+from calstudy.base.errors import InputError
+from calstudy.report.page import write_report
+from calstudy.run.execution import Workers, drop_temporary, execute, schedule
+from calstudy.run.progress import report
+from calstudy.run.store import Product, Store
+from calstudy.run.task import Task, unique
+from calstudy.studies.folder import LOG, log_to, open_folder
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a run may take.
+
+    Attributes
+    ----------
+    workers
+        Wanted number of worker processes, or None for one per core as far as the memory goes.
+    max_memory
+        What all workers together may take, such as "6 GB", or None for what is free now.
+    scheduler
+        Address of a running dask scheduler, whose memory is not looked at, or None.
+    """
+
+    workers: int | None = None
+    max_memory: str | None = None
+    scheduler: str | None = None
+
+
+@dataclass(frozen=True)
+class Made:
+    """What making the products of a study gave.
+
+    Attributes
+    ----------
+    products
+        By key: those that were made or looked at, and all others behind them that are still in the store.
+    tasks
+        The tasks whose products were made; the others were in the store.
+    """
+
+    products: Mapping[str, Product]
+    tasks: tuple[Task, ...]
+
+    def of(self, tasks: Sequence[Task]) -> Made:
+        """Return the part that belongs to some tasks."""
+        keys = {task.key for task in tasks}
+        products = {key: product for key, product in self.products.items() if key in keys}
+        return Made(products, tuple(task for task in self.tasks if task.key in keys))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder
+        Holds the resolved file, the manifest, the log, figures and tables.
+    made
+        Its products.
+    tasks
+        All tasks whose products the run made or looked at.
+    parts
+        Runs that it consists of, with folders of their own, by name.
+    """
+
+    folder: Path
+    made: Made
+    tasks: tuple[Task, ...]
+    parts: Mapping[str, Run]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the stages warn of, with the product that it is about."""
+        records = [product.record for product in self.made.products.values()]
+        return [
+            f"{record['stage']} ({record['label']}): {text}"
+            for record in records
+            for text in record["notes"].get("warnings", [])
+        ]
+
+
+class Folders(Protocol):
+    """Where a study puts what it makes."""
+
+    @property
+    def store(self) -> Path:
+        """Folder of products."""
+
+    @property
+    def runs(self) -> Path:
+        """Folder in which each run gets its own folder."""
+
+
+class Study(ABC):
+    """What a file asks for: an experiment, a sweep, a collection, a run-time study.
+
+    A new kind is a subclass, with the key of its files in `calstudy.studies.load`.
+    """
+
+    name: str
+    description: str
+
+    @property
+    @abstractmethod
+    def outputs(self) -> Folders:
+        """Store and folder of runs."""
+
+    @abstractmethod
+    def fitted(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study fitted to a budget, and the number of workers; raises InputError if it does not fit."""
+
+    @property
+    @abstractmethod
+    def targets(self) -> Sequence[Task]:
+        """The products that a run is for; the others are made on the way."""
+
+    @property
+    @abstractmethod
+    def stand_ins(self) -> tuple[str, ...]:
+        """What is used in place of the papers' own ingredients; printed with the results."""
+
+    @property
+    @abstractmethod
+    def folder(self) -> Path:
+        """The run folder."""
+
+    @property
+    def parts(self) -> Mapping[str, Study]:
+        """Studies that it consists of, which get run folders of their own, by name."""
+        return {}
+
+    @abstractmethod
+    def fill(self, made: Made) -> None:
+        """Put what was asked for into the run folder: figures, tables, claims, manifest, the file itself."""
+
+    @cached_property
+    def tasks(self) -> list[Task]:
+        """All tasks, once each, every one after what it needs."""
+        return unique(self.targets)
+
+    @property
+    def folders(self) -> list[Path]:
+        """The run folders of the study and of its parts."""
+        return [self.folder, *(folder for part in self.parts.values() for folder in part.folders)]
+
+
+S = TypeVar("S", bound=Study)
+
+
+def fitted_parts(parts: Mapping[str, S], budget: Budget) -> dict[str, tuple[S, int]]:
+    """Return every part of a study fitted to a budget, with its number of workers; an InputError names the part."""
+    fits = {}
+    for name, part in parts.items():
+        try:
+            fits[name] = part.fitted(budget)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+    return fits
+
+
+def make(targets: Sequence[Task], store: Store, workers: Workers, console: Console) -> Made:
+    """Make products and all that they need, as far as it is not in the store, and report the progress.
+
+    A store that can only be read serves if it holds everything.
+
+    Parameters
+    ----------
+    targets
+        What is wanted.
+    store
+        Where products are.
+    workers
+        Who makes them.
+    console
+        Where the progress is written.
+
+    Raises
+    ------
+    InputError
+        If the store must be written and cannot be, or a stage refuses its input.
+    """
+    plan = schedule(targets, store)
+    if plan.todo:
+        store.prepare()
+    for task in plan.damaged:
+        message = f"{task.stage.name} ({task.label}): the product in the store is damaged, and is made again"
+        logger.warning(message)
+        console.print(message, markup=False)
+    costs = {task.key: task.cost.seconds for task in plan.todo}
+    with report(plan.todo, costs, console) as show:
+
+        def done(task: Task, product: Product) -> None:
+            logger.info("%s (%s): %.1f s", task.stage.name, task.label, product.record["seconds"])
+            show(task, product)
+
+        products = execute(plan.todo, store, workers, done)
+    products |= plan.ready
+    drop_temporary(targets, store)
+    for task in unique(targets):
+        if task.key not in products and (found := store.find(task.stage.name, task.key)) is not None:
+            products[task.key] = found
+    return Made(products, plan.todo)
+
+
+def run_study(study: Study, budget: Budget | None = None, console: Console | None = None) -> Run:
+    """Make what a study asks for, reusing every product that is in the store.
+
+    Parameters
+    ----------
+    study
+        From `calstudy.studies.load.load_study`.
+    budget
+        Workers and memory.
+    console
+        Where progress is written; nowhere if None.
+
+    Raises
+    ------
+    InputError
+        If the study does not fit the machine, the store or a run folder cannot be written, or a stage refuses its
+        input.
+    """
+    budget, console = budget or Budget(), console or Console(quiet=True)
+    study, count = study.fitted(budget)
+    store = Store(study.outputs.store)
+    with ExitStack() as logs:
+        for folder in study.folders:
+            open_folder(folder)
+            logs.enter_context(log_to(folder / LOG))
+        made = make(study.targets, store, Workers(count, study.folder / LOG, budget.scheduler), console)
+        return _filled(study, made)
+
+
+def _filled(study: Study, made: Made) -> Run:
+    parts = {name: _filled(part, made) for name, part in study.parts.items()}
+    own = made.of(study.tasks)
+    study.fill(own)
+    write_report(study.folder)
+    return Run(study.folder, own, tuple(study.tasks), parts)

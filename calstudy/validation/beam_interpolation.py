@@ -1,0 +1,137 @@
+"""Interpolations of a tabulated beam in frequency: the smooth fit against the table, and others against the fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin
+from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
+from calstudy.instrument.beams import GriddedBeam, make_beam
+from calstudy.instrument.settings import Channels, InstrumentSettings
+from calstudy.plotting import style
+
+INTERPOLATIONS = get_args(MwaEmbeddedBeam.model_fields["interpolation"].annotation)
+SMOOTH = INTERPOLATIONS[0]
+INTERPOLATION_COLOURS = {
+    "chebyshev": style.BLUE,
+    "cubic": style.GREEN,
+    "linear": style.ORANGE,
+    "nearest": style.RED,
+}
+"""One colour for each interpolation in every figure."""
+
+
+@dataclass(frozen=True)
+class BeamInterpolation:
+    """Differences between Jones components, relative to the zenith, over directions, feeds and components.
+
+    Attributes
+    ----------
+    tabulated : (Ntab,) float
+        Tabulated frequencies within the band, Hz.
+    fit_rms, fit_max : (Ntab,) float
+        Rms and largest difference of the smooth fit from the table.
+    channels : (Nfreqs,) float
+        Channels, Hz.
+    others : dict
+        By interpolation, the rms difference of the other interpolations from the smooth fit, (Nfreqs,).
+    """
+
+    tabulated: np.ndarray
+    fit_rms: np.ndarray
+    fit_max: np.ndarray
+    channels: np.ndarray
+    others: dict[str, np.ndarray]
+
+
+def require_tabulated(beam: Plugin) -> None:
+    """Raise InputError for a beam in closed form, which is not interpolated."""
+    if not hasattr(beam, "interpolation"):
+        raise InputError(
+            f"instrument.beam: {beam.label} is a formula, exact at every frequency; there is no fit to check"
+        )
+
+
+def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> BeamInterpolation:
+    """Compare the smooth fit of a beam with its table, and the other interpolations with the smooth found.
+
+    Parameters
+    ----------
+    instrument
+        Beam and channels.
+    step
+        Only every so many channels are looked at.
+
+    Raises
+    ------
+    InputError
+        If the beam is not tabulated.
+    """
+    require_tabulated(instrument.beam)
+    beams = {name: interpolated(instrument.beam, instrument.channels, name) for name in INTERPOLATIONS}
+    tabulated = beams[SMOOTH].tabulated_frequencies
+    difference = _difference(beams[SMOOTH], beams["nearest"], tabulated)
+    settings = instrument.channels
+    channels = (settings.first + settings.width * np.arange(settings.count))[::step]
+    return BeamInterpolation(
+        tabulated=tabulated,
+        fit_rms=_rms(difference),
+        fit_max=np.abs(difference).max(axis=(0, 1, 3, 4)),
+        channels=channels,
+        others={
+            name: _rms(_difference(beam, beams[SMOOTH], channels)) for name, beam in beams.items() if name != SMOOTH
+        },
+    )
+
+
+def interpolated(beam: Plugin, channels: Channels, interpolation: str) -> GriddedBeam:
+    """Return a tabulated beam with another interpolation between its frequencies.
+
+    Parameters
+    ----------
+    beam
+        Section of a tabulated beam.
+    channels
+        Over which it is read and fitted.
+    interpolation
+        One of `INTERPOLATIONS`.
+    """
+    found = make_beam(beam.model_copy(update={"interpolation": interpolation}), channels)
+    assert isinstance(found, GriddedBeam)
+    return found
+
+
+def _difference(beam: GriddedBeam, other: GriddedBeam, frequencies: np.ndarray) -> np.ndarray:
+    """Return J - J', (2, Nfeeds, Nfreqs, Nza, Naz)."""
+    return beam.at(frequencies).data_array - other.at(frequencies).data_array
+
+
+def _rms(difference: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(np.abs(difference) ** 2, axis=(0, 1, 3, 4)))
+
+
+@style.journal_style()
+def draw_interpolations(found: BeamInterpolation, stand_ins: Sequence[str] = ()) -> Figure:
+    """Draw differences of Jones components, relative to the zenith, against frequency."""
+    figure = style.new_figure(style.ONE_COLUMN, 2.9)
+    axes = figure.subplots()
+    blue = INTERPOLATION_COLOURS["chebyshev"]
+    axes.plot(
+        found.tabulated / 1e6, found.fit_max, "^", color=blue, markerfacecolor="white", label="fit − table, largest"
+    )
+    axes.plot(found.tabulated / 1e6, found.fit_rms, "o", color=blue, label="fit − table, rms")
+    for name, rms in found.others.items():
+        axes.plot(
+            found.channels / 1e6, rms, color=INTERPOLATION_COLOURS[name], linewidth=0.8, label=f"{name} − fit, rms"
+        )
+    axes.set(yscale="log", xlabel=style.FREQUENCY, ylabel=r"$|\Delta J|\,/\,|J_\mathrm{zenith}|$")
+    axes.margins(x=0.01)
+    figure.legend(loc="outside upper center", ncols=2)
+    style.note_stand_ins(figure, stand_ins)
+    return figure

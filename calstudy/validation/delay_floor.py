@@ -1,0 +1,161 @@
+"""The delay floor of an experiment's foregrounds for every interpolation of its beam between tabulated frequencies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import baseline_vectors, from_cube
+from calstudy.experiment.model import Experiment
+from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.plotting import style
+from calstudy.power.delay import horizon_delay
+from calstudy.simulate.chunks import simulate_visibilities
+from calstudy.simulate.floor import MAIN_LOBES, DelayFloor, delay_floor, delay_profile, floor_buffers
+from calstudy.simulate.nodes import integration_times
+from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.validation.beam_interpolation import (
+    INTERPOLATION_COLOURS,
+    INTERPOLATIONS,
+    interpolated,
+    require_tabulated,
+)
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+PAPER_FLOOR = -45.0
+"""Artefacts of beam interpolation in the paper, dB of brightness."""
+LINES = {"dolph-chebyshev": "-", "blackman-harris": ":"}
+
+
+@dataclass(frozen=True)
+class InterpolationFloor:
+    """Delay spectra and floors of foregrounds simulated with one interpolation of the beam.
+
+    Attributes
+    ----------
+    delay : (Ndelays,) float
+        Non-negative delays, s.
+    spectrum : (Ndelays,) float
+        Rms over the shortest third of the baselines, relative to its largest, Dolph-Chebyshev taper.
+    horizon
+        Longest horizon delay of these baselines, s.
+    floors
+        By taper.
+    """
+
+    delay: np.ndarray
+    spectrum: np.ndarray
+    horizon: float
+    floors: dict[str, DelayFloor]
+
+
+def compare_floors(
+    experiment: Experiment, announce: Callable[[str], None] = lambda text: None
+) -> dict[str, InterpolationFloor]:
+    """Simulate the foregrounds of an experiment at its middle integration, once with every interpolation.
+
+    Every channel is simulated, so that nothing but the beam is interpolated.
+
+    Parameters
+    ----------
+    experiment
+        Its instrument, foregrounds and engine are used.
+    announce
+        Called with the name of each interpolation before its simulation.
+
+    Raises
+    ------
+    InputError
+        If the beam is not tabulated, or a catalogue or beam file is missing.
+    """
+    instrument = experiment.instrument
+    require_tabulated(instrument.beam)
+    whole = make_template(instrument)
+    times = integration_times(whole)
+    template = subset_template(whole, times[len(times) // 2 :][:1], whole.freq_array)
+    sky = make_foregrounds(experiment.sky.foregrounds, whole.freq_array).sky
+    settings = experiment.simulation
+    engine = settings.engine
+    floors = {}
+    for name in INTERPOLATIONS:
+        announce(name)
+        beam = interpolated(instrument.beam, instrument.channels, name)
+        cube = simulate_visibilities(engine, sky, beam, template, settings, smooth_in_frequency=False)
+        floors[name] = _measure(from_cube(template, cube))
+    return floors
+
+
+def _measure(foregrounds: UVData) -> InterpolationFloor:
+    buffers = floor_buffers(foregrounds)
+    if len(buffers) < len(MAIN_LOBES):
+        raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")
+    lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
+    short = lengths <= np.quantile(lengths, 1 / 3)
+    delays, power = delay_profile(foregrounds, "dolph-chebyshev")
+    delay, folded = folded_spectrum(delays, power[short].mean(axis=0))
+    return InterpolationFloor(
+        delay=delay,
+        spectrum=np.sqrt(folded / folded.max()),
+        horizon=horizon_delay(float(lengths[short].max())),
+        floors={taper: delay_floor(foregrounds, buffer, taper) for taper, buffer in buffers.items()},
+    )
+
+
+def folded_spectrum(delays: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return delays >= 0, (N // 2,), and the mean power of both signs of each, from the order of `numpy.fft`."""
+    half = delays.size // 2
+    return delays[:half], np.concatenate([power[:1], (power[1:half] + power[:-half:-1]) / 2])
+
+
+@style.journal_style()
+def draw_delay_floors(
+    floors: Mapping[str, InterpolationFloor], eor_level: float | None, stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw delay spectra of short baselines (left) and the floor beyond the horizon against baseline length (right).
+
+    Parameters
+    ----------
+    floors
+        By interpolation.
+    eor_level
+        Level of the EoR that is marked, amplitude dB, or None.
+    stand_ins
+        Printed below.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 3.0)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for name, floor in floors.items():
+        colour = INTERPOLATION_COLOURS[name]
+        left.plot(floor.delay * 1e9, 10 * np.log10(floor.spectrum), color=colour, linewidth=0.8, label=name)
+        for taper, line in LINES.items():
+            _draw_steps(right, floor, taper, colour, line)
+    horizon = next(iter(floors.values())).horizon
+    left.axvline(horizon * 1e9, color=style.BLACK, linestyle="--", linewidth=0.7)
+    for axes in (left, right):
+        axes.axhline(PAPER_FLOOR, color=style.GREY, linewidth=0.6, linestyle="-.")
+        if eor_level is not None:
+            axes.axhline(eor_level, color=style.BLACK, linewidth=0.6)
+    left.set(xlabel=style.DELAY, ylabel="brightness relative to peak (dB)", ylim=(-105, 3))
+    left.margins(x=0)
+    right.set(xlabel=style.BASELINE_LENGTH)
+    for line, label in (("-", "Dolph–Chebyshev"), (":", "Blackman–Harris"), ("-.", "paper's artefacts")):
+        right.plot([], [], color=style.GREY, linestyle=line, label=label)
+    if eor_level is not None:
+        right.plot([], [], color=style.BLACK, linewidth=0.6, label="EoR asked for")
+    right.legend(loc="upper right")
+    left.legend(loc="upper right")
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_steps(axes: Axes, floor: InterpolationFloor, taper: str, colour: str, line: str) -> None:
+    measured = floor.floors[taper]
+    axes.stairs(measured.rms_db, measured.edges, baseline=None, linewidth=1.0, color=colour, linestyle=line)

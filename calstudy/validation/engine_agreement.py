@@ -1,0 +1,221 @@
+"""Foregrounds made by one engine against the same foregrounds made by another, in full."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
+from calstudy.corrupt.levels import rms
+from calstudy.plotting import style
+from calstudy.power.delay import horizon_delay
+from calstudy.simulate.floor import DelayFloor, Taper, delay_floor, delay_profile, floor_buffers, length_bins
+from calstudy.validation.delay_floor import folded_spectrum
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+GROUPS = 6
+SHORT_AND_LONG = (style.BLUE, style.RED)
+
+
+@dataclass(frozen=True)
+class GroupAgreement:
+    """The difference of two simulations on the baselines of a range of lengths, relative to the rms of these.
+
+    Attributes
+    ----------
+    shortest, longest
+        Range of lengths, m.
+    baselines
+        How many there are.
+    rms_jy
+        Rms of the visibilities, Jy.
+    largest, rms
+        Largest and rms difference, over `rms_jy`.
+    delay
+        Delays >= 0, (Ndelays,), s.
+    spectrum, difference
+        Rms of the delay spectra of the visibilities and of the difference, over the largest of `spectrum`, (Ndelays,).
+    """
+
+    shortest: float
+    longest: float
+    baselines: int
+    rms_jy: float
+    largest: float
+    rms: float
+    delay: np.ndarray
+    spectrum: np.ndarray
+    difference: np.ndarray
+
+
+@dataclass(frozen=True)
+class EngineAgreement:
+    """How far two simulations of the same foregrounds agree.
+
+    Attributes
+    ----------
+    groups
+        Ranges of baseline length that hold baselines, ascending.
+    largest, rms
+        Largest and rms difference of all visibilities over their rms.
+    worst_slot
+        Largest difference of any integration and channel over the rms of that integration and channel.
+    taper
+        Of the delay spectra.
+    floors, differences
+        By taper: the delay floor of the visibilities, and the same of the difference, relative to the same peaks.
+    """
+
+    groups: tuple[GroupAgreement, ...]
+    largest: float
+    rms: float
+    worst_slot: float
+    taper: Taper
+    floors: dict[Taper, DelayFloor]
+    differences: dict[Taper, DelayFloor]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the numbers, without the delay spectra."""
+        groups = [
+            {key: value for key, value in asdict(group).items() if not isinstance(value, np.ndarray)}
+            for group in self.groups
+        ]
+        worst = {
+            taper: {"foregrounds_db": floor.worst_db, "difference_db": self.differences[taper].worst_db}
+            for taper, floor in self.floors.items()
+        }
+        return {
+            "largest": self.largest,
+            "rms": self.rms,
+            "worst_slot": self.worst_slot,
+            "groups": groups,
+            "beyond_horizon": worst,
+        }
+
+
+def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreement:
+    """Compare two simulations of the same sky, beam and observation.
+
+    Parameters
+    ----------
+    foregrounds, reference
+        Visibilities in Jy, equally spaced channels, the same observation. Not mutated.
+
+    Raises
+    ------
+    InputError
+        If the band leaves no delays beyond the horizon of the longest baseline.
+    ValueError
+        If the observations differ.
+    """
+    for name in ("baseline_array", "time_array", "freq_array", "polarization_array"):
+        if not np.array_equal(getattr(foregrounds, name), getattr(reference, name)):
+            raise ValueError(f"the two simulations differ in {name}, expected the same observation")
+    buffers = floor_buffers(foregrounds)
+    if not buffers:
+        raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")
+    taper: Taper = "dolph-chebyshev" if "dolph-chebyshev" in buffers else next(iter(buffers))
+    cube = to_cube(reference)
+    difference = from_cube(foregrounds, to_cube(foregrounds) - cube)
+    size = np.abs(to_cube(difference))
+    level = rms(cube)
+    slots = np.sqrt(np.mean(np.abs(cube) ** 2, axis=(1, 3)))
+    return EngineAgreement(
+        groups=_groups(reference, difference, taper),
+        largest=float(size.max() / level),
+        rms=rms(size) / level,
+        worst_slot=float((size.max(axis=(1, 3)) / slots).max()),
+        taper=taper,
+        floors={name: delay_floor(reference, buffer, name, GROUPS) for name, buffer in buffers.items()},
+        differences={
+            name: delay_floor(difference, buffer, name, GROUPS, reference) for name, buffer in buffers.items()
+        },
+    )
+
+
+def _groups(reference: UVData, difference: UVData, taper: Taper) -> tuple[GroupAgreement, ...]:
+    lengths = np.linalg.norm(baseline_vectors(reference), axis=1)
+    edges, bins = length_bins(lengths, GROUPS)
+    delays, power = delay_profile(reference, taper)
+    _, power_of_difference = delay_profile(difference, taper)
+    groups = []
+    for index in np.unique(bins):
+        members = bins == index
+        visibilities, deviations = to_cube(reference)[:, members], np.abs(to_cube(difference)[:, members])
+        delay, spectrum = folded_spectrum(delays, power[members].mean(axis=0))
+        _, deviation = folded_spectrum(delays, power_of_difference[members].mean(axis=0))
+        level = rms(visibilities)
+        groups.append(
+            GroupAgreement(
+                shortest=float(edges[index]),
+                longest=float(edges[index + 1]),
+                baselines=int(members.sum()),
+                rms_jy=level,
+                largest=float(deviations.max() / level),
+                rms=rms(deviations) / level,
+                delay=delay,
+                spectrum=np.sqrt(spectrum / spectrum.max()),
+                difference=np.sqrt(deviation / spectrum.max()),
+            )
+        )
+    return tuple(groups)
+
+
+@style.journal_style()
+def draw_engine_agreement(
+    agreement: EngineAgreement,
+    names: tuple[str, str],
+    allowed: float,
+    eor_level: float | None,
+    stand_ins: Sequence[str] = (),
+) -> Figure:
+    """Draw delay spectra of short and long baselines (left) and relative differences against baseline length (right).
+
+    Parameters
+    ----------
+    agreement
+        Of the two simulations.
+    names
+        Of the engine and of the reference.
+    allowed
+        Sum of the node tolerances of both, relative to the rms.
+    eor_level
+        Level of the EoR that is marked, amplitude dB, or None.
+    stand_ins
+        Printed below.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 3.1)
+    left, right = figure.subplots(1, 2)
+    ends = (agreement.groups[0], agreement.groups[-1])
+    for group, colour in zip(ends, SHORT_AND_LONG, strict=True):
+        _draw_spectra(left, group, colour)
+    if eor_level is not None:
+        left.axhline(eor_level, color=style.BLACK, linewidth=0.6, label="EoR asked for")
+    left.set(xlabel=style.DELAY, ylabel="brightness relative to peak (dB)")
+    left.margins(x=0)
+    left.legend(loc="upper right", frameon=True, framealpha=0.95, edgecolor="none")
+    for name, label, line in (("largest", "largest", "-"), ("rms", "rms", "--")):
+        values = [getattr(group, name) for group in agreement.groups]
+        shortest, longest = zip(*((group.shortest, group.longest) for group in agreement.groups), strict=True)
+        right.hlines(values, shortest, longest, color=style.BLUE, linestyle=line, linewidth=1.2, label=label)
+    right.axhline(allowed, color=style.GREY, linestyle="-.", linewidth=0.8, label="sum of node tolerances")
+    right.set(yscale="log", xlabel=style.BASELINE_LENGTH, ylabel=f"|{names[0]} − {names[1]}| / rms")
+    right.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, columnspacing=1.0)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_spectra(axes: Axes, group: GroupAgreement, colour: str) -> None:
+    span = f"{group.shortest:.0f} to {group.longest:.0f} m"
+    for values, line, label in ((group.spectrum, "-", f"F, {span}"), (group.difference, ":", f"difference, {span}")):
+        level = 10 * np.log10(np.maximum(values, np.finfo(float).tiny))
+        axes.plot(group.delay * 1e9, level, line, color=colour, linewidth=0.9, label=label)
+    axes.axvline(horizon_delay(group.longest) * 1e9, color=colour, linestyle="--", linewidth=0.6)

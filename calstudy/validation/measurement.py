@@ -1,0 +1,160 @@
+"""What a step of the validation ladder measures: the interface, what it is given, and what it returns.
+
+A measurement is a `Measurement`: its fields are the parameters of the step's file. The built-in ones are the modules of
+`calstudy.validation.measurements`, named as their files; a step may name a file of one's own instead.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin, Registry
+from calstudy.corrupt.levels import Levels
+from calstudy.power.drawn import input_power
+from calstudy.power.settings import PowerSettings
+from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
+from calstudy.power.tables import load_spectrum
+from calstudy.products.corruption import LEVELS
+from calstudy.products.files import read_json, spectrum_file
+from calstudy.products.graph import Graph
+from calstudy.products.spectra import read_delay_spectra
+from calstudy.run.task import Task
+from calstudy.verdicts.criterion import Finding
+
+if TYPE_CHECKING:
+    from calstudy.calibrate.interface import Calibrator
+    from calstudy.corrupt.settings import CorruptionSettings
+    from calstudy.instrument.settings import InstrumentSettings
+    from calstudy.sky.settings import Eor
+
+MEASUREMENTS: Registry[Measurement] = Registry(
+    "measurement", "calstudy.validation.measurements", "calstudy.validation.measurement:Measurement"
+)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a measurement found.
+
+    Attributes
+    ----------
+    values
+        Numbers with their uncertainties, by the names that the criteria of the step know them under.
+    remarks
+        Sentences that belong to the numbers.
+    """
+
+    values: Mapping[str, Finding]
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a measurement is made on.
+
+    Attributes
+    ----------
+    experiments
+        The sections of each experiment that the measurement reads, by the experiment's name in the step.
+    folders
+        Folders of products by ``experiment:product``.
+    output
+        Folder for figures and tables.
+    """
+
+    experiments: Mapping[str, Mapping[str, Any]]
+    folders: Mapping[str, Path] = field(default_factory=dict)
+    output: Path = Path()
+
+    @property
+    def only(self) -> str:
+        """The name of the single experiment."""
+        (name,) = self.experiments
+        return name
+
+    def folder(self, experiment: str, product: str) -> Path:
+        """Return the folder of a product of an experiment."""
+        return self.folders[f"{experiment}:{product}"]
+
+    def power(self, experiment: str) -> PowerSettings:
+        """Return the `power` section of an experiment."""
+        return self.experiments[experiment]["power"]
+
+    def calibration(self, experiment: str) -> Calibrator:
+        """Return the `calibration` section of an experiment."""
+        return self.experiments[experiment]["calibration"]
+
+    def instrument(self, experiment: str) -> InstrumentSettings:
+        """Return the `instrument` section of an experiment."""
+        return self.experiments[experiment]["instrument"]
+
+    def levels(self, experiment: str) -> Levels:
+        """Return how the components of an experiment are scaled."""
+        return Levels(**read_json(self.folder(experiment, "levels") / LEVELS))
+
+    def corruption(self, experiment: str) -> CorruptionSettings:
+        """Return the `corruption` section of an experiment."""
+        return self.experiments[experiment]["corruption"]
+
+    def eor(self, experiment: str) -> Eor:
+        """Return the `sky.eor` section of an experiment."""
+        return self.experiments[experiment]["sky"].eor
+
+    def input_power(self, experiment: str, k: np.ndarray) -> np.ndarray:
+        """Return the P(k) that was put in, scaled as the data were, mK^2 h^-3 Mpc^3, at `k` in h/Mpc."""
+        power = input_power(self.eor(experiment), k, self.power(experiment).cosmology)
+        return self.levels(experiment).eor_factor ** 2 * power
+
+    def delay_spectra(self, experiment: str, product: str) -> DelaySpectra:
+        """Return the delay spectra of a `power` product."""
+        return read_delay_spectra(self.folder(experiment, product))
+
+    def spherical(self, experiment: str, variant: str) -> SphericalSpectrum:
+        """Return the spherical spectrum of a variant outside the wedge, from the product "spectra"."""
+        file = self.folder(experiment, "spectra") / spectrum_file(variant, "outside-wedge")
+        return load_spectrum(file, SphericalSpectrum)
+
+    def cylindrical(self, experiment: str, variant: str) -> CylindricalSpectrum:
+        """Return the cylindrical spectrum of a variant, from the product "spectra"."""
+        return load_spectrum(self.folder(experiment, "spectra") / spectrum_file(variant, "wedge"), CylindricalSpectrum)
+
+
+def required(task: Task | None, what: str) -> Task:
+    """Return a task that a measurement cannot do without; raises InputError if the experiment has none."""
+    if task is None:
+        raise InputError(f"the measurement needs {what}, which the experiment does not have")
+    return task
+
+
+class Measurement(Plugin):
+    """The base of all measurements; fields of subclasses are the parameters that a step may give.
+
+    Attributes
+    ----------
+    version
+        Raised when the results change.
+    sections
+        The sections of the experiments that are read; what only their products depend on need not be named.
+    """
+
+    registry: ClassVar = MEASUREMENTS
+    version: ClassVar[int] = 1
+    sections: ClassVar[tuple[str, ...]] = ()
+
+    kind: str
+
+    def products(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the products of one experiment that are read, by names of the measurement's own."""
+        del graph
+        return {}
+
+    @abstractmethod
+    def measure(self, inputs: Inputs) -> Findings:
+        """Measure, and write figures and tables to ``inputs.output`` if there are any."""

@@ -1,0 +1,51 @@
+"""Step 4.0: whether the EoR is recovered bin by bin, from the sky to the power spectrum.
+
+Pulls (P^R - P^S) / sigma outside wedge and buffer, with two readings of sigma: the paper's error bar sigma_N + sigma_S,
+and the error of the difference, from which the sample variance that P^R and P^S share is gone
+(`calstudy.papers.calamity2022.bins.difference_error`). The second is the harder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.units import Wavenumber
+from calstudy.papers.calamity2022.bins import difference_error, recovered, used_bins
+from calstudy.products import spectra
+from calstudy.products.graph import Graph
+from calstudy.run.task import Task
+from calstudy.validation.measurement import Findings, Inputs, Measurement
+from calstudy.verdicts.criterion import Finding
+
+SIGMAS = 2
+EXPECTED = 0.954
+"""Part of a normal distribution within two sigma."""
+
+
+class EndToEnd(Measurement):
+    """Of every experiment, the part of the bins with a pull within two sigma, for both readings."""
+
+    k_min: Wavenumber = Field(0.0, description="Bins below are left out.")
+
+    def products(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the averaged spectra of all variants."""
+        return {"spectra": spectra.spectra(graph)}
+
+    def measure(self, inputs: Inputs) -> Findings:
+        """Compare the residual's spectrum with the EoR's."""
+        values, remarks = {}, []
+        for name in inputs.experiments:
+            residual, signal = (inputs.spherical(name, variant) for variant in ("residual", "eor"))
+            used = used_bins(residual, signal, k_min=self.k_min)
+            difference = (residual.power - signal.power).real[used]
+            for reading, error in (("bars", residual.error), ("difference", difference_error(residual))):
+                within = np.abs(difference / error[used]) <= SIGMAS
+                sampling = np.sqrt(EXPECTED * (1 - EXPECTED) / within.size)
+                values[f"{name}_{reading}"] = Finding(float(within.mean()), float(sampling))
+            ratio = recovered(residual, signal, self.k_min)
+            values[f"{name}_ratio"] = ratio
+            remarks.append(f"{name}: P^R / P^S = {ratio.value:.3f} ± {ratio.uncertainty:.3f} in {used.sum()} bins")
+        return Findings(values, tuple(remarks))

@@ -1,0 +1,93 @@
+r"""Step 0.0: noise alone, whose power is known from its standard deviation.
+
+For white noise of standard deviation sigma (Jy, complex) per integration, N_t integrations averaged, and a taper T, the
+noise power of one baseline is
+
+    P_N = dnu sum_nu T^2 s^2 / sum_nu T^2 (Omega_pp / Omega_p^2) / (X^2 Y),   s = sigma / sqrt(N_t) in mK,
+
+which is the familiar X^2 Y Omega_eff T^2 dnu; X and Y are taken at the band's own channels. Even times odd have
+independent noise, so that Re and Im of their product have mean zero and standard deviation P_N / sqrt(2).
+
+Baselines have independent noise. Means and mean squares of a baseline's delays are the samples, from whose scatter
+come the sampling errors: correlations between delays, and the products' long tails, are in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from calstudy.corrupt.levels import Levels
+from calstudy.experiment.model import Variant
+from calstudy.instrument.beams import make_beam
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.power.cosmology import make_cosmology, radial_scale, redshift, transverse_scale
+from calstudy.power.delay import make_taper
+from calstudy.power.estimate import kelvin_per_jansky
+from calstudy.power.settings import PowerSettings
+from calstudy.products import corruption, spectra
+from calstudy.products.graph import Graph
+from calstudy.run.task import Task
+from calstudy.validation.measurement import Findings, Inputs, Measurement
+from calstudy.verdicts.criterion import Finding
+
+
+class Noise(Measurement):
+    """The scatter of the estimates over the theory's, and the means of Re and Im in units of P_N."""
+
+    sections: ClassVar = ("instrument", "power")
+
+    def products(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the spectra of the noise alone, and its level."""
+        noise = Variant(components=("noise",))
+        return {"noise": spectra.variant_power(graph, "noise", noise), "levels": corruption.levels(graph)}
+
+    def measure(self, inputs: Inputs) -> Findings:
+        """Compare the spectra of the noise with P_N."""
+        name = inputs.only
+        found = inputs.delay_spectra(name, "noise")
+        theory = noise_power(inputs.instrument(name), inputs.power(name), inputs.levels(name))
+        products = found.power * np.sqrt(found.n_pairs)[:, None] / theory
+        square = _mean(np.mean(products.real**2, axis=1))
+        scatter = np.sqrt(2 * square.value)
+        values = {
+            "scatter_over_theory": Finding(scatter, scatter * square.uncertainty / (2 * square.value)),
+            "mean_real": _mean(products.real.mean(axis=1)),
+            "mean_imaginary": _mean(products.imag.mean(axis=1)),
+        }
+        return Findings(
+            values, (f"P_N of one baseline: {theory:.4g} mK2 h-3 Mpc3; {len(products)} baselines or groups",)
+        )
+
+
+def noise_power(instrument: InstrumentSettings, power: PowerSettings, levels: Levels) -> float:
+    """Return P_N of one baseline in mK2 h-3 Mpc3, as in the module's text.
+
+    Parameters
+    ----------
+    instrument
+        Its channels, times, first polarization and beam.
+    power
+        Taper and cosmology.
+    levels
+        Gives sigma.
+    """
+    channels = instrument.channels
+    frequencies = channels.first + channels.width * np.arange(channels.count)
+    omega_p, omega_pp = make_beam(instrument.beam, channels).solid_angles(frequencies, instrument.polarizations[0])
+    sigma = levels.noise_std / np.sqrt(instrument.times.count)
+    temperature = 1e3 * sigma * kelvin_per_jansky(frequencies, omega_p, None)
+    cosmology = make_cosmology(power.cosmology)
+    redshifts = np.asarray(redshift(frequencies))
+    volume = cosmology.h**3 * np.array(
+        [transverse_scale(cosmology, z) ** 2 * radial_scale(cosmology, z) for z in redshifts]
+    )
+    taper = make_taper(power.taper, channels.count) ** 2
+    return float(channels.width * np.sum(taper * temperature**2) / np.sum(taper * omega_pp / omega_p**2 / volume))
+
+
+def _mean(values: np.ndarray) -> Finding:
+    """Return the mean of independent samples and its standard error."""
+    return Finding(float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size)))

@@ -1,0 +1,38 @@
+"""Step 2.0: noiseless data whose foregrounds lie in the basis: the product of gains and model must equal the data.
+
+The foregrounds are the simulated ones projected on the fit's basis, so that a perfect fit exists. In single precision
+the data are rounded to complex64, as stored data are, and the solver is the experiment's own; in double precision they
+are not, and the solver goes on as long as its predicted gain exceeds 1e-14 of the loss.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calstudy.corrupt.levels import rms
+from calstudy.validation.measurement import Findings, Inputs
+from calstudy.validation.single_integration import SingleIntegrationMeasurement
+from calstudy.verdicts.criterion import Finding
+
+SMALLEST_TOLERANCE = 1e-14
+
+
+class Noiseless(SingleIntegrationMeasurement):
+    """The rms of V - g_a g_b* F over that of V, for both precisions."""
+
+    def measure(self, inputs: Inputs) -> Findings:
+        """Calibrate in both precisions."""
+        integration = self.integration(inputs)
+        exact = integration.products(integration.true_gains) * integration.modelled
+        patient = integration.settings.solver.model_copy(update={"tolerance": SMALLEST_TOLERANCE})
+        cases = {
+            "single": (exact.astype(np.complex64).astype(complex), integration.settings),
+            "double": (exact, integration.settings.model_copy(update={"solver": patient})),
+        }
+        values, remarks = {}, []
+        for precision, (visibilities, settings) in cases.items():
+            result = integration.calibrate(visibilities, settings)
+            values[precision] = Finding(rms(integration.misfit(result, visibilities)) / rms(visibilities), 0.0)
+            record = result.solutions[0]
+            remarks.append(f"{precision}: {record.status} after {record.n_steps} steps: {record.message}")
+        return Findings(values, tuple(remarks))

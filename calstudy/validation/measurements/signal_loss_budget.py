@@ -1,0 +1,166 @@
+r"""Step 4.1: the signal-loss budget: what each stage takes from the EoR, per band of k.
+
+The spectrum of the EoR alone is followed through the chain, each entry in units of what was put in:
+
+- *sky*: P_in - P of the middle integration by itself, without taper: this sky is a sample;
+- *averaging*: all integrations averaged as they are: fringes wash out;
+- *fringe-stop*: what stopping the fringes first gives back;
+- *taper*: the window instead of none;
+- *calibration*: the response D of the residual to the EoR (`calstudy.power.transfer`) in place of the EoR;
+- *mask*: modes outside the wedge in place of all modes of the band;
+- *left*: what the residual holds when there is no EoR, noise and foregrounds, which is no signal but in P^R (negative).
+
+The end-to-end loss is measured apart from these: P_in - P^R, from the residual of the whole chain. The sum must agree
+with it; the difference is the cross term of the EoR's response and what is left, whose mean is zero, and whose error
+comes from the scatter of baselines or groups.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from calstudy.base.visibilities import to_cube
+from calstudy.experiment.model import Variant
+from calstudy.instrument.beams import make_beam
+from calstudy.power.average import fringe_stop_and_average
+from calstudy.power.interface import estimate_spectra
+from calstudy.power.spectra import DelaySpectra, outside_wedge
+from calstudy.power.transfer import BANDS
+from calstudy.products import corruption, signal_loss, spectra
+from calstudy.products.files import DATA, read_visibilities
+from calstudy.products.graph import Graph
+from calstudy.run.task import Task
+from calstudy.validation.means import clustered_mean
+from calstudy.validation.measurement import Findings, Inputs, Measurement, required
+from calstudy.verdicts.criterion import Finding
+
+STAGES = ("sky", "averaging", "fringe-stop", "taper", "calibration", "mask", "left")
+
+
+@dataclass(frozen=True)
+class Band:
+    """The budget of one band of k, in units of P_in.
+
+    Attributes
+    ----------
+    low, high
+        h/Mpc.
+    losses
+        What each of `STAGES` takes.
+    total
+        Their sum.
+    measured
+        1 - P^R / P_in, and the error of its difference from the sum.
+    """
+
+    low: float
+    high: float
+    losses: tuple[float, ...]
+    total: float
+    measured: Finding
+
+    @property
+    def pull(self) -> float:
+        """Difference of sum and end-to-end loss in units of its error."""
+        return (self.measured.value - self.total) / self.measured.uncertainty
+
+
+class SignalLossBudget(Measurement):
+    """The largest pull of any band of k, of every experiment."""
+
+    sections: ClassVar = ("instrument", "power", "sky")
+
+    def products(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the EoR before averaging, and the spectra of EoR, response, residual, and residual without EoR."""
+        eor = Variant(components=("eor",))
+        return {
+            "levels": corruption.levels(graph),
+            "data": corruption.data(graph, eor, "even"),
+            "eor": spectra.variant_power(graph, "eor", eor),
+            "residual": spectra.power(graph, "residual"),
+            "left": spectra.power(graph, "residual_without_eor"),
+            "response": required(signal_loss.transfer(graph), "the variants of signal loss").inputs["response"],
+        }
+
+    def measure(self, inputs: Inputs) -> Findings:
+        """Write the budgets to signal_loss_budget.csv."""
+        values, remarks, rows = {}, [], []
+        for name in inputs.experiments:
+            bands = budget(inputs, name)
+            rows += [(name, band) for band in bands]
+            worst = max(bands, key=lambda band: abs(band.pull))
+            values[f"{name}_worst_pull"] = Finding(abs(worst.pull), 1.0)
+            remarks += [f"{name}: {_sentence(band)}" for band in bands]
+        with (inputs.output / "signal_loss_budget.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["experiment", "k from [h/Mpc]", "k to [h/Mpc]", *STAGES, "sum", "end to end", "error"])
+            writer.writerows(
+                [name, band.low, band.high, *band.losses, band.total, band.measured.value, band.measured.uncertainty]
+                for name, band in rows
+            )
+        return Findings(values, tuple(remarks))
+
+
+def _sentence(band: Band) -> str:
+    parts = ", ".join(f"{stage} {100 * loss:.1f} %" for stage, loss in zip(STAGES, band.losses, strict=True))
+    return (
+        f"k from {band.low:g} to {band.high:g} h/Mpc: {parts}; sum {100 * band.total:.1f} %, end to end "
+        f"{100 * band.measured.value:.1f} ± {100 * band.measured.uncertainty:.1f} %"
+    )
+
+
+def budget(inputs: Inputs, name: str) -> list[Band]:
+    """Return the budget of one experiment, band by band."""
+    settings = inputs.power(name)
+    followed = [*_before_calibration(inputs, name), inputs.delay_spectra(name, "eor")]
+    response, residual, left = (inputs.delay_spectra(name, product) for product in ("response", "residual", "left"))
+    outside = outside_wedge(response, settings.wedge_buffer)
+    k = np.hypot(response.k_perp[:, None], response.k_parallel)
+    bands = []
+    for low, high in itertools.pairwise(BANDS):
+        inside = (k > low) & (k <= high)
+        if not (inside & outside).any():
+            continue
+        put_in = float(inputs.input_power(name, np.array((low + high) / 2)))
+        powers = [1.0, *(_mean(modes, inside).value / put_in for modes in (*followed, response))]
+        powers.append(_mean(response, inside & outside).value / put_in)
+        powers.append(powers[-1] + _mean(left, inside & outside).value / put_in)
+        difference = _mean(residual, inside & outside, minus=(response, left))
+        total = 1 - powers[-1]
+        bands.append(
+            Band(
+                low,
+                high,
+                tuple(before - after for before, after in itertools.pairwise(powers)),
+                total,
+                Finding(total - difference.value / put_in, difference.uncertainty / put_in),
+            )
+        )
+    return bands
+
+
+def _mean(modes: DelaySpectra, used: np.ndarray, minus: Sequence[DelaySpectra] = ()) -> Finding:
+    power = modes.power.real - sum(other.power.real for other in minus)
+    return clustered_mean(np.where(used, power, np.nan), modes.n_pairs)
+
+
+def _before_calibration(inputs: Inputs, name: str) -> list[DelaySpectra]:
+    """Return the EoR's spectra without taper: one integration, the plain average, the fringe-stopped average."""
+    data = read_visibilities(inputs.folder(name, "data") / DATA)
+    stopped, cube = fringe_stop_and_average(data), to_cube(data)
+    plain = stopped.copy()
+    versions = []
+    for values in (cube[len(cube) // 2], cube.mean(axis=0)):
+        version = plain.copy()
+        version.data_array = values.astype(complex)
+        versions.append(version)
+    settings = inputs.power(name).model_copy(update={"taper": "none"})
+    instrument = inputs.instrument(name)
+    beam = make_beam(instrument.beam, instrument.channels)
+    return [estimate_spectra(version, version, beam, settings) for version in (*versions, stopped)]

@@ -1,0 +1,163 @@
+"""One integration to calibrate, put together from products: foregrounds, gains, and the level of the noise.
+
+TensorFlow is imported inside functions, for the steps of the ladder are read without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+from pyuvdata import UVCal, UVData
+
+from calstudy.base.errors import InputError
+from calstudy.base.gains import make_uvcal
+from calstudy.base.observation import Observation
+from calstudy.base.visibilities import from_cube, to_cube
+from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.problem import FitStructure, gain_products
+from calstudy.calibrate.records import CalibrationResult
+from calstudy.calibrate.settings import ForegroundFit
+from calstudy.products import corruption, simulation
+from calstudy.products.files import GAINS, VISIBILITIES, read_visibilities
+from calstudy.products.graph import Graph
+from calstudy.run.task import Task
+from calstudy.validation.measurement import Inputs, Measurement, required
+
+
+def first_integrations(uvd: UVData, count: int = 1) -> UVData:
+    """Return the first integrations of a rectangular data set."""
+    return uvd.select(blt_inds=np.arange(count * uvd.Nbls), inplace=False, run_check=False)
+
+
+@dataclass(frozen=True)
+class SingleIntegration:
+    """One integration of one polarization, and what it consists of.
+
+    Attributes
+    ----------
+    foregrounds
+        As simulated.
+    structure, numbers
+        Of the fit, and the antenna numbers its indices stand for.
+    settings
+        Of the calibration.
+    noise_std
+        Of the complex noise of one sample, Jy.
+    true_gains
+        (Nants, Nfreqs), in the order of the fit's antennas.
+    """
+
+    foregrounds: UVData
+    structure: FitStructure
+    numbers: np.ndarray
+    settings: ForegroundFit
+    noise_std: float
+    true_gains: np.ndarray
+
+    @classmethod
+    def of(cls, inputs: Inputs, experiment: str) -> SingleIntegration:
+        """Return the first integration of an experiment, from its products "foregrounds", "gains" and "levels"."""
+        from calstudy.calibrate.structure import make_structure
+
+        foregrounds = first_integrations(read_visibilities(inputs.folder(experiment, "foregrounds") / VISIBILITIES))
+        settings, frame = inputs.calibration(experiment), Observation(foregrounds)
+        if not isinstance(settings, ForegroundFit):
+            raise InputError(f"{settings.label}: the measurement needs a calibrator with foregrounds, such as calamity")
+        cal = UVCal.from_file(inputs.folder(experiment, "gains") / GAINS)
+        return cls(
+            foregrounds=foregrounds,
+            structure=make_structure(frame, settings),
+            numbers=frame.numbers,
+            settings=settings,
+            noise_std=inputs.levels(experiment).noise_std,
+            true_gains=cal.gain_array[np.searchsorted(cal.ant_array, frame.numbers), :, 0, 0],
+        )
+
+    def first(self, antennas: int | None, channels: int | None) -> SingleIntegration:
+        """Return the first antennas and channels only; all if None."""
+        from calstudy.calibrate.structure import make_structure
+
+        if antennas is None and channels is None:
+            return self
+        numbers = self.numbers[:antennas]
+        cut = self.foregrounds.select(
+            antenna_nums=numbers,
+            freq_chans=np.arange(self.foregrounds.Nfreqs)[:channels],
+            inplace=False,
+            run_check=False,
+        )
+        frame = Observation(cut)
+        structure = make_structure(frame, self.settings)
+        gains = self.true_gains[np.searchsorted(self.numbers, frame.numbers), : structure.n_frequencies]
+        return replace(self, foregrounds=cut, structure=structure, numbers=frame.numbers, true_gains=gains)
+
+    @property
+    def modelled(self) -> np.ndarray:
+        """The foregrounds' projection on the basis of the fit, (Nbls, Nfreqs): foregrounds that it holds exactly."""
+        cube = to_cube(self.foregrounds)[0, :, :, 0]
+        projected = np.empty_like(cube)
+        for bucket in self.structure.basis.buckets:
+            projected[bucket.members] = cube[bucket.members] @ bucket.vectors @ bucket.vectors.T
+        return projected
+
+    def data(self, visibilities: np.ndarray) -> UVData:
+        """Return visibilities, (Nbls, Nfreqs), as a data set."""
+        return from_cube(self.foregrounds, visibilities[None, :, :, None])
+
+    def products(self, gains: np.ndarray) -> np.ndarray:
+        """Return g_a g_b* of each baseline, (Nbls, Nfreqs)."""
+        return gain_products(gains, self.structure.antennas)
+
+    def uvcal(self, gains: np.ndarray) -> UVCal:
+        """Return gains, (Nants, Nfreqs), as a set of solutions to start from."""
+        telescope = self.foregrounds.telescope
+        values = np.ones((telescope.Nants, gains.shape[1], 1, 1), complex)
+        values[np.searchsorted(telescope.antenna_numbers, self.numbers), :, 0, 0] = gains
+        return make_uvcal(self.foregrounds, values)
+
+    def calibrate(
+        self, visibilities: np.ndarray, settings: ForegroundFit | None = None, start: np.ndarray | None = None
+    ) -> CalibrationResult:
+        """Calibrate visibilities, (Nbls, Nfreqs), with the foregrounds fixing the scale.
+
+        Parameters
+        ----------
+        visibilities
+            Data, Jy.
+        settings
+            By default those of the experiment.
+        start
+            Gains to start from, complex, (Nants, Nfreqs); None for unity.
+        """
+        gains = None if start is None else self.uvcal(start)
+        return run_calibrator(settings or self.settings, self.data(visibilities), self.foregrounds, gains)
+
+    def misfit(self, result: CalibrationResult, visibilities: np.ndarray) -> np.ndarray:
+        """Return V - g_a g_b* F of a result, (Nbls, Nfreqs): the residual in the unit and gauge of the data."""
+        gains = result.gains.gain_array[np.searchsorted(result.gains.ant_array, self.numbers), :, 0, 0]
+        return visibilities - self.products(gains) * to_cube(result.model)[0, :, :, 0]
+
+
+class SingleIntegrationMeasurement(Measurement):
+    """The base of measurements on the first integration of the step's one experiment."""
+
+    sections: ClassVar = ("calibration",)
+
+    antennas: int | None = Field(None, ge=3, description="How many are used, the first ones; null: all.")
+    channels: int | None = Field(None, ge=1, description="How many are used, the first ones; null: all.")
+
+    def products(self, graph: Graph) -> Mapping[str, Task]:
+        """Return foregrounds, gains and levels."""
+        return {
+            "foregrounds": required(simulation.foregrounds(graph), "foregrounds"),
+            "gains": corruption.gains(graph),
+            "levels": corruption.levels(graph),
+        }
+
+    def integration(self, inputs: Inputs) -> SingleIntegration:
+        """Return the first integration of the experiment, of the first antennas and channels."""
+        return SingleIntegration.of(inputs, inputs.only).first(self.antennas, self.channels)

@@ -1,0 +1,229 @@
+"""Tables of results and of verdicts: for the terminal, as JSON for programs, as Markdown and CSV for documents."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as TerminalTable
+
+from calstudy.base.errors import InputError
+from calstudy.verdicts.criterion import Verdict
+
+OUTCOMES = ("PASS", "FAIL", "not evaluated")
+COLOURS = {
+    "PASS": "green",
+    "FAIL": "bold red",
+    "not evaluated": "dim",
+    "same": "green",
+    "moved": "yellow",
+    "beyond": "bold red",
+}
+"""Of verdicts, and of comparisons with a reference, on the terminal."""
+CLAIMS_JSON, CLAIMS_MARKDOWN = "claims.json", "claims.md"
+SUFFIXES = (".csv", ".md")
+LARGE = 1e5
+"""Numbers beyond this have an exponent."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts.
+
+    Attributes
+    ----------
+    headings
+        Of the columns.
+    rows
+        As many cells each.
+    title
+        Printed above it on the terminal.
+    """
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
+
+    def show(self, console: Console) -> None:
+        """Print it: the first column to the left, the others to the right; words with a colour have theirs."""
+        table = TerminalTable(title=escape(self.title), title_justify="left")
+        for index, heading in enumerate(self.headings):
+            table.add_column(heading, justify="right" if index else "left", overflow="fold")
+        for row in self.rows:
+            table.add_row(*(coloured(cell) for cell in row))
+        console.print(table)
+
+    def markdown(self, numbers: bool = True) -> str:
+        """Return it in Markdown; with `numbers`, all columns but the first are aligned to the right."""
+        marks = ["---", *["--:" if numbers else "---"] * (len(self.headings) - 1)]
+        rows = ([cell.replace("|", "\\|") for cell in row] for row in (self.headings, marks, *self.rows))
+        return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+    def write(self, path: Path) -> None:
+        """Write it as CSV or Markdown, whichever the path's ending says; see `require_writable`."""
+        require_writable(path)
+        if path.suffix == ".csv":
+            with path.open("w", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerows([self.headings, *self.rows])
+        else:
+            path.write_text(self.markdown(), encoding="utf-8")
+
+
+def require_writable(path: Path) -> None:
+    """Raise InputError unless a table can be written to this path; called before anything is measured."""
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"--output {path}: the name must end in {' or '.join(SUFFIXES)}")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"--output {path}: there is no folder {path.absolute().parent}")
+
+
+def coloured(text: str) -> str:
+    """Return a cell as markup of the terminal, in its colour if it is the name of an outcome or a status."""
+    return f"[{COLOURS[text]}]{text}[/]" if text in COLOURS else escape(text)
+
+
+def number(value: float, uncertainty: float | None = None) -> str:
+    """Write a number with three digits, or with its uncertainty and as many digits as that leaves meaning to."""
+    if not uncertainty:
+        return f"{value:.3g}"
+    places = max(0, 1 - math.floor(math.log10(uncertainty)))
+    size = f"{value:.3g}" if abs(value) >= LARGE else f"{value:.{places}f}"
+    return f"{size} ± {uncertainty:.2g}"
+
+
+def measured(verdict: Verdict) -> str:
+    """Write the measured number and its uncertainty, or why there is none."""
+    return verdict.reason if verdict.measured is None else number(verdict.measured, verdict.uncertainty)
+
+
+def count(words: Sequence[str], kinds: Iterable[str]) -> str:
+    """Count words of some kinds in one line: ``3 PASS, 1 FAIL``."""
+    return ", ".join(f"{words.count(kind)} {kind}" for kind in kinds)
+
+
+def tally(verdicts: Sequence[Verdict]) -> str:
+    """Count the outcomes in one line."""
+    return count([verdict.verdict for verdict in verdicts], OUTCOMES)
+
+
+def as_json(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
+    """Return verdicts as JSON-able objects."""
+    return [asdict(verdict) for verdict in verdicts]
+
+
+def to_json(verdicts: Sequence[Verdict]) -> str:
+    """Return verdicts as a JSON list."""
+    return json.dumps(as_json(verdicts), indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def from_json(text: str) -> list[Verdict]:
+    """Return the verdicts that `to_json` wrote."""
+    return [Verdict(**{**item, "runs": tuple(item["runs"])}) for item in json.loads(text)]
+
+
+def to_markdown(
+    verdicts: Sequence[Verdict],
+    title: str,
+    headings: tuple[str, str],
+    summary: str | None = None,
+    notes: Sequence[str] = (),
+) -> str:
+    """Return verdicts as a Markdown document, one table per section.
+
+    Parameters
+    ----------
+    verdicts
+        In order; those of one section together.
+    title
+        Of the document.
+    headings
+        What the first two columns hold, names and sentences.
+    summary
+        The line below the title; the tally by default.
+    notes
+        What stands in for the paper's own ingredients.
+    """
+    lines = [f"# {title}", "", summary or tally(verdicts), ""]
+    lines += [f"Stand-in: {note}." for note in notes] + ([""] if notes else [])
+    for section in dict.fromkeys(verdict.section for verdict in verdicts):
+        rows = [_cells(verdict) for verdict in verdicts if verdict.section == section]
+        table = Table((*headings, "measured", "must be", "why", ""), rows)
+        lines += ([f"## {section}", ""] if section else []) + [table.markdown(numbers=False)]
+    return "\n".join(lines)
+
+
+def _cells(verdict: Verdict) -> tuple[str, ...]:
+    runs = f"; {', '.join(verdict.runs)}" if verdict.runs else ""
+    number_and_quantity = f"**{measured(verdict)}** ({verdict.quantity}{runs})"
+    return verdict.name, verdict.sentence, number_and_quantity, verdict.threshold, verdict.why, verdict.verdict
+
+
+def show_verdicts(
+    verdicts: Sequence[Verdict],
+    title: str,
+    console: Console,
+    heading: str = "claim",
+    summary: str | None = None,
+) -> None:
+    """Print verdicts as a table, and after it those that were not evaluated, by what they lack.
+
+    Parameters
+    ----------
+    verdicts, title, summary
+        As for `to_markdown`.
+    console
+        Where it is written.
+    heading
+        What the first column holds.
+    """
+    heading_line = escape(f"{title}: {summary or tally(verdicts)}")
+    table = TerminalTable(title=heading_line, title_justify="left", show_lines=True, expand=True)
+    for text, ratio in ((heading, 5), ("measured", 4), ("must be", 2)):
+        table.add_column(text, ratio=ratio)
+    table.add_column("", no_wrap=True)
+    lacking: dict[str, list[str]] = {}
+    for verdict in verdicts:
+        if verdict.verdict == "not evaluated":
+            lacking.setdefault(verdict.reason, []).append(verdict.name)
+            continue
+        tested = f"[bold]{escape(verdict.name)}[/bold]\n{escape(verdict.sentence)}"
+        value = f"{escape(measured(verdict))}\n[dim]{escape(verdict.quantity)}[/dim]"
+        table.add_row(tested, value, escape(verdict.threshold), coloured(verdict.verdict))
+    console.print(table)
+    for reason, names in lacking.items():
+        console.print(f"not evaluated: {', '.join(names)}: {reason}", markup=False)
+
+
+def write_claims(
+    verdicts: Sequence[Verdict],
+    folder: Path,
+    title: str,
+    notes: Sequence[str] = (),
+    without_role: Sequence[str] = (),
+) -> None:
+    """Write the verdicts on a paper's statements to claims.json and claims.md in a folder.
+
+    Parameters
+    ----------
+    verdicts
+        On the statements.
+    folder
+        Must exist.
+    title
+        Name of the run.
+    notes
+        What stands in for the paper's own ingredients.
+    without_role
+        Sentences on why there are no verdicts on a paper, written below the table.
+    """
+    (folder / CLAIMS_JSON).write_text(to_json(verdicts) + "\n", encoding="utf-8")
+    summary = None if verdicts else "No claims."
+    text = to_markdown(verdicts, f"Claims of the paper: {title}", ("claim", "the paper"), summary, notes)
+    (folder / CLAIMS_MARKDOWN).write_text("\n".join([text, *without_role]).rstrip() + "\n", encoding="utf-8")

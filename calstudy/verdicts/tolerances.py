@@ -1,0 +1,189 @@
+"""How far the arrays of a figure may be from the reference: tolerances by figure and array, each with its reason.
+
+A result that is made again with the same seeds and the same code is the same to rounding. It moves when a library
+draws other random numbers, a solver stops elsewhere, or a model changes. What depends on draws or on where a solver
+stops may move by its error bars, as another draw would; all else may not move at all.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+Arrays = Mapping[str, np.ndarray]
+ROUNDING = 1e-6
+"""Part of an array's largest magnitude that counts as rounding: products are stored in single precision."""
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """The same in every run: numbers and texts that count or name exactly, all others to rounding."""
+
+    why: str
+
+    def __str__(self) -> str:
+        return f"{ROUNDING:g} of the largest"
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Another draw may stand in its place: compared in units of the error of a difference of two draws, √2 σ.
+
+    Attributes
+    ----------
+    error
+        From the reference arrays and the array's name to the standard deviation σ of each of its elements (of the real
+        part, if they are complex), in a shape that broadcasts.
+    why
+        What the error bar is.
+    largest
+        The element that is farthest may be so many σ off.
+    rms
+        The root mean square of the deviations may be so many σ.
+    shift
+        Their mean may be so many of its own standard errors, as if the elements were independent; what moves all of
+        an array the same way shows here first.
+    """
+
+    error: Callable[[Arrays, str], np.ndarray]
+    why: str
+    largest: float = 6.0
+    rms: float = 2.0
+    shift: float = 6.0
+
+    def __str__(self) -> str:
+        return f"largest {self.largest:g} σ, rms {self.rms:g} σ, mean {self.shift:g} σ"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Depends on the machine: changes are reported, and none is a failure."""
+
+    why: str
+
+    def __str__(self) -> str:
+        return "any"
+
+
+Tolerance = Fixed | Drawn | Measured
+Rules = tuple[tuple[str, Tolerance], ...]
+"""Patterns of array names with their tolerance; the first that matches counts."""
+
+
+def _parent(name: str) -> str:
+    return name.rpartition(".")[0]
+
+
+def _root_mean_square(values: np.ndarray) -> np.ndarray:
+    """Return the rms over the last axis, of the real part alone if the values are complex."""
+    rms = np.sqrt(np.mean(np.abs(values) ** 2, axis=-1, keepdims=True))
+    return rms / np.sqrt(2) if np.iscomplexobj(values) else rms
+
+
+def rms_of(sibling: str) -> Callable[[Arrays, str], np.ndarray]:
+    """Return an error: the rms of the array beside this one that is in the same domain, such as ``noise.values``."""
+
+    def error(arrays: Arrays, name: str) -> np.ndarray:
+        return _root_mean_square(arrays[f"{sibling}.{name.rpartition('.')[2]}"])
+
+    return error
+
+
+def departure_from_mean(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the rms over the last axis of the departure from its mean."""
+    values = arrays[name] - arrays[name].mean(axis=-1, keepdims=True)
+    return _root_mean_square(values)
+
+
+def scatter_of_noise(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the error of an rms over time of delay transforms: that of the noise, whose true one is flat in delay."""
+    return np.asarray(np.std(arrays[f"{_parent(name)}.noise"]))
+
+
+def spherical_error(arrays: Arrays, name: str) -> np.ndarray:
+    """Return σ_N + σ_S, and the noise's cross power with whatever else is in the spectrum."""
+    series = _parent(name)
+    noise, sample = arrays[f"{series}.noise_error"], arrays[f"{series}.sample_error"]
+    modes = arrays[f"{series}.noise_modes"]
+    # In a mean of M modes σ_N = P_N / √(2 M), and the cross terms have variance P P_N / M = √2 P σ_N / √M.
+    cross = np.sqrt(np.sqrt(2) * np.abs(arrays[name].real) * noise / np.sqrt(np.maximum(modes, 1)))
+    return noise + sample + cross
+
+
+def cylindrical_error(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the same for cells of a wedge, from the panels of noise and EoR, which are flat in delay."""
+    noise = _root_mean_square(arrays["noise.power"].real)
+    sample = np.mean(np.abs(arrays["eor.power"].real), axis=-1, keepdims=True)
+    pairs = arrays["noise.n_pairs"][:, None]
+    cross = np.sqrt(np.sqrt(2) * np.abs(arrays[name].real) * noise / np.sqrt(pairs))
+    with_signal = 0 if name.startswith("noise") else sample
+    return noise + with_signal + cross if not name.startswith("eor") else sample + 0 * noise
+
+
+def own_error(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the array that is named as the error of this one."""
+    return arrays[f"{name}_error"]
+
+
+def typical_error(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the error bars of a map, or their median over delays where that is larger.
+
+    Those of a bin with a single baseline come from two samples, and are often far too small by chance.
+    """
+    errors = arrays[f"{name.removesuffix('_error')}_error"]
+    counted = np.where(np.isfinite(errors), errors, np.nan)
+    return np.fmax(errors, np.nanmedian(counted, axis=-1, keepdims=True))
+
+
+def half(arrays: Arrays, name: str) -> np.ndarray:
+    """Return half the absolute value."""
+    return 0.5 * np.abs(arrays[name])
+
+
+def power_over_samples(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the absolute value over the root of the number of samples, at least one."""
+    return np.abs(arrays[name]) / np.sqrt(np.maximum(arrays[f"{_parent(name)}.n_samples"], 1))
+
+
+ERROR_OF_ERROR = Drawn(half, "an error bar is an estimate itself; half of it")
+BY_OWN_ERROR = Drawn(own_error, "its error bar")
+SPHERICAL_RULES: Rules = (
+    (r".*\.power", Drawn(spherical_error, "noise + sample variance, and noise x foregrounds")),
+    (r".*\.(noise|sample)_error", ERROR_OF_ERROR),
+)
+"""For figures of spherical power spectra."""
+COORDINATES = re.compile(
+    r"(.*\.)?(delay|frequency|k|k_perp|k_parallel|bin_edges|baseline_length|horizon_delay|antennas|numbers|enu|highlight)"
+)
+FIXED_COORDINATE = Fixed("what is plotted against")
+FIXED = Fixed("follows from the experiment alone")
+MACHINE = Measured("times depend on the machine")
+
+
+def tolerance(rules: Rules, name: str, reference: Arrays) -> Tolerance:
+    """Return how far an array of a figure may be from its reference.
+
+    Parameters
+    ----------
+    rules
+        Of the figure.
+    name
+        Of the array.
+    reference
+        All reference arrays of the figure.
+    """
+    if any(rule is MACHINE for _, rule in rules):
+        return MACHINE
+    if COORDINATES.fullmatch(name):
+        return FIXED_COORDINATE
+    if reference[name].dtype.kind not in "fc":
+        return FIXED
+    for pattern, rule in rules:
+        if re.fullmatch(pattern, name):
+            return rule
+    if f"{name}_error" in reference:
+        return BY_OWN_ERROR
+    return ERROR_OF_ERROR if name.endswith("_error") else FIXED

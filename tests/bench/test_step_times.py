@@ -1,0 +1,78 @@
+"""What is timed for the run-time study is what it says."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from calstudy.base.errors import InputError
+from calstudy.bench.step_times import Descent, Samples, descend, make_simulation, time_steps, time_steps_apart
+from calstudy.calibrate.settings import BasisSettings
+from calstudy.instrument.settings import Channels, LinearLayout
+
+CHANNELS = Channels(first="120.3 MHz", width="600 kHz", count=100)
+LINE = LinearLayout(kind="linear", count=6, spacing="20 m")
+
+
+def test_every_solver_is_timed_as_often_as_asked():
+    found = time_steps(LINE, CHANNELS, BasisSettings(), Samples(steps=13, calls=3, solves=2), "cpu")
+    counts = {name: len(samples) for name, samples in found.seconds.items()}
+    steps = counts.pop("default-step")
+    assert counts == {"paper-step": 13, "paper-sum": 13, "adamax-step": 3, "default-solve": 2}
+    assert steps > 2
+    assert min(min(samples) for samples in found.seconds.values()) > 0
+    assert sum(found.seconds["default-solve"]) > sum(found.seconds["default-step"])
+    # A step holds the sum and its gradient. The shortest of all samples is that with the least of the machine in it.
+    assert min(found.seconds["paper-step"]) > min(found.seconds["paper-sum"])
+    assert (found.antennas, found.baselines) == (6, 15)
+    assert found.longest == pytest.approx(100.0)
+    # 384 ns on either side over 60 MHz, and some more until the sequences leave the band.
+    assert 46 < found.vectors < 62
+    assert found.vectors < found.coefficients < 15 * found.vectors
+    assert found.basis_bytes == 4 * found.vectors * 15 * 100
+
+
+def test_a_descent_is_counted_from_its_losses():
+    losses = np.array([5.0, 1.2, 1.04, 1.06, 1.005])
+    descent = Descent(3, 1.0, losses)
+    assert (descent.steps_to(0.05), descent.steps_to(0.01), descent.steps_to(0.001)) == (2, 4, None)
+
+
+def test_the_papers_descent_comes_close_to_the_minimum():
+    found = descend(LINE, CHANNELS, BasisSettings(), 500)
+    assert found.losses.size == 501
+    assert found.losses[0] > 100 * found.floor
+    assert found.floor < found.losses.min() < 2 * found.losses[-1]
+    assert found.steps_to(1e9) == 0
+
+
+def test_the_sky_is_seen_over_the_given_band():
+    simulation = make_simulation(LINE, CHANNELS)
+    assert simulation.case.frequencies[[0, -1]] == pytest.approx([120.3e6, 179.7e6])
+    assert simulation.positions.shape == (6, 3)
+    assert np.ptp(simulation.positions[:, 0]) == pytest.approx(100.0)
+
+
+def test_a_process_that_fails_says_why(monkeypatch):
+    failed = subprocess.CompletedProcess([], 1, stdout="", stderr="noise\n--device gpu: no GPU\n")
+    asked = []
+
+    def run(command, **options):
+        asked.append((command, options["env"]["OMP_NUM_THREADS"]))
+        return failed
+
+    monkeypatch.setattr(subprocess, "run", run)
+    array = {"layout": {"kind": "linear", "count": 6}, "channels": {}, "basis": {}}
+    with pytest.raises(InputError, match="failed: --device gpu: no GPU"):
+        time_steps_apart(array, Samples(1, 2, 3), "gpu")
+    ((command, threads),) = asked
+    assert (command[0], threads) == (sys.executable, "1")
+    assert json.loads(command[-1]) == {
+        "array": array,
+        "samples": {"steps": 1, "calls": 2, "solves": 3},
+        "device": "gpu",
+    }

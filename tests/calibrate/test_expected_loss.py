@@ -1,0 +1,166 @@
+"""What a fit is expected to leave of a small signal, against brute force, against itself, and against injection."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_calibration_loss import redundant_structure
+from test_joint_basis import joined
+from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
+
+from calstudy.calibrate.expected_loss import DelayModes, expected_transfer
+from calstudy.calibrate.gain_space import gain_vectors
+from calstudy.calibrate.problem import flag_weights, gain_products
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton
+from calstudy.calibrate.solvers.interface import WarmStart, solve_warm
+
+MODES = DelayModes(FREQUENCIES)
+
+
+def brute_force(problem, gains, model):
+    """<f|1 - P|f> / <f|f> from the tangent vectors of every real unknown, gains and coefficients, by an SVD."""
+    structure = problem.structure
+    antennas, shape = structure.antennas, model.shape
+    products = gain_products(gains, antennas)
+    roots = np.sqrt(problem.weights)
+    tangents = []
+    vectors = np.eye(shape[1]) if structure.gain_vectors is None else structure.gain_vectors
+    for unit in (1, 1j):
+        for antenna in range(structure.n_antennas):
+            for vector in vectors.T:
+                change = np.zeros_like(gains)
+                change[antenna] = unit * vector
+                first, second = antennas.T
+                moved = change[first] * gains[second].conj() + gains[first] * change[second].conj()
+                tangents.append(roots * moved * model)
+        for bucket in structure.basis.buckets:
+            # Each member has coefficients of its own, or all of them together.
+            for members in [bucket.members] if bucket.joint else bucket.members[:, None]:
+                sequences = bucket.vectors if bucket.joint else bucket.vectors[None]
+                for column in range(sequences.shape[2]):
+                    moved = np.zeros(shape, complex)
+                    for index, vector in zip(members, sequences[:, :, column], strict=True):
+                        for p in np.flatnonzero(structure.groups == index):
+                            moved[p] = (np.conj(unit) if structure.conjugated[p] else unit) * vector
+                    tangents.append(roots * products * moved)
+    # The phases of g_a g_b* turn the plane of each sample, which isotropic signals do not see.
+    turned = np.array(tangents) * (np.abs(products) / products)
+    matrix = np.concatenate([turned.real.reshape(len(turned), -1), turned.imag.reshape(len(turned), -1)], axis=1)
+    matrix /= np.linalg.norm(matrix, axis=1, keepdims=True).clip(1e-300)
+    _, singular, right = np.linalg.svd(matrix, full_matrices=False)
+    space = right[singular > 1e-7 * singular[0]].reshape(-1, 2, *shape)
+    real, imaginary = (MODES.amplitudes(space[:, part]) for part in (0, 1))
+    power = np.sum(np.abs(real + 1j * imaginary) ** 2, axis=0) / 2
+    norm = np.sum(MODES.weights**2 * (problem.weights > 0), axis=1)[:, None]
+    return 1 - power / np.where(norm > 0, norm, np.nan)
+
+
+def in_the_basis(toy, structure, seed=2):
+    """Foregrounds with as much of every sequence, so that no gain comes close to what foregrounds can do."""
+    rng = np.random.default_rng(seed)
+    model = np.empty(toy.foregrounds.shape, complex)
+    for bucket in structure.basis.buckets:
+        common = complex_normal(rng, (bucket.vectors.shape[-1],)) if bucket.joint else None
+        for row, index in enumerate(bucket.members):
+            if common is not None:
+                spectrum = bucket.vectors[row] @ common
+            else:
+                spectrum = bucket.vectors @ complex_normal(rng, (bucket.vectors.shape[1],))
+            for p in np.flatnonzero(structure.groups == index):
+                model[p] = spectrum.conj() if structure.conjugated[p] else spectrum
+    return model
+
+
+def case(kind):
+    """A problem of one kind, with the gains and model of its solution."""
+    toy = make_toy(HEX if kind == "redundant" else scattered(5), noise=0.0)
+    structure = redundant_structure(toy) if kind == "redundant" else toy.structure
+    flags = np.zeros(toy.foregrounds.shape, bool)
+    gains = toy.gains
+    if kind == "flags":
+        flags[2, 10:14] = flags[4] = flags[:, 40] = True
+    if kind.startswith("joint"):
+        structure = joined(structure)
+    if kind.endswith("smooth gains"):
+        vectors = gain_vectors(FREQUENCIES, 400e-9, 1e-12)
+        structure = replace(structure, gain_vectors=vectors)
+        gains = 1 + 0.3 * complex_normal(np.random.default_rng(1), (5, vectors.shape[1])) @ vectors.T
+    model = in_the_basis(toy, structure)
+    data = gain_products(gains, structure.antennas) * model
+    return toy.problem(structure, visibilities=data, weights=flag_weights(flags)), gains, model
+
+
+KINDS = ["any gains", "flags", "smooth gains", "redundant", "joint", "joint, smooth gains"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_exact_diagonal_is_that_of_the_projector_on_all_tangent_vectors(kind):
+    problem, gains, model = case(kind)
+    found = expected_transfer(problem, gains, model, MODES)
+    brute = brute_force(problem, gains, model)
+    # Smooth gains times foregrounds come close to other foregrounds: there the solver's damping matters a little.
+    assert np.allclose(
+        found.transfer, brute, rtol=0, atol=1e-2 if kind.endswith("smooth gains") else 5e-4, equal_nan=True
+    )
+    assert np.isnan(found.transfer).all(axis=1).sum() == (kind == "flags")
+    assert np.nanmax(brute) - np.nanmin(brute) > 0.5
+    total = found.transfer + found.foregrounds + found.gains
+    assert np.nanmax(np.abs(total - 1)) < 1e-12
+    assert not np.nan_to_num(found.error).any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_random_probes_agree_with_the_exact_diagonal_within_their_errors(kind):
+    problem, gains, model = case(kind)
+    exact = expected_transfer(problem, gains, model, MODES)
+    probed = expected_transfer(problem, gains, model, MODES, probes=64)
+    known = np.isfinite(exact.transfer)
+    pull = ((probed.transfer - exact.transfer) / probed.error)[known]
+    assert 0.8 < np.std(pull) < 1.25
+    assert abs(np.mean(pull)) < 0.3
+    assert np.mean(probed.error[known]) < 0.08
+
+
+def test_far_from_the_foregrounds_gains_take_their_share_of_the_degrees_of_freedom():
+    problem, gains, model = case("any gains")
+    found = expected_transfer(problem, gains, model, MODES)
+    n_antennas = len(gains)
+    far = np.abs(MODES.delay) > 600e-9
+    share = (2 * n_antennas - 1) / (n_antennas * (n_antennas - 1))
+    assert np.mean(found.gains[:, far]) == pytest.approx(share, abs=0.02)
+
+
+def test_injected_signals_are_left_as_expected():
+    problem, gains, model = case("any gains")
+    expected = expected_transfer(problem, gains, model, MODES).transfer
+    rng, start = np.random.default_rng(8), WarmStart(gains, None)
+    products = gain_products(gains, problem.structure.antennas)
+    response, injected = np.zeros(expected.shape), np.zeros(expected.shape)
+    for _ in range(40):
+        signal = 1e-4 * complex_normal(rng, model.shape)
+        measured = replace(problem, visibilities=products * (model + signal), prior="none", initial_gains=gains)
+        solution = solve_warm(measured, GaussNewton(tolerance=1e-4), start)[0]
+        left = measured.visibilities / gain_products(solution.gains, problem.structure.antennas) - solution.model
+        response += np.abs(MODES.amplitudes(left)) ** 2
+        injected += np.abs(MODES.amplitudes(signal)) ** 2
+    for low, high in ((200e-9, 300e-9), (300e-9, 450e-9), (450e-9, 800e-9), (800e-9, 2e-6)):
+        chosen = (np.abs(MODES.delay) >= low) & (np.abs(MODES.delay) < high)
+        ratio = response[:, chosen].sum() / injected[:, chosen].sum()
+        assert ratio == pytest.approx(np.mean(expected[:, chosen]), abs=0.03)
+
+
+def test_what_cannot_be_estimated_is_refused():
+    problem, gains, model = case("any gains")
+    with pytest.raises(ValueError, match="at least 2"):
+        expected_transfer(problem, gains, model, MODES, probes=1)
+
+
+def test_a_frozen_sky_leaves_the_foreground_delays():
+    problem, gains, model = case("any gains")
+    frozen = replace(problem, sky_model=model, frozen=True)
+    found = expected_transfer(frozen, gains, model, MODES)
+    assert not found.foregrounds.any()
+    probed = expected_transfer(frozen, gains, model, MODES, probes=64)
+    assert np.std((probed.transfer - found.transfer) / probed.error) < 1.25

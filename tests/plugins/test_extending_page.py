@@ -1,0 +1,60 @@
+"""Every example of docs/extending.md is run as it is printed: each section is one kind of thing."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from tiny import tiny
+
+from calstudy.studies.load import load_study
+from calstudy.studies.reference import plugin_reference
+from calstudy.studies.study import run_study
+
+PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text(encoding="utf-8")
+BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", flags=re.MULTILINE | re.DOTALL)
+MOST_LINES = 40
+
+
+def sections() -> dict[str, dict[str, str]]:
+    """Return the blocks of each section that has some, by the section's title and the language of the block."""
+    found = {}
+    for text in re.split(r"^## ", PAGE, flags=re.MULTILINE)[1:]:
+        blocks = {match["language"]: match["text"] for match in BLOCK.finditer(text)}
+        if blocks:
+            found[text.splitlines()[0]] = blocks
+    return found
+
+
+def merged(base: dict | str, changes: dict) -> dict:
+    """Return a block of settings with changes, block by block; a name alone is replaced."""
+    base = {} if isinstance(base, str) else base
+    return {
+        **base,
+        **{
+            key: merged(base.get(key, {}), value) if isinstance(value, dict) else value
+            for key, value in changes.items()
+        },
+    }
+
+
+def test_the_page_shows_something():
+    assert "A calibrator" in sections()
+
+
+@pytest.mark.parametrize("title", sections())
+def test_an_example_is_short_and_runs(title, tmp_path):
+    blocks = sections()[title]
+    lines = blocks["python"].splitlines()
+    assert len(lines) < MOST_LINES
+    name = re.fullmatch(r"# (\w+\.py)", lines[0])
+    assert name, "the first line of an example is the name of its file"
+    (tmp_path / name[1]).write_text(blocks["python"])
+    assert name[1] in plugin_reference(tmp_path / name[1])
+    path = tmp_path / "experiment.yaml"
+    path.write_text(yaml.safe_dump(merged(tiny(tmp_path), yaml.safe_load(blocks["yaml"]))))
+    run = run_study(load_study(path))
+    assert (run.folder / "report.html").is_file()
+    assert run.warnings == []

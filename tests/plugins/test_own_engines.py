@@ -1,0 +1,71 @@
+"""An engine from one file outside the package: settings, key, cost, refusal, and visibilities that agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plugin_files import Plugged, make
+
+from calstudy.base import ranks
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.visibilities import to_cube
+from calstudy.products import simulation
+from calstudy.products.files import read_visibilities
+from calstudy.products.graph import Graph
+from calstudy.studies.reference import field_reference, plugin_reference
+
+
+@pytest.fixture(params=["path", "entry point"])
+def plugged(request, tmp_path, monkeypatch) -> Plugged:
+    return Plugged("An engine", request.param, tmp_path, monkeypatch)
+
+
+def with_engine(plugged: Plugged, engine, **instrument):
+    small = {"foregrounds": {"kind": "g4jy-and-counts", "count": 20}, "eor": {"nside": 16}}
+    changes = {"simulation": {"engine": engine, "chunks": 2}, "sky": small, "instrument": instrument}
+    return plugged.experiment(changes)
+
+
+def test_its_settings_are_validated_with_units(plugged):
+    assert with_engine(plugged, plugged.settings(faintest="2 mJy")).simulation.engine.faintest == 2e-3
+    with pytest.raises(ExperimentError, match=r"simulation\.engine\.faintest: 0\.001 has no unit"):
+        with_engine(plugged, plugged.settings(faintest=0.001))
+    with pytest.raises(ExperimentError, match=r"simulation\.engine: 'fast' is not an engine \(there are: auto, dense"):
+        with_engine(plugged, "fast")
+
+
+def test_it_is_listed(plugged):
+    text = plugin_reference(plugged.file) if plugged.reference.endswith(".py") else field_reference()
+    assert "| `faintest` | quantity in Jy | `0 Jy` | Fainter components are left out. |" in text
+
+
+def test_it_decides_the_simulation_and_its_cost(plugged):
+    default, own, other = (
+        simulation.foregrounds(Graph(with_engine(plugged, engine)))
+        for engine in ("auto", plugged.settings(), plugged.settings(faintest="1 Jy"))
+    )
+    assert len({default.key, own.key, other.key}) == 3
+    seconds = [next(iter(task.pieces.values())).cost.seconds for task in (default, own)]
+    assert seconds[0] != seconds[1]
+
+
+def test_its_visibilities_are_those_of_the_default(plugged):
+    tasks = [simulation.foregrounds(Graph(with_engine(plugged, engine))) for engine in ("auto", plugged.settings())]
+    products = make(tasks, plugged.folder)
+    expected, found = (to_cube(read_visibilities(products[task.key].path / "visibilities.uvh5")) for task in tasks)
+    # Two ways to add up the same terms: what differs is rounding, of phases of up to 1e3 turns.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
+
+
+def test_it_refuses_in_a_sentence(plugged):
+    task = simulation.foregrounds(Graph(with_engine(plugged, plugged.settings(), polarizations=["xx", "yy"])))
+    with pytest.raises(InputError, match=r"simulation\.engine = '\w.*': needs an unpolarized sky in xx"):
+        make([task], plugged.folder)
+
+
+def test_it_must_share_ranks_to_run_on_several(plugged, monkeypatch):
+    from calstudy.studies.capacity import Budget, fit
+
+    monkeypatch.setattr(ranks, "count", lambda: 2)
+    with pytest.raises(InputError, match="does not share its work between MPI ranks"):
+        fit(with_engine(plugged, plugged.settings()), Budget(), targets=lambda graph: [])

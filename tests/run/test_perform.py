@@ -1,0 +1,202 @@
+"""Making one product: mistakes of a user end in a sentence, defects in a traceback, and neither in a hanging run."""
+
+import errno
+import subprocess
+import sys
+import traceback
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.plugins import UserCodeError
+from calstudy.run.execution import Workers, drop_temporary, execute, schedule
+from calstudy.run.perform import WorkOrder, perform
+from calstudy.run.store import Store
+from calstudy.run.task import Job, Stage, Task
+
+EXIT_INPUT = 2
+
+
+def make_number(job: Job) -> dict:
+    number = job.settings["number"] + sum(int((folder / "number").read_text()) for folder in job.inputs.values())
+    (job.output / "number").write_text(str(number))
+    return {"number": number}
+
+
+NUMBER = Stage(name="number", version=1, make=make_number)
+
+
+def failing(error: BaseException) -> Stage:
+    """Return a stage that raises an error after it has written a file."""
+
+    def make(job: Job) -> dict:
+        (job.output / "half").write_text("half")
+        raise error
+
+    return Stage(name="failing", version=1, make=make)
+
+
+@pytest.fixture
+def store(tmp_path) -> Store:
+    found = Store(tmp_path / "store")
+    found.prepare()
+    return found
+
+
+def run(task: Task, store: Store) -> None:
+    """Make a task and what it needs with one worker, as a run does."""
+    execute(schedule([task], store).todo, store, Workers(1, store.root / "run.log"))
+
+
+def test_a_product_is_made_from_its_inputs_and_pieces_and_recorded(store):
+    first = Task(NUMBER, "first", {"number": 1})
+    piece = Task(NUMBER, "piece", {"number": 20})
+    total = Task(NUMBER, "total", {"number": 300}, {"first": first}, {"piece": piece})
+    run(total, store)
+    product = store.verify("number", total.key)
+    assert (product.path / "number").read_text() == "321"
+    assert product.record["notes"] == {"number": 321}
+    assert product.record["inputs"] == {"first": ["number", first.key], "piece": ["number", piece.key]}
+    assert product.record["stage_version"] == 1
+
+
+def test_a_product_of_an_older_version_is_not_found_and_left_alone(store):
+    old = Task(NUMBER, "total", {"number": 1})
+    run(old, store)
+    new = Task(replace(NUMBER, version=2), "total", {"number": 1})
+    plan = schedule([new], store)
+    assert (plan.todo, plan.damaged) == ((new,), ())
+    run(new, store)
+    assert all(store.verify("number", task.key) is not None for task in (old, new))
+    assert schedule([new], store).todo == ()
+
+
+def test_a_store_that_can_only_be_read_keeps_its_temporary_products(store, monkeypatch):
+    piece = Task(NUMBER, "piece", {"number": 20}, temporary=True)
+    total = Task(NUMBER, "total", {"number": 300}, {}, {"piece": piece})
+    run(total, store)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Store, "discard", refuse)
+        drop_temporary([total], store)
+    assert store.find("number", piece.key) is not None
+    drop_temporary([total], store)
+    assert store.find("number", piece.key) is None
+    assert store.find("number", total.key) is not None
+
+
+@pytest.mark.parametrize("error", [ValueError("index 3 is wrong"), KeyError("gains"), TypeError("no"), LookupError()])
+def test_a_defect_of_a_stage_reaches_the_caller_as_it_is_with_its_traceback(store, error):
+    task = Task(failing(error), "defect", {})
+    with pytest.raises(type(error)) as caught:
+        run(task, store)
+    assert type(caught.value) is type(error)
+    assert str(caught.value) == str(error)
+    assert "make" in [frame.name for frame in traceback.extract_tb(caught.value.__traceback__)]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        InputError("sky.eor.seed = 3: no"),
+        ExperimentError(["a: no", "b: no"]),
+        UserCodeError("own.py line 3, in calibrate: ValueError: no"),
+    ],
+)
+def test_a_refusal_of_a_stage_passes_as_it_is(store, error):
+    with pytest.raises(InputError) as caught:
+        run(Task(failing(error), "refusal", {}), store)
+    assert (type(caught.value), str(caught.value)) == (type(error), str(error))
+
+
+def test_what_failed_leaves_no_product_and_no_lock(store):
+    task = Task(failing(ValueError("no")), "defect", {})
+    for _ in range(2):
+        with pytest.raises(ValueError, match="no"):
+            perform(WorkOrder.of(task, store))
+    assert not store.exists("failing", task.key)
+    assert list((store.root / "failing").iterdir()) == []
+
+
+def test_an_input_that_vanished_is_told_in_a_sentence(store):
+    first = Task(NUMBER, "first", {"number": 1})
+    with pytest.raises(InputError, match=r"number \(second\): its input number/\w+ was removed or damaged"):
+        perform(WorkOrder.of(Task(NUMBER, "second", {"number": 2}, {"first": first}), store))
+
+
+PROGRAM = """
+import resource, signal, sys
+from pathlib import Path
+from calstudy.base.errors import InputError
+from calstudy.run.execution import Workers, execute, schedule
+from calstudy.run.store import Store
+from calstudy.run.task import Stage, Task
+
+def leave(job):
+    sys.exit(3)
+
+def write_much(job):
+    (job.output / "much").write_bytes(bytes(10**6))
+    return {{}}
+
+def write_hdf5(job):
+    import h5py
+    with h5py.File(job.output / "much.h5", "w") as file:
+        file["much"] = list(range(10**5))
+    return {{}}
+
+def limit():
+    # Longer files cannot be written, whoever asks: EFBIG, as on a full disk.
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10**5, 10**5))
+
+if __name__ == "__main__":
+    store = Store(Path("store"))
+    store.prepare()
+    {before}
+    tasks = schedule([Task(Stage(name="stage", version=1, make={make}), "label", {{}})], store).todo
+    try:
+        execute(tasks, store, Workers({workers}, Path("run.log")))
+    except InputError as error:
+        print(error)
+        sys.exit(2)
+"""
+
+
+def program(folder: Path, make: str, workers: int = 1, before: str = "") -> subprocess.CompletedProcess:
+    """Run a stage in a process of its own, which must end by itself."""
+    (folder / "program.py").write_text(PROGRAM.format(make=make, workers=workers, before=before))
+    command = [sys.executable, "program.py"]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False, timeout=120)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, workers):
+    result = program(tmp_path, "leave", workers)
+    assert result.returncode == 1
+    assert "RuntimeError: stage (label): the process was told to exit" in result.stderr
+    assert "in leave" in result.stderr
+
+
+@pytest.mark.parametrize("make", ["write_much", "write_hdf5"])
+def test_a_product_that_cannot_be_written_is_told_in_a_sentence(tmp_path, make):
+    result = program(tmp_path, make, before="limit()")
+    assert result.returncode == EXIT_INPUT, result.stderr
+    assert result.stdout.startswith(f"outputs.store = '{tmp_path / 'store'}': stage (label) could not be written (")
+    assert "make room or choose another folder" in result.stdout
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_only_files_of_the_store_are_taken_for_it(store, number, tmp_path):
+    inside, outside = (OSError(number, "no", str(folder / "file")) for folder in (store.root, tmp_path))
+    with pytest.raises(InputError, match=r"outputs\.store"):
+        perform(WorkOrder.of(Task(failing(inside), "inside", {}), store))
+    with pytest.raises(OSError, match="no") as caught:
+        perform(WorkOrder.of(Task(failing(outside), "outside", {}), store))
+    assert caught.value is outside

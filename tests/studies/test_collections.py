@@ -1,0 +1,192 @@
+"""Collections: members share what they can, keep their own folders, and are compared."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from tiny import tiny
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.claims.folders import evaluate_folder
+from calstudy.experiment.files import override
+from calstudy.power.spectra import SphericalSpectrum
+from calstudy.power.tables import load_spectrum
+from calstudy.products import corruption, simulation
+from calstudy.products.spectra import power
+from calstudy.studies.collection import Collection
+from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.load import load_study
+from calstudy.studies.study import Budget, Run, run_study
+from calstudy.verdicts.tables import from_json
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+PAIR = {
+    "name": "pair",
+    "experiments": [
+        "hex.yaml",
+        {"file": "hex.yaml", "name": "redundant", "overrides": {"corruption.effects.0.seed": 6}},
+    ],
+    "roles": {"minimally_redundant": "hexagon"},
+    "figures": ["layouts", "spherical-comparison"],
+}
+
+
+def write(folder: Path, **changes) -> Path:
+    """Write a collection of two hexagons with different gains, and, for other collections, one with reflections."""
+    hexagon = {**override(tiny(folder), "outputs.figures", ["gains"]), "name": "hexagon", "papers": ["calamity2022"]}
+    reflecting = override({**hexagon, "name": "lowsnr"}, "corruption.effects", ["reflection-gains"])
+    for name, data in (("hex", hexagon), ("reflections", reflecting)):
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(data))
+    path = folder / "pair.yaml"
+    path.write_text(yaml.safe_dump({**PAIR, **changes}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("collection")
+
+
+@pytest.fixture(scope="module")
+def collection(folder) -> Collection:
+    return load_study(write(folder))
+
+
+@pytest.fixture(scope="module")
+def finished(collection) -> Run:
+    return run_study(collection, Budget(1), Console(file=io.StringIO()))
+
+
+def keys_of(study: ExperimentStudy, stage: str) -> set[str]:
+    return {task.key for task in study.tasks if task.stage.name == stage}
+
+
+def test_members_share_every_product_that_they_can(collection):
+    first, second = collection.parts.values()
+    assert keys_of(first, "simulate") == keys_of(second, "simulate")
+    assert keys_of(first, "levels") == keys_of(second, "levels")
+    assert power(first.graph, "noise").key == power(second.graph, "noise").key
+    assert keys_of(first, "gains").isdisjoint(keys_of(second, "gains"))
+    assert power(first.graph, "residual").key != power(second.graph, "residual").key
+    keys = [task.key for task in collection.tasks]
+    assert len(set(keys)) == len(keys) < len(first.tasks) + len(second.tasks)
+
+
+def test_every_member_gets_its_own_folder_and_the_collection_another(finished, collection):
+    assert list(finished.parts) == ["hexagon", "redundant"]
+    folders = {run.folder for run in finished.parts.values()} | {finished.folder}
+    assert len(folders) == 3
+    for run in finished.parts.values():
+        names = {path.name for path in run.folder.iterdir()}
+        assert {"figures", "tables", "claims.json", "claims.md", "manifest.json", "experiment.yaml"} <= names
+    assert finished.folder == collection.folder
+    made = {path.name for path in (finished.folder / "figures").iterdir()}
+    assert made == {f"{name}.{ending}" for name in PAIR["figures"] for ending in ("png", "pdf", "npz")}
+
+
+def test_the_combined_figure_shows_the_tables_of_the_members(finished):
+    with np.load(finished.folder / "figures" / "spherical-comparison.npz") as shown:
+        for role, member in (("minimally_redundant", "hexagon"), ("redundant", "redundant")):
+            table = finished.parts[member].folder / "tables" / "residual.outside-wedge.h5"
+            spectrum = load_spectrum(table, SphericalSpectrum)
+            np.testing.assert_array_equal(shown[f"{role}.residual.power"], spectrum.power)
+    with np.load(finished.folder / "figures" / "layouts.npz") as shown:
+        assert (len(shown["0.numbers"]), len(shown["1.numbers"])) == (7, 7)
+
+
+def test_combined_claims_hold_each_member_to_its_role(finished):
+    claims = {claim.name: claim for claim in from_json((finished.folder / "claims.json").read_text())}
+    assert claims["noise-reduced"].runs == ("hexagon", "redundant")
+    assert claims["noise-reduced"].measured == pytest.approx(1)
+    assert claims["gains-within-20-percent"].runs == ("hexagon",)
+    assert claims["redundant-modelling-same-power"].verdict == "not evaluated"
+    alone = {claim.name: claim for claim in from_json((finished.parts["hexagon"].folder / "claims.json").read_text())}
+    # A hexagon alone is a redundant array, whatever role a collection gives it, and held to nothing else.
+    assert "gains-within-20-percent" not in alone
+    assert alone["redundant-signal-recovered"].runs == ("hexagon",)
+
+
+def test_claims_are_the_same_evaluated_from_the_folders(finished):
+    for folder in (finished.folder, finished.parts["redundant"].folder):
+        written = from_json((folder / "claims.json").read_text())
+        assert evaluate_folder(folder).claims == written
+
+
+def test_a_second_run_makes_nothing_and_a_member_alone_has_everything(finished, collection, folder):
+    again = run_study(collection, Budget(1), Console(file=io.StringIO()))
+    assert again.made.tasks == ()
+    assert all(run.made.tasks == () for run in again.parts.values())
+    store = Path(tiny(folder)["outputs"]["store"])
+    alone = ExperimentStudy(collection.members["redundant"])
+    assert all((store / task.stage.name / task.key).exists() for task in alone.targets)
+    assert alone.folder == finished.parts["redundant"].folder
+    manifest = json.loads((finished.folder / "manifest.json").read_text())
+    assert set(manifest["members"]) == set(collection.members)
+
+
+def test_scale_and_overrides_reach_every_member(folder):
+    changed = load_study(write(folder), overrides=["power.taper=hann"])
+    assert {experiment.power.taper for experiment in changed.members.values()} == {"hann"}
+    with pytest.raises(InputError, match=r"experiments\.0 \(hex\.yaml\): --scale small"):
+        load_study(write(folder), scale="small")
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"experiment": []}, "experiment: unknown key, did you mean 'experiments'?"),
+        ({"experiments": []}, "experiments: must have at least 1 item(s), has 0"),
+        ({"experiments": [{"file": "hex.yaml", "nam": "a"}]}, "experiments.0.nam: unknown key, did you mean 'name'?"),
+        ({"experiments": [{"name": "a"}]}, "experiments.0.file: missing, and it has no default"),
+        ({"experiments": ["hex.yaml", "hex.yaml"]}, "experiments.1: a second 'hexagon'; give it a `name` of its own"),
+        ({"figures": ["layout"]}, "figures.0: 'layout' does not compare members, did you mean 'layouts'?"),
+        ({"figures": ["layuot"]}, "figures.0: 'layuot' is not a figure, did you mean 'layout'?"),
+        ({"roles": {"redundant": "line"}}, "roles.redundant = 'line': not a member (there are: hexagon, redundant)"),
+        ({"roles": {"low_snr": "hexagon"}}, "roles.low_snr = 'hexagon': corruption.effects is per-channel-gains"),
+        ({"roles": {"redundant": "lowsnr"}, "experiments": ["reflections.yaml"]}, "not per-channel-gains alone"),
+        ({"roles": {}}, "figures: asks for 'layouts', which needs a member in the role(s) minimally_redundant"),
+        (
+            {"experiments": [{"file": "hex.yaml", "overrides": {"calibration.bufer": 1}}]},
+            "experiments.0 (hex.yaml): calibration.bufer: unknown key",
+        ),
+        (
+            {"experiments": ["reflections.yaml", {"file": "hex.yaml", "overrides": {"outputs.store": "x"}}]},
+            "have different outputs.store",
+        ),
+    ],
+)
+def test_a_fault_is_told_in_the_files_own_terms(tmp_path, changes, told):
+    with pytest.raises(ExperimentError) as caught:
+        load_study(write(tmp_path, **changes))
+    assert any(told in sentence for sentence in caught.value.faults), caught.value.faults
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"experiments": ["none.yaml"]}, r"experiments\.0 \(none\.yaml\): .*cannot be read"),
+        ({"experiments": ["pair.yaml"]}, r"experiments\.0 \(pair\.yaml\): is a collection itself"),
+    ],
+)
+def test_a_member_that_cannot_be_used_is_told(tmp_path, changes, told):
+    with pytest.raises(InputError, match=told):
+        load_study(write(tmp_path, **changes))
+
+
+def test_an_experiment_file_is_an_experiment(folder):
+    write(folder)
+    assert isinstance(load_study(folder / "hex.yaml"), ExperimentStudy)
+
+
+@pytest.mark.parametrize("scale", [None, "small"])
+def test_the_papers_collection_shares_its_simulations(scale):
+    collection = load_study(EXPERIMENTS / "paper.yaml", scale)
+    graphs = {name: part.graph for name, part in collection.parts.items()}
+    for component in (simulation.foregrounds, simulation.eor):
+        assert component(graphs["minredundant"]).key == component(graphs["lowsnr"]).key
+    assert corruption.gains(graphs["redundant"]).key == corruption.gains(graphs["redundant-modelling"]).key
+    assert set(collection.roles) == {"minimally_redundant", "redundant", "redundant_modelling", "low_snr"}

@@ -1,0 +1,170 @@
+"""Run-time studies: known times come out as known exponents, and belong to the machine they were measured on."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.bench.step_times import Descent, StepTimes
+from calstudy.claims.folders import evaluate_folder
+from calstudy.studies import runtime
+from calstudy.studies.load import load_study
+from calstudy.studies.runtime import RuntimeStudy
+from calstudy.studies.show import show_plan
+from calstudy.studies.study import Budget, run_study
+
+FILE = Path(__file__).parents[2] / "experiments" / "runtime.yaml"
+POWERS = {"paper-step": 2.1, "paper-sum": 2.1, "adamax-step": 1.9, "default-step": 1.5, "default-solve": 1.6}
+
+
+def pretend_to_time(array, samples, device):
+    """Return times that grow with the array by known powers; ten times faster on a GPU."""
+    layout = array["layout"]
+    count = layout["count"]
+    longest = 100.0 if layout["kind"] == "rectangular" else (count - 1) * float(layout["spacing"].split()[0])
+    scatter = np.exp(0.1 * np.linspace(-1, 1, 101)) * (0.1 if device == "gpu" else 1)
+    seconds = {name: (1e-5 * count**power * longest * scatter).tolist() for name, power in POWERS.items()}
+    basis = int(1e5 * count**2)
+    return StepTimes(count, count * (count - 1) // 2, longest, int(longest), 99, seconds, basis, 6 * basis)
+
+
+def pretend_to_descend(array, max_steps):
+    del array
+    return Descent(9, 1.0, 1 + 100 / np.arange(1, max_steps + 2))
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch) -> RuntimeStudy:
+    monkeypatch.setattr("calstudy.bench.step_times.time_steps_apart", pretend_to_time)
+    monkeypatch.setattr("calstudy.bench.step_times.descend_apart", pretend_to_descend)
+    places = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
+    monkeypatch.setattr(sys.modules[__name__], "PLACES", places)
+    return reload()
+
+
+PLACES: list[str] = []
+"""Overrides that send products and runs to the folder of a test."""
+
+
+def reload(*changes: str) -> RuntimeStudy:
+    """Read the study again, on the machine as it is now."""
+    return load_study(FILE, "small", [*PLACES, "runtime.descent.max_steps=9000", *changes])
+
+
+def test_known_powers_come_back_in_figures_tables_and_claims(study):
+    run = run_study(study)
+    for panel, exponent in (("rows", 2.1), ("line", 1.0)):
+        with np.load(run.folder / "figures" / f"runtime-{panel}.npz", allow_pickle=False) as arrays:
+            assert str(arrays["0.label"]) == "paper's Adamax, step"
+            assert float(arrays["0.fit.exponent"]) == pytest.approx(exponent)
+            np.testing.assert_allclose(arrays["0.high"] / arrays["0.median"], np.exp(0.095), rtol=1e-3)
+    with (run.folder / "tables" / "runtime.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["panel"] == "rows" and row["timed"] == "default-solve"]
+    assert [int(row["antennas"]) for row in rows] == [9, 12, 16]
+    assert [float(row["median [s]"]) for row in rows] == pytest.approx([1e-3 * n**1.6 for n in (9, 12, 16)])
+    claims = {claim.name: claim for claim in evaluate_folder(run.folder).claims}
+    expected = {
+        "paper-step-quadratic-in-antennas": (2.1, "PASS"),
+        "own-step-quadratic-in-antennas": (1.9, "PASS"),
+        "paper-step-linear-in-longest-baseline": (1.0, "PASS"),
+        "sum-dominates-step": (1.0, "PASS"),
+        "basis-dominates-memory": (1 / 6, "FAIL"),
+        "memory-grows-like-basis": (1.0, "PASS"),
+        "thousands-of-steps-to-five-percent": (1999, "PASS"),
+        "default-solve-in-minutes": (1e-3 * 300**1.6, "PASS"),
+    }
+    for name, (value, verdict) in expected.items():
+        assert claims[name].measured == pytest.approx(value, rel=1e-6), name
+        assert claims[name].verdict == verdict, name
+    assert "not within 1 % of the minimum after 9000" in claims["thousands-of-steps-to-one-percent"].reason
+    assert "needs run times on a gpu" in claims["gpu-thirty-times-faster"].reason
+    assert (run.folder / "report.html").stat().st_size > 1e5
+
+
+def test_times_are_measured_once_on_a_machine_and_again_on_another(study, monkeypatch):
+    first = run_study(study)
+    again = run_study(study)
+    assert (len(first.made.tasks), len(again.made.tasks)) == (11, 0)
+    assert again.folder == first.folder
+    here = runtime.machine()
+    monkeypatch.setattr(runtime, "machine", lambda: {**here, "processor": "another"})
+    elsewhere = run_study(reload())
+    # The steps that a descent takes are no run time.
+    assert len(elsewhere.made.tasks) == 10
+    assert elsewhere.folder != first.folder
+    assert json.loads((elsewhere.folder / "manifest.json").read_text())["machine"]["processor"] == "another"
+
+
+def test_a_gpu_is_compared_with_the_processor(study, monkeypatch):
+    monkeypatch.setattr(runtime, "_gpu", lambda: "some GPU")
+    run = run_study(reload("runtime.devices=[cpu, gpu]"))
+    claims = {claim.name: claim for claim in evaluate_folder(run.folder).claims}
+    assert claims["gpu-thirty-times-faster"].measured == pytest.approx(10)
+    assert claims["gpu-step-constant-in-longest-baseline"].measured == pytest.approx(1)
+    with np.load(run.folder / "figures" / "runtime-rows.npz", allow_pickle=False) as arrays:
+        assert {str(arrays[f"{index}.label"]) for index in range(8)} >= {"paper's Adamax, step, GPU"}
+
+
+def test_a_gpu_that_is_not_there_is_a_sentence(study, monkeypatch):
+    monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: [])
+    with pytest.raises(InputError, match="finds no GPU"):
+        reload("runtime.devices=[gpu]").fitted(Budget())
+
+
+def test_what_would_spoil_the_times_is_refused(study):
+    assert study.fitted(Budget(1)) == (study, 1)
+    for budget in (Budget(2), Budget(scheduler="tcp://somewhere:8786")):
+        with pytest.raises(InputError, match="one after the other"):
+            study.fitted(budget)
+    with pytest.raises(InputError, match=r"the paper's solver needs about \d+\.\d GB, and there are 0\.5 GB"):
+        study.fitted(Budget(max_memory="500 MB"))
+
+
+def test_a_plan_names_what_will_be_timed(study):
+    console = Console(file=io.StringIO(), width=100)
+    show_plan(study, Budget(), console)
+    told = console.file.getvalue()
+    assert "step-times" in told
+    assert "plan for 1 worker" in told
+
+
+def test_full_scale_is_the_papers():
+    study = load_study(FILE)
+    channels = study.file.runtime.channels
+    assert channels.count * channels.width == pytest.approx(60e6)
+    assert max(size for panel, size, _ in study.arrays.values() if panel == "rows") >= 100
+    lengths = [size for panel, size, _ in study.arrays.values() if panel == "line"]
+    assert (min(lengths), max(lengths)) == (20.0, 200.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("runtime.rows.antennas=[16, 12, 20]", "runtime.rows.antennas: must increase"),
+        ("runtime.rows.max_baseline=14 m", "runtime.rows.max_baseline: 14 m must exceed the length of a row, 14 m"),
+        ("runtime.line.lengths=[20 m, 2 km, 3 km]", "runtime.channels.width: 300 kHz resolves 1667 ns"),
+        ("runtime.devices=[tpu]", "runtime.devices.0 = 'tpu'"),
+        ("runtime.sample=3", "runtime.sample: unknown key, did you mean 'samples'"),
+    ],
+)
+def test_mistakes_are_sentences(change, sentence):
+    with pytest.raises(ExperimentError) as caught:
+        load_study(FILE, None, [change])
+    assert any(fault.startswith(sentence) for fault in caught.value.faults), caught.value.faults
+
+
+@pytest.mark.slow
+def test_the_small_scale_runs(tmp_path):
+    places = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
+    run = run_study(load_study(FILE, "small", places))
+    claims = {claim.name: claim for claim in evaluate_folder(run.folder).claims}
+    assert 0 < claims["sum-dominates-step"].measured < 1
+    assert claims["default-solve-in-minutes"].verdict != "not evaluated"

@@ -1,0 +1,262 @@
+"""Signal loss in the chain: what the gains must absorb, they do, and sweeps compare it."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from tiny import tiny
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.experiment.files import dump, load, override, validate
+from calstudy.power.tables import load_spectrum
+from calstudy.power.transfer import TransferFunction, TransferMap, pool
+from calstudy.products.signal_loss import transfer
+from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.load import load_study
+from calstudy.studies.study import Run, run_study
+from calstudy.studies.sweep import Sweep, expand
+
+ANTENNAS = 7
+VARIANTS = {
+    "residual": {"components": ["foregrounds", "eor", "noise"], "effects": True, "calibrate": True},
+    "residual_without_eor": {"components": ["foregrounds", "noise"], "effects": True, "calibrate": True},
+    "eor": {"components": ["eor"]},
+}
+
+
+def small(folder, **fields) -> dict:
+    """The tiny chain with an array of few redundant baselines, and only what the signal loss needs."""
+    data = {**tiny(folder), "variants": VARIANTS}
+    data = override(data, "instrument.layout", {"kind": "mwa-compact-minredundant", "count": ANTENNAS})
+    for path, value in {"outputs.figures": ["signal-loss"], "simulation.chunks": 1, "calibration.chunks": 1}.items():
+        data = override(data, path, value)
+    for path, value in fields.items():
+        data = override(data, path.replace("__", "."), value)
+    return data
+
+
+SWEEP = [
+    {"calibration.basis.buffer": ["50 ns", "400 ns"], "sky.eor.seed": [2, 3]},
+    {"corruption.eor_level": ["-50 dB"]},
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("loss")
+
+
+@pytest.fixture(scope="module")
+def swept(folder) -> Run:
+    return run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)))
+
+
+def table(result: Run, point: int, name: str, kind: type = TransferFunction):
+    found = list(result.parts.values())[point - 1]
+    return load_spectrum(found.folder / "tables" / f"{name}.h5", kind)
+
+
+def test_far_from_the_wedge_gains_absorb_their_share_of_the_degrees_of_freedom(swept):
+    """2 N - 1 real numbers of N (N - 1) per channel: the phase of all gains together has no effect."""
+    expected = 1 - (2 * ANTENNAS - 1) / (ANTENNAS * (ANTENNAS - 1))
+    found = pool([table(swept, point, "transfer-bands.outside-wedge") for point in (1, 2)])
+    assert found.squared_coherence[-1] == pytest.approx(expected, abs=3 * found.squared_coherence_error[-1])
+    assert found.squared_coherence_error[-1] < 0.05
+    # The flux scale that the calibration chooses is right to ten percent.
+    assert found.transfer[-1] / found.cross_transfer[-1] == pytest.approx(1, abs=0.1)
+
+
+def test_inside_the_modelled_delays_nothing_is_left(swept):
+    found = table(swept, 1, "transfer.wedge", TransferMap)
+    modelled = found.delay <= np.maximum(found.horizon_delay, 100e-9)[:, None]
+    assert np.mean(found.cross_transfer[modelled]) < 0.1
+    assert np.mean(found.cross_transfer[found.delay > 900e-9 + 0 * found.cross_transfer]) > 0.4
+
+
+def test_a_larger_buffer_loses_more(swept):
+    narrow, wide = (
+        pool([table(swept, point, "transfer-bands.outside-wedge") for point in points]) for points in ((1, 2), (3, 4))
+    )
+    assert wide.transfer[2] < narrow.transfer[2] - 3 * narrow.transfer_error[2]
+
+
+def test_the_loss_is_linear_in_the_signal(swept):
+    usual, fainter = (table(swept, point, "transfer-bands.outside-wedge") for point in (1, 5))
+    # Near the wedge, weakly constrained gains make the loss of so small an array depend on where the solver stopped.
+    assert fainter.squared_coherence[-1] == pytest.approx(usual.squared_coherence[-1], abs=0.03)
+    difference = np.abs(fainter.squared_coherence - usual.squared_coherence)[2:]
+    assert (difference < 2 * usual.squared_coherence_error[2:]).all()
+
+
+def test_the_corrected_residual_is_a_table(swept):
+    path = next(iter(swept.parts.values())).folder / "tables" / "residual-corrected.outside-wedge.csv"
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    unit = "[mK2 h-3 Mpc3]"
+    corrected = [row for row in rows if row[f"corrected {unit}"] != "nan"]
+    assert corrected
+    for row in corrected:
+        ratio = float(row[f"residual {unit}"]) / float(row["transfer"])
+        assert float(row[f"corrected {unit}"]) == pytest.approx(ratio)
+
+
+def test_a_sweep_shares_what_its_points_have_in_common(swept):
+    made = swept.made.tasks
+    # Two EoR skies, one of foregrounds; the level and the buffer change neither.
+    assert sum(task.stage.name == "simulate" for task in made) == 3
+    assert len(swept.parts) == 5
+    keys = [task.key for task in made]
+    assert len(keys) == len(set(keys))
+
+
+def test_a_sweep_leaves_a_summary_a_figure_and_a_folder_per_point(swept):
+    folder = swept.folder
+    names = [path.name for path in sorted((folder / "points").iterdir())]
+    assert names == [
+        "01-buffer=50ns-seed=2",
+        "02-buffer=50ns-seed=3",
+        "03-buffer=400ns-seed=2",
+        "04-buffer=400ns-seed=3",
+        "05-eor_level=-50dB",
+    ]
+    with (folder / "tables" / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["point"] for row in rows} == set(names)
+    assert len(rows) == 5 * 2 * 4
+    first = table(swept, 1, "transfer-bands.outside-wedge")
+    assert float(rows[3]["transfer"]) == pytest.approx(first.transfer[3])
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["points"][2]["changes"] == {"calibration.basis.buffer": "400 ns", "sky.eor.seed": "2"}
+    assert (folder / "points" / names[0] / "manifest.json").exists()
+    again = load(folder / "points" / names[2] / "experiment.yaml")
+    assert again.calibration.basis.buffer == pytest.approx(400e-9)
+    assert again.sweep == ()
+
+
+def test_the_figure_pools_skies_and_keeps_the_rest_apart(swept):
+    with np.load(swept.folder / "figures" / "sweep.npz") as arrays:
+        assert arrays["panels.0.values"].tolist() == ["50 ns", "400 ns"]
+        assert arrays["panels.0.field"] == "calibration.basis.buffer"
+        pooled = arrays["panels.0.transfers.0.transfer"]
+        error = arrays["panels.0.transfers.0.transfer_error"]
+    single = [table(swept, point, "transfer-bands.outside-wedge") for point in (1, 2)]
+    between = sorted(item.transfer[3] for item in single)
+    assert between[0] <= pooled[3] <= between[1]
+    assert error[3] < min(item.transfer_error[3] for item in single)
+
+
+def test_a_second_sweep_makes_nothing(swept, folder):
+    again = run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)))
+    assert again.made.tasks == ()
+    assert again.folder == swept.folder
+
+
+def test_the_same_sweep_reads_back_from_its_run_folder(swept):
+    experiment = load(swept.folder / "experiment.yaml")
+    assert {task.key for task in expand(experiment).targets} <= set(swept.made.products)
+    resolved = swept.folder / "experiment.yaml"
+    assert resolved.read_text() == dump(experiment)
+
+
+@pytest.mark.parametrize("scale", [None, "small"])
+def test_the_shipped_sweep_varies_what_the_paper_says_loss_depends_on(scale):
+    family = expand(load(Path(__file__).parents[2] / "experiments" / "signalloss.yaml", scale))
+    varied = {field for point in family.points for field in point.changes}
+    assert varied >= {
+        "calibration.basis.buffer",
+        "instrument.channels.count",
+        "instrument.channels",
+        "instrument.layout.count",
+        "calibration.calibrator",
+        "sky.eor.seed",
+        "corruption.eor_level",
+    }
+
+
+def faults_of(data: dict, folder) -> list[str]:
+    with pytest.raises(ExperimentError) as caught:
+        expand(validate(data, folder))
+    return caught.value.faults
+
+
+@pytest.mark.parametrize(
+    ("sweep", "told"),
+    [
+        (
+            {"calibration.basis.bufer": ["50 ns"]},
+            "sweep (calibration.basis.bufer = 50 ns): calibration.basis.bufer: unknown key, did you mean 'buffer'?",
+        ),
+        (
+            {"calibration.basis.buffer": ["50 ns", 3]},
+            "sweep (calibration.basis.buffer = 3): calibration.basis.buffer: 3 has no unit",
+        ),
+        (
+            {"instrument.channels.first": ["150 MHz", "1.5 GHz"], "sky.eor.seed": [2]},
+            "sweep (instrument.channels.first = 1.5 GHz, sky.eor.seed = 2): instrument.channels: end at 1512.4 MHz",
+        ),
+        ({"calibration.basis.buffer": "50 ns"}, "sweep.0.calibration.basis.buffer: must be a list"),
+        ({"calibration.basis.buffer": []}, "sweep.0.calibration.basis.buffer: must have at least 1 item(s), has 0"),
+        ({"sky.eor.seed": [2, 2]}, "sweep.sky.eor.seed: names the value 2 twice"),
+        ({"outputs.store": ["a"]}, "sweep.outputs.store: cannot be varied"),
+        ({"claibration.chunks": [1]}, "sweep.claibration.chunks: cannot be varied, did you mean 'calibration'?"),
+        ({"calibration.chunks.x": [1]}, "'chunks' is 1 and not a block of keys"),
+        (3, "sweep = 3: must be a list"),
+        ([3], "sweep.0 = 3: must be a block of keys"),
+    ],
+)
+def test_a_fault_of_a_sweep_is_told_with_the_point_that_has_it(folder, sweep, told):
+    assert any(told in fault for fault in faults_of({**small(folder), "sweep": sweep}, folder))
+
+
+def test_all_faults_of_a_sweep_are_told_at_once(folder):
+    sweep = {"instrument.channels.first": ["1.5 GHz", "1.6 GHz"]}
+    assert len(faults_of({**small(folder), "sweep": sweep}, folder)) == 2
+
+
+def test_what_the_calibrator_refuses_is_told_with_the_point_before_anything_is_made(folder):
+    sweep = expand(validate({**small(folder), "sweep": {"calibration.basis.buffer": ["50 ns", "9 us"]}}, folder))
+    with pytest.raises(InputError, match=r"^02-buffer=9us: calibration\.basis: a delay half-width of \d+ ns fills"):
+        run_study(sweep)
+    assert not sweep.folder.exists()
+
+
+def test_a_sweep_without_the_variants_to_measure_loss_is_refused(folder):
+    data = {**small(folder), "sweep": SWEEP, "variants": {"eor": VARIANTS["eor"]}}
+    data["outputs"]["figures"] = ["spherical"]
+    assert "needs the variants residual, residual_without_eor, eor" in faults_of(data, folder)[0]
+
+
+def test_variants_that_differ_in_more_than_the_eor_are_refused(folder):
+    variants = {**VARIANTS, "residual_without_eor": {**VARIANTS["residual_without_eor"], "effects": False}}
+    with pytest.raises(ExperimentError, match="which differ in the EoR alone"):
+        validate({**small(folder), "variants": variants}, folder)
+
+
+def test_no_loss_is_measured_without_the_variants_for_it(folder):
+    data = small(folder, outputs__figures=["layout"])
+    data["variants"] = {"eor": VARIANTS["eor"]}
+    study = ExperimentStudy(validate(data, folder))
+    assert transfer(study.graph) is None
+    assert not any(task.stage.name == "transfer" for task in study.tasks)
+
+
+def test_a_file_with_a_sweep_is_a_sweep_and_one_without_is_none(folder):
+    for name, data, kind in (
+        ("alone.yaml", small(folder), ExperimentStudy),
+        ("sweep.yaml", {**small(folder), "sweep": SWEEP}, Sweep),
+    ):
+        (folder / name).write_text(yaml.safe_dump(data))
+        assert isinstance(load_study(folder / name), kind)
+    with pytest.raises(InputError, match="has no sweep"):
+        expand(validate(small(folder), folder))
+
+
+def test_blocks_as_values_vary_fields_together(folder):
+    sweep = {"instrument.channels": [{"first": "170 MHz", "width": "200 kHz", "count": 64}]}
+    (point,) = expand(validate({**small(folder), "sweep": sweep}, folder)).points
+    assert point.experiment.instrument.channels.count == 64
+    assert point.changes == {"instrument.channels": "first 170 MHz, width 200 kHz, count 64"}
+    assert point.label == "01-channels=first170MHzwidth200kHzcount64"

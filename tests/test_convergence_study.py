@@ -1,0 +1,58 @@
+"""The figures of convergence and of the expected signal loss, at the smallest size."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+from tiny import tiny
+
+from calstudy.experiment.files import override, validate
+from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.study import Budget, run_study
+
+VARIANTS = {
+    "residual": {"components": ["foregrounds", "eor", "noise"], "effects": True, "calibrate": True},
+    "residual_without_eor": {"components": ["foregrounds", "noise"], "effects": True, "calibrate": True},
+    "eor": {"components": ["eor"]},
+}
+STUDY = {
+    "integrations": 2,
+    "steps": [1, 2, 50, 200],
+    "solvers": {"default": "gauss-newton", "Adamax": {"name": "adamax", "tolerance": 0.0, "max_steps": 200}},
+}
+
+
+@pytest.fixture(scope="module")
+def figures(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("convergence")
+    data = {**tiny(folder), "variants": VARIANTS}
+    data = override(data, "outputs.figures", ["convergence", "expected-loss"])
+    data = override(data, "outputs.convergence", STUDY)
+    return run_study(ExperimentStudy(validate(data, folder)), Budget(workers=1)).folder / "figures"
+
+
+def test_the_bias_falls_with_the_steps_and_stays_below_what_is_predicted(figures):
+    with (figures / "convergence.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    paths = {name: [row for row in rows if row["solver"] == name] for name in STUDY["solvers"]}
+    assert [int(row["steps"]) for row in paths["Adamax"]] == [50, 200]
+    assert [int(row["steps"]) for row in paths["default"]][:2] == [1, 2]
+    for path in paths.values():
+        bias, error = (np.array([float(row[name]) for row in path]) for name in ("bias", "bias error"))
+        predicted = np.array([float(row["predicted"]) for row in path])
+        assert bias[0] > 10 * abs(bias[-1])
+        assert (bias[1:] - 3 * error[1:] < 2 * predicted[1:]).all()
+    assert (figures / "convergence.png").exists()
+
+
+def test_expected_and_measured_loss_are_drawn_from_the_same_bins(figures):
+    with np.load(figures / "expected-loss.npz") as arrays:
+        assert np.array_equal(arrays["expected.bin_edges"], arrays["measured.bin_edges"])
+        expected, lengths = arrays["expected.outside"], arrays["expected.by_length"]
+        assert np.array_equal(np.isfinite(expected), np.isfinite(arrays["measured.transfer"]))
+    known = np.isfinite(expected)
+    assert (expected[known] > 0).all()
+    assert (expected[known] < 1).all()
+    assert lengths[:, 0].max() < 0.1 < lengths[:, -1].min()

@@ -1,0 +1,98 @@
+"""The wheel: commands find the published experiments and reference results wherever they are run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from calstudy.base.errors import InputError
+from calstudy.base.package_files import experiment_names, find_experiment, published, reference_folder
+
+ROOT = Path(__file__).parents[1]
+SOURCES = ("calstudy", "experiments", "figures", "pyproject.toml", "README.md", "LICENSE")
+
+
+def test_in_a_checkout_published_files_are_its_own(monkeypatch, tmp_path):
+    assert published("experiments") == ROOT / "experiments"
+    assert experiment_names() == sorted(path.stem for path in (ROOT / "experiments").glob("*.yaml"))
+    monkeypatch.chdir(tmp_path)
+    assert find_experiment(Path("quickstart")) == ROOT / "experiments" / "quickstart.yaml"
+    assert reference_folder() == ROOT / "figures"
+    Path("figures").mkdir()
+    assert reference_folder() == Path("figures")
+
+
+def test_a_file_comes_before_a_published_experiment_of_its_name(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("quickstart").write_text("name: mine")
+    assert find_experiment(Path("quickstart")) == Path("quickstart")
+    for path in (Path("mine.yaml"), Path("folder/quickstart")):
+        assert find_experiment(path) == path
+    with pytest.raises(InputError, match=r"quickstrat: neither a file nor a published experiment \(there are: .*quick"):
+        find_experiment(Path("quickstrat"))
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """A folder that the wheel was installed into, without its dependencies."""
+    folder = tmp_path_factory.mktemp("installed")
+    sources = folder / "sources"
+    sources.mkdir()
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
+            shutil.copytree(ROOT / name, sources / name, symlinks=True, ignore=ignored)
+        else:
+            shutil.copy(ROOT / name, sources)
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    wheels = folder / "wheels"
+    subprocess.run([*pip, "wheel", str(sources), "--no-deps", "--no-build-isolation", "-w", str(wheels)], check=True)
+    (wheel,) = wheels.iterdir()
+    assert wheel.stat().st_size < 15e6
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(folder / "site"), str(wheel)], check=True)
+    shutil.rmtree(sources)
+    return folder / "site"
+
+
+def python(installed: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with the installed package, in another folder than the checkout."""
+    environment = {**os.environ, "PYTHONPATH": str(installed), "COLUMNS": "200"}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_an_installed_package_plans_a_published_experiment(installed, tmp_path):
+    result = python(installed, tmp_path, "-m", "calstudy", "plan", "quickstart")
+    assert result.returncode == 0, result.stderr
+    assert "quickstart: plan for" in result.stdout
+    assert str(tmp_path / "store") in result.stdout
+
+
+def test_an_installed_package_has_steps_and_references(installed, tmp_path):
+    result = python(installed, tmp_path, "-m", "calstudy", "validate", "9.9")
+    assert result.returncode == 2
+    assert "9.9: not a step of the ladder (there are: -1, 0.0" in result.stderr
+    read = (
+        "from calstudy.base.package_files import reference_folder\n"
+        "from calstudy.regression.reference import find_references, read_reference\n"
+        "for folder in find_references([reference_folder()]):\n"
+        "    print(folder.parents[2].name, folder.name, len(read_reference(folder).figures))\n"
+    )
+    result = python(installed, tmp_path, "-c", read)
+    assert result.returncode == 0, result.stderr
+    found = {line.split()[1]: line.split()[::2] for line in result.stdout.splitlines()}
+    assert found.keys() >= {"minredundant", "redundant", "lowsnr", "paper"}
+    assert all(package == "calstudy" and int(figures) > 0 for package, figures in found.values())
+
+
+@pytest.mark.slow
+def test_an_installed_package_validates(installed, tmp_path):
+    result = python(installed, tmp_path, "-m", "calstudy", "validate", "-1", "--scale", "small")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "1 of 1 steps pass" in (tmp_path / "validation" / "validation.md").read_text()

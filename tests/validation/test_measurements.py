@@ -1,0 +1,146 @@
+"""The formulas of the measurements against closed forms and independent draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calstudy.base.errors import InputError
+from calstudy.power.spectra import DelaySpectra
+from calstudy.validation.means import clustered_mean, pooled
+from calstudy.validation.measurements.steep_signal import windowed
+from calstudy.validation.product import measurement_task
+from calstudy.validation.steps import SCALES, load_ladder, load_step
+from calstudy.verdicts.criterion import Finding
+
+
+def spectra(power: np.ndarray, taper: str = "blackman-harris") -> DelaySpectra:
+    n_units, n_delays = power.shape
+    return DelaySpectra(
+        power=power.astype(complex),
+        vectors=np.column_stack([10.0 * (1 + np.arange(n_units)), np.zeros(n_units), np.zeros(n_units)]),
+        n_pairs=np.ones(n_units, int),
+        n_polarizations=1,
+        delay=(np.arange(n_delays) - n_delays // 2) * 32e-9,
+        k_perp=np.full(n_units, 0.01),
+        k_parallel=(np.arange(n_delays) - n_delays // 2) * 0.02,
+        frequency=182e6,
+        omega_pp=0.05,
+        taper=taper,
+    )
+
+
+def test_a_window_does_nothing_to_a_flat_spectrum():
+    frame = spectra(np.ones((2, 64)))
+    np.testing.assert_allclose(windowed(lambda k: 3.0 * np.ones_like(k), frame), 3.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("taper", ["blackman-harris", "none"])
+def test_a_window_mixes_delays_as_monte_carlo_does(taper, rng):
+    """Waves of random amplitude at all delays, through taper and transform, have the mean power of `windowed`."""
+    from calstudy.power.delay import make_taper
+
+    count, fine, draws = 32, 8, 4000
+
+    def power(k):
+        return 1 / (1 + (k / 0.05) ** 2)
+
+    frame = spectra(np.ones((1, count)), taper)
+    offsets = (np.arange(fine) - (fine - 1) / 2) / fine
+    cells = ((np.arange(count) - count // 2)[:, None] + offsets).ravel()
+    amplitude = np.sqrt(power(np.hypot(0.01, cells * 0.02)) / fine)
+    waves = np.exp(2j * np.pi * np.outer(cells, np.arange(count)) / count)
+    normal = (rng.standard_normal((2, draws, cells.size)) * np.sqrt(0.5)).astype(np.float64)
+    data = ((normal[0] + 1j * normal[1]) * amplitude) @ waves
+    window = make_taper(taper, count)
+    transformed = np.fft.fftshift(np.fft.fft(data * window, axis=1), axes=1)
+    found = np.mean(np.abs(transformed) ** 2, axis=0) / (count * np.sum(window**2))
+    expected = windowed(power, frame)[0]
+    np.testing.assert_allclose(found, expected, rtol=5 / np.sqrt(draws))
+
+
+@given(seed=st.integers(0, 2**32 - 1), n_units=st.integers(20, 60))
+@settings(max_examples=20, deadline=None)
+def test_clustered_errors_cover_the_truth(seed, n_units):
+    """Units whose modes share a common offset: the error must be that of the units, not of the modes."""
+    generator = np.random.default_rng(seed)
+    values = 5.0 + generator.standard_normal((n_units, 1)) + 0.01 * generator.standard_normal((n_units, 50))
+    found = clustered_mean(values)
+    assert abs(found.value - 5) < 6 * found.uncertainty
+    assert found.uncertainty == pytest.approx(n_units**-0.5, rel=0.6)
+
+
+def test_left_out_modes_do_not_count():
+    values = np.array([[1.0, np.nan], [3.0, 5.0], [np.nan, np.nan]])
+    assert clustered_mean(values).value == pytest.approx(3.0)
+
+
+def test_pooling_weights_by_inverse_variance():
+    found = pooled([Finding(1.0, 1.0), Finding(2.0, 0.5)])
+    assert found.value == pytest.approx((1 + 8) / 5)
+    assert found.uncertainty == pytest.approx(5**-0.5)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_all_steps_load_and_have_what_the_table_needs(scale):
+    steps = load_ladder(scale=scale)
+    assert len(steps) == 12
+    for step in steps:
+        assert step.criteria
+        assert all(item.why and item.quantity for item in step.criteria.values())
+
+
+def test_full_scale_thresholds_are_those_of_the_table():
+    must = {(step.name, name): str(item.threshold) for step in load_ladder() for name, item in step.criteria.items()}
+    assert must["-1", "double_pyuvsim"] == "<= 1e-06"
+    assert must["0.0", "scatter_over_theory"] == "1 within 3 sigma"
+    assert must["0.1", "normalization"] == "from 0.99 to 1.01"
+    assert must["0.1", "exponential"] == ">= 0.01"
+    assert must["0.1", "imaginary"] == "from -0.015 to 0.015"
+    assert must["0.2", "normalization"] == "from 0.98 to 1.02"
+    assert must["1.0", "excess"] == must["1.0", "beyond_floor"] == "<= 0.01"
+    assert must["2.0", "single"] == "<= 1e-05"
+    assert must["2.0", "double"] == "<= 1e-09"
+    assert must["2.1", "exact"] == must["2.1", "fitted"] == "<= 1e-06"
+    assert must["2.2", "false_convergence"] == must["2.3", "influence"] == "<= 0"
+    assert must["2.3", "bias"] == "<= 2"
+    assert must["3.0", "left"] == "<= 1"
+    assert must["4.0", "minredundant_bars"] == must["4.0", "redundant_bars"] == ">= 0.9"
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"measurement": "ladder"}, "measurement: 'ladder' is not a measurement"),
+        ({"parameters": {"k_min": 0.3}}, r"parameters\.k_min: 0.3 is not a wavenumber"),
+        ({"parameters": {"banana": 1}}, r"parameters\.banana: unknown key"),
+        ({"criteria": []}, "at least 1"),
+        ({"criteria": [{"measures": "x", "quantity": "x", "must": {}, "why": "x"}]}, "exactly one of"),
+        ({"criteria": 2 * [{"measures": "x", "quantity": "x", "must": {"at_most": 1}, "why": "x"}]}, "a finding twice"),
+        ({"step": "one"}, "must match"),
+        ({"steps": 1}, "unknown key"),
+        ({"experiments": {"x": {"file": "nowhere.yaml"}}}, "nowhere.yaml"),
+    ],
+)
+def test_a_broken_step_is_refused_in_a_sentence(change, sentence, tmp_path):
+    good = {
+        "step": "9.9",
+        "title": "x",
+        "proves": "x",
+        "measurement": "end-to-end",
+        "criteria": [{"measures": "x", "quantity": "x", "must": {"at_most": 1}, "why": "x"}],
+    }
+    path = tmp_path / "step.yaml"
+    path.write_text(yaml.safe_dump({**good, **change}))
+    with pytest.raises(InputError, match=sentence):
+        load_step(path)
+
+
+def test_a_step_says_what_its_experiment_lacks():
+    without = ["sky.foregrounds=none", "corruption.eor_level=null", "variants={eor: {components: [eor]}}"]
+    (step,) = load_ladder(["2.3"], "small", [*without, "outputs.figures=[]"])
+    with pytest.raises(InputError, match=r"step 2\.3: validation-small: the measurement needs foregrounds"):
+        measurement_task(step)

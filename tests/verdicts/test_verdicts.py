@@ -1,0 +1,147 @@
+"""Thresholds, verdicts and statements; their tables and files, which can be read back."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from calstudy.base.errors import InputError
+from calstudy.verdicts.criterion import AtLeast, AtMost, Criterion, Equal, Finding, Within
+from calstudy.verdicts.statement import Source, Unevaluated
+from calstudy.verdicts.tables import (
+    CLAIMS_JSON,
+    CLAIMS_MARKDOWN,
+    Table,
+    from_json,
+    measured,
+    number,
+    require_writable,
+    show_verdicts,
+    tally,
+    to_json,
+    to_markdown,
+    write_claims,
+)
+
+SECTION = Source("Results", ("ours", "theirs"))
+ROLES = {"ours": "a run of ours", "theirs": "a run of theirs"}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run whose one result is a number."""
+
+    name: str
+    result: float
+
+
+@SECTION.states("ours | theirs are alike", "ratio", Within(0.5, 2), "a factor of two")
+def ratio_near_one(ours: Run, theirs: Run) -> Finding:
+    if not theirs.result:
+        raise Unevaluated("theirs is zero")
+    return Finding(ours.result / theirs.result, 0.1)
+
+
+def evaluate(ours: float, theirs: float):
+    return ratio_near_one.evaluate({"ours": Run("a", ours), "theirs": Run("b", theirs)}, ROLES)
+
+
+@given(st.floats(-10, 10), st.floats(1e-3, 3), st.floats(-5, 5))
+def test_thresholds_are_what_they_say(value, uncertainty, bound):
+    finding = Finding(value, uncertainty)
+    assert AtLeast(bound).holds(finding) == (value >= bound)
+    assert AtMost(bound).holds(finding) == (value <= bound)
+    assert Within(bound, bound + 1).holds(finding) == (bound <= value <= bound + 1)
+    assert AtLeast(bound, 2).holds(finding) <= AtLeast(bound).holds(finding)
+    assert not (AtLeast(bound, 2).holds(finding) and AtMost(bound, 2).holds(finding))
+    assert Equal(bound).holds(finding) == (abs(value - bound) <= 2 * uncertainty)
+
+
+def test_a_number_decides_and_one_that_is_not_finite_does_not():
+    criterion = Criterion("name", "section", "sentence", "quantity", AtMost(1), "because")
+    outcomes = [criterion.judge(Finding(value, 0.0)).verdict for value in (0.5, 1.5, float("nan"), float("inf"))]
+    assert outcomes == ["PASS", "FAIL", "not evaluated", "not evaluated"]
+    assert criterion.judge(Finding(0.5, float("nan"))).reason == "the measured number is not finite"
+
+
+def test_a_statement_is_measured_on_the_runs_that_play_its_roles_in_their_order():
+    assert ratio_near_one.name == "ratio-near-one"
+    verdict = evaluate(1.0, 4.0)
+    assert (verdict.verdict, verdict.measured, verdict.runs) == ("FAIL", 0.25, ("a", "b"))
+    assert evaluate(1.0, 1.0).verdict == "PASS"
+
+
+def test_what_is_missing_is_said():
+    alone = ratio_near_one.evaluate({"ours": Run("a", 1.0)}, ROLES)
+    assert (alone.verdict, alone.reason, alone.measured) == ("not evaluated", "needs a run of theirs", None)
+    zero = evaluate(1.0, 0.0)
+    assert (zero.verdict, zero.reason, zero.runs) == ("not evaluated", "theirs is zero", ("a", "b"))
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "text"),
+    [
+        (0.123456, None, "0.123"),
+        (0.0, 0.0, "0"),
+        (0.99531, 0.0034, "0.9953 ± 0.0034"),
+        (-0.000658, 9.7e-5, "-0.000658 ± 9.7e-05"),
+        (176.2, 86.7, "176 ± 87"),
+        (3.5741e6, 8.34e5, "3.57e+06 ± 8.3e+05"),
+    ],
+)
+def test_a_number_has_the_digits_that_its_uncertainty_leaves_meaning_to(value, uncertainty, text):
+    assert number(value, uncertainty) == text
+
+
+def test_json_reads_back_and_markdown_and_terminal_have_everything(tmp_path: Path):
+    verdicts = [evaluate(1.0, 4.0), evaluate(1.0, 1.0), evaluate(1.0, 0.0)]
+    assert from_json(to_json(verdicts)) == verdicts
+    assert tally(verdicts) == "1 PASS, 1 FAIL, 1 not evaluated"
+    text = to_markdown(verdicts, "title", ("claim", "the paper"), notes=["a small sky"])
+    assert {tally(verdicts), "## Results", "Stand-in: a small sky."} <= set(text.splitlines())
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(rows) == 2 + len(verdicts)
+    assert {line.replace("\\|", "").count("|") for line in rows} == {7}
+    console = Console(record=True, width=160)
+    show_verdicts(verdicts, "run", console)
+    shown = console.export_text()
+    assert all(part in shown for part in (tally(verdicts), measured(verdicts[0]), "theirs is zero", "ratio"))
+    write_claims(verdicts, tmp_path, "run")
+    assert from_json((tmp_path / CLAIMS_JSON).read_text()) == verdicts
+    assert (tmp_path / CLAIMS_MARKDOWN).read_text().startswith("# Claims of the paper: run\n")
+
+
+def test_published_verdicts_can_be_read():
+    published = sorted((Path(__file__).parents[2] / "figures").glob(f"*/{CLAIMS_JSON}"))
+    assert published
+    for path in published:
+        verdicts = from_json(path.read_text())
+        assert json.loads(to_json(verdicts)) == json.loads(path.read_text())
+
+
+def test_a_table_reads_back(tmp_path):
+    headings, rows = ("engine", "seconds"), [("dense, double", "0.1"), ("pyuvsim, double", "5")]
+    table = Table(headings, rows, "title")
+    for name in ("table.csv", "table.md"):
+        table.write(tmp_path / name)
+    with (tmp_path / "table.csv").open(newline="") as file:
+        assert [tuple(row) for row in csv.reader(file)] == [headings, *rows]
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    assert lines[0] == "| engine | seconds |"
+    assert lines[3] == "| pyuvsim, double | 5 |"
+    console = Console(record=True, width=80)
+    table.show(console)
+    assert "dense, double" in console.export_text()
+
+
+@pytest.mark.parametrize(("path", "reason"), [("table.txt", "must end in .csv or .md"), ("no/table.md", "no folder")])
+def test_a_path_that_cannot_be_written_is_refused(tmp_path, path, reason):
+    with pytest.raises(InputError, match=reason):
+        require_writable(tmp_path / path)
