@@ -166,14 +166,17 @@ def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]
     size = _rms(truth.gains, axis=1)
     power = [
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
-        for values in (aligned - truth.gains, truth.gains[None])
+        for values in (aligned - truth.gains, truth.gains[None], fit.gains - truth.gains)
     ]
     by_delay = np.sqrt(power[0] / power[1])
+    raw_by_delay = np.sqrt(power[2] / power[1])
     return {
         "gains_aligned": Statistic.of(_rms(aligned - truth.gains, axis=2) / size, "antennas and integrations"),
         "gains_raw": Statistic.of(_rms(fit.gains - truth.gains, axis=2) / size, "antennas and integrations"),
         "gains_by_delay": Statistic.of(by_delay, "delays"),
         "gains_worst_delay": Statistic(float(by_delay.max()), 0.0, by_delay.size, "delays"),
+        "gains_raw_by_delay": Statistic.of(raw_by_delay, "delays"),
+        "gains_raw_worst_delay": Statistic(float(raw_by_delay.max()), 0.0, raw_by_delay.size, "delays"),
     }
 
 

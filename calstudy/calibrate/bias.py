@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calstudy.calibrate.agreement import TAPER, Baselines
+from calstudy.power.clusters import Clusters
 from calstudy.power.delay import delay_transform
 
 
@@ -61,7 +62,7 @@ def ratio_over_antennas(power: np.ndarray, reference: np.ndarray, antennas: np.n
     """Return sum(power) / sum(reference) over baselines and its standard deviation.
 
     What a fit leaves of the foregrounds is mostly due to errors of its gains, which the baselines of an antenna share.
-    The scatter is therefore that of leaving out one antenna after the other (the jackknife), not that of baselines.
+    The error comes from leaving out one antenna after the other (`calstudy.power.clusters`).
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def ratio_over_antennas(power: np.ndarray, reference: np.ndarray, antennas: np.n
     antennas
         The two antennas of each baseline, (Nbls, 2).
     """
-    without = [(antennas != antenna).all(axis=1) for antenna in np.unique(antennas)]
-    ratios = np.array([power[kept].sum() / reference[kept].sum() for kept in without if kept.any()])
-    scatter = np.sum((ratios - ratios.mean()) ** 2) * (ratios.size - 1) / ratios.size
-    return float(power.sum() / reference.sum()), float(np.sqrt(scatter))
+    clusters = Clusters.of_baselines(antennas)
+    above, below = (clusters.sums(values[:, None], np.repeat(values, 2)[:, None]) for values in (power, reference))
+    value, error = above.ratio(below)
+    return float(value[0]), float(error[0])

@@ -12,8 +12,10 @@ from calstudy.calibrate.agreement import Statistic, from_json
 from calstudy.experiment.model import Experiment
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
+from calstudy.power.transfer import TransferFunction
 from calstudy.products.agreement import AGREEMENT
 from calstudy.products.files import spectrum_file
+from calstudy.products.signal_loss import TRANSFER
 from calstudy.verdicts.statement import Unevaluated
 
 Spectrum = TypeVar("Spectrum", SphericalSpectrum, CylindricalSpectrum)
@@ -28,7 +30,7 @@ class RunResults:
     experiment
         What was run.
     folders
-        Where tables are looked for: spectra as ``<variant>.<kind>.h5`` and agreement.json.
+        Where tables are looked for: spectra as ``<variant>.<kind>.h5``, ``transfer.<region>.h5`` and agreement.json.
     """
 
     experiment: Experiment
@@ -54,6 +56,13 @@ class RunResults:
     def wedge(self, variant: str) -> CylindricalSpectrum:
         """Return the cylindrical spectrum of a variant."""
         return self._spectrum(variant, "wedge", CylindricalSpectrum)
+
+    def transfer(self, region: str) -> TransferFunction:
+        """Return the transfer function of the calibration, "outside-wedge" or "inside-wedge"."""
+        path = self._find(spectrum_file(TRANSFER, region))
+        if path is None:
+            raise Unevaluated("the run does not calibrate the same data with the EoR and without")
+        return load_spectrum(path, TransferFunction)
 
     def measured(self, name: str) -> Statistic:
         """Return a comparison of the calibration with the truth (`calstudy.calibrate.agreement`)."""

@@ -18,7 +18,7 @@ from calstudy.products import expected_loss, signal_loss
 from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
-from calstudy.verdicts.tolerances import Drawn, half, power_over_samples, typical_error
+from calstudy.verdicts.tolerances import Drawn, half, power_over_samples, spread_of_scale, typical_error
 
 if TYPE_CHECKING:
     from calstudy.power.expected import ExpectedBins
@@ -67,10 +67,10 @@ def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9, stand_ins: Se
     left.plot(expected.k, expected.outside, color=style.ORANGE, label="expected at the solution")
     left.plot(
         measured.k,
-        measured.squared_coherence,
+        measured.scale_free_transfer,
         color=style.BLUE,
         linestyle=":",
-        label="injected, free of the flux scale",
+        label=f"injected, free of the flux scale {measured.flux_scale:.3f}",
     )
     filled = np.isfinite(measured.transfer)
     left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, min(measured.bin_edges[1:][filled].max(), 1.5)))
@@ -119,6 +119,7 @@ class ExpectedLossFigure(StudyFigure):
     needs_calibration = True
     tolerances = (
         (r"map\..*", Drawn(typical_error, "its error bar, at least the median of its baseline length", largest=12.0)),
+        (r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),
         (r".*\.signal", Drawn(power_over_samples, "sample variance", largest=12.0)),
         (r"expected\..*", Drawn(half, "follows from fitted gains; half of it")),
     )

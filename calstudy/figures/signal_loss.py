@@ -20,7 +20,14 @@ from calstudy.products import signal_loss
 from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
-from calstudy.verdicts.tolerances import ERROR_OF_ERROR, Drawn, own_error, power_over_samples, typical_error
+from calstudy.verdicts.tolerances import (
+    ERROR_OF_ERROR,
+    Drawn,
+    own_error,
+    power_over_samples,
+    spread_of_scale,
+    typical_error,
+)
 
 if TYPE_CHECKING:
     from calstudy.power.transfer import TransferFunction, TransferMap
@@ -28,7 +35,7 @@ if TYPE_CHECKING:
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""
 TRANSFER = r"$T = P^{R}/P^{S}$"
-SCALE_FREE = "outside, free of the flux scale"
+SCALE_FREE = "outside, free of the flux scale {:.3f}"
 MAP_COLOURS = "cividis"
 EMPTY = "0.8"
 
@@ -91,12 +98,17 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
     ):
         draw_transfer(axes, part, label, marker, colour)
     axes.plot(
-        loss.outside.k, loss.outside.squared_coherence, color=style.BLUE, linewidth=0.7, zorder=1, label=SCALE_FREE
+        loss.outside.k,
+        loss.outside.scale_free_transfer,
+        color=style.BLUE,
+        linewidth=0.7,
+        zorder=1,
+        label=SCALE_FREE.format(loss.outside.flux_scale),
     )
     axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, _last_k(loss)), ylim=_limits(loss))
     handles, labels = axes.get_legend_handles_labels()
-    order = sorted(range(len(labels)), key=lambda index: labels[index] == SCALE_FREE)
-    axes.legend([handles[index] for index in order], [labels[index] for index in order], loc="lower right")
+    # The line comes first otherwise; the points are what the figure is about.
+    axes.legend(handles[1:] + handles[:1], labels[1:] + labels[:1], loc="lower right")
 
 
 def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, colour: str) -> None:
@@ -160,8 +172,9 @@ class SignalLossFigure(StudyFigure):
     needs_calibration = True
     tolerances = (
         (r"map\..*", Drawn(typical_error, "its error bar, at least the median of its baseline length", largest=12.0)),
-        (r".*\.(transfer|coherence|retained)", Drawn(own_error, "its error bar", largest=12.0)),
+        (r".*\.(transfer|coherence|scale_free_transfer|retained)", Drawn(own_error, "its error bar", largest=12.0)),
         (r".*_error", ERROR_OF_ERROR),
+        (r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),
         (r".*\.signal", Drawn(power_over_samples, "sample variance", largest=12.0)),
     )
 

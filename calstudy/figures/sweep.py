@@ -32,20 +32,8 @@ SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", styl
 """Marker and colour of each band of k, from small k up."""
 SKIES = "sky.eor.seed"
 """The field whose values are further samples of the same thing, to be pooled."""
-COLUMNS_OF_SUMMARY = (
-    "point",
-    "changes",
-    "region",
-    "k from [h/Mpc]",
-    "k to [h/Mpc]",
-    "transfer",
-    "transfer error",
-    "cross transfer",
-    "cross transfer error",
-    "squared coherence",
-    "squared coherence error",
-    "baselines or groups",
-)
+WHERE = ("point", "changes", "region")
+"""First columns of the summary; those of a transfer function follow."""
 SUMMARY = "summary.csv"
 COLUMNS = 2
 PANEL_HEIGHT = 1.9
@@ -79,7 +67,7 @@ class SweepPanel:
 def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> Figure:
     """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
 
-    Dashes are the squared coherence C^2 / T, which is free of the scale of the gains (see `calstudy.power.transfer`).
+    Dashes are T free of the flux scale, which is written above each value (see `calstudy.power.transfer`).
 
     Parameters
     ----------
@@ -103,7 +91,8 @@ def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> F
     width = style.ONE_COLUMN if columns == 1 else style.TWO_COLUMNS
     figure = style.new_figure(width, 0.5 + PANEL_HEIGHT * rows)
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    top = max(1.1, 1.05 * max(_highest(panel) for panel in panels))
+    # Above the points the flux scale is written.
+    top = max(1.2, 1.15 * max(_highest(panel) for panel in panels))
     for axes, panel in zip(grid.flat, panels, strict=False):
         _draw_panel(axes, panel)
         axes.set_ylim(min(0.0, 1.1 * min(_lowest(item) for item in panels)), top)
@@ -140,8 +129,20 @@ def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
             color=colour,
             elinewidth=0.7,
         )
-        coherence = np.array([item.squared_coherence[band] for item in panel.transfers])
-        axes.plot(positions + shift, coherence, "_", color=colour, markersize=7, linestyle=":", linewidth=0.6)
+        scale_free = np.array([item.scale_free_transfer[band] for item in panel.transfers])
+        axes.plot(positions + shift, scale_free, "_", color=colour, markersize=7, linestyle=":", linewidth=0.6)
+    for position, item in zip(positions, panel.transfers, strict=True):
+        axes.annotate(
+            f"$s$ = {item.flux_scale:.3f}",
+            (position, 1),
+            (0, -2),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=style.SMALL_SIZE,
+            color=style.GREY,
+        )
     axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
     axes.set_xlim(-0.5, len(panel.values) - 0.5)
     axes.set_xticks(positions, [textwrap.fill(text, LABEL_WIDTH) for text in panel.values], fontsize=style.SMALL_SIZE)
@@ -158,7 +159,7 @@ def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> 
     ]
     labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
     handles.append(Line2D([], [], color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6))
-    labels.append("free of the flux scale")
+    labels.append("free of the flux scale $s$")
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)
 
 
@@ -191,26 +192,17 @@ def _bands(folder: Path, region: str) -> TransferFunction:
 
 
 def _write_summary(path: Path, points: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> None:
+    from calstudy.power.tables import TRANSFER_COLUMNS
+
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(COLUMNS_OF_SUMMARY)
+        writer.writerow([*WHERE, *TRANSFER_COLUMNS])
         for point in points:
             changes = "; ".join(f"{field} = {text}" for field, text in point["changes"].items())
             for region in signal_loss.REGIONS:
                 found = _bands(folders[point["label"]], region)
-                columns = (
-                    found.bin_edges[:-1],
-                    found.bin_edges[1:],
-                    found.transfer,
-                    found.transfer_error,
-                    found.cross_transfer,
-                    found.cross_transfer_error,
-                    found.squared_coherence,
-                    found.squared_coherence_error,
-                    found.n_samples,
-                )
-                for row in zip(*(column.tolist() for column in columns), strict=True):
-                    writer.writerow([point["label"], changes, region, *row])
+                columns = (values(found).tolist() for values in TRANSFER_COLUMNS.values())
+                writer.writerows([point["label"], changes, region, *row] for row in zip(*columns, strict=True))
 
 
 def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> Any:

@@ -11,7 +11,8 @@ Averages have fewer independent modes than modes:
 
 - a taper correlates neighbouring delays (`calstudy.power.delay.mode_correlation`); tau and -tau are independent;
 - the n (n-1) products of different baselines of a redundant group have independent noise and the same signal:
-  sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same goes for two polarizations;
+  sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same goes for two polarizations. The product of signal and
+  noise has the noise of n baselines in it, and its variance falls by n;
 - the signal of two baselines closer than the size of an antenna is partly the same. For a Gaussian beam with squared
   integral Omega_pp the visibilities correlate by exp(-pi Omega_pp |db|^2 / lambda^2), powers by its square.
 """
@@ -64,6 +65,27 @@ def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndar
     units = np.arange(len(spectra.n_pairs))
     products = spectra.n_pairs * spectra.n_polarizations
     return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / products))
+
+
+def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return how many independent products of signal and noise each bin averages.
+
+    Parameters
+    ----------
+    spectra
+        The averaged spectra.
+    bins
+        Bin of each mode, (Nu, Nd) int, -1 for those left out.
+    n_bins
+        Number of bins.
+
+    Returns
+    -------
+    (n_bins,) float, zero for empty bins.
+    """
+    units = np.arange(len(spectra.n_pairs))
+    baselines = spectra.n_baselines * spectra.n_polarizations
+    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / baselines))
 
 
 def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:

@@ -45,6 +45,11 @@ class DelaySpectra:
         Integral of the squared power beam in sr, mean over band and polarizations.
     taper
         Name of the taper, see `calstudy.power.delay.TAPERS`.
+    share_unit, share_antenna, share_pairs, share_power
+        What each unit owes to each of its antennas: unit and number of the antenna, (Nm,) int; how many of the unit's
+        pairs contain the antenna, (Nm,) int; and the sum of the powers of these pairs, (Nm, Nd) complex. From these,
+        errors are found by leaving out antennas (`calstudy.power.clusters`). Empty if not known: the errors of ratios
+        then come from the scatter of units, which is too small where units share antennas.
     """
 
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
@@ -57,11 +62,22 @@ class DelaySpectra:
     frequency: float = field(metadata={"unit": "Hz"})
     omega_pp: float = field(metadata={"unit": "sr"})
     taper: str = field(metadata={"unit": ""})
+    share_unit: np.ndarray = field(default_factory=lambda: np.zeros(0, int), metadata={"unit": ""})
+    share_antenna: np.ndarray = field(default_factory=lambda: np.zeros(0, int), metadata={"unit": ""})
+    share_pairs: np.ndarray = field(default_factory=lambda: np.zeros(0, int), metadata={"unit": ""})
+    share_power: np.ndarray = field(
+        default_factory=lambda: np.zeros((0, 0), complex), metadata={"unit": "mK2 h-3 Mpc3"}
+    )
 
     @property
     def length(self) -> np.ndarray:
         """Baseline lengths in m, (Nu,)."""
         return np.linalg.norm(self.vectors, axis=1)
+
+    @property
+    def n_baselines(self) -> np.ndarray:
+        """Baselines of each unit, (Nu,): one that is crossed with itself, or n with n (n - 1) pairs."""
+        return np.where(self.n_pairs == 1, 1.0, (1 + np.sqrt(1 + 4 * self.n_pairs)) / 2)
 
 
 @dataclass(frozen=True)
@@ -128,8 +144,9 @@ class SphericalSpectrum:
         Mean over modes, (Nk,) complex; the real part estimates P(k).
     n_modes
         Modes (baseline or redundant group, and delay) averaged, (Nk,) int.
-    noise_modes, sample_modes
-        Independent modes of noise and of signal among them, (Nk,); see `calstudy.power.errors`.
+    noise_modes, sample_modes, cross_modes
+        Independent modes of noise, of signal, and of the product of both among them, (Nk,); see
+        `calstudy.power.errors`.
     noise_error, sample_error
         Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.errors.with_errors`.
     wedge_excluded
@@ -142,6 +159,7 @@ class SphericalSpectrum:
     n_modes: np.ndarray = field(metadata={"unit": ""})
     noise_modes: np.ndarray = field(metadata={"unit": ""})
     sample_modes: np.ndarray = field(metadata={"unit": ""})
+    cross_modes: np.ndarray = field(metadata={"unit": ""})
     noise_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     sample_error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     wedge_excluded: bool = field(metadata={"unit": ""})
@@ -150,6 +168,18 @@ class SphericalSpectrum:
     def error(self) -> np.ndarray:
         """sigma_P = sigma_N + sigma_S, one standard deviation, (Nk,)."""
         return self.noise_error + self.sample_error
+
+    @property
+    def difference_error(self) -> np.ndarray:
+        """Standard deviation of P - P_S, (Nk,), where the EoR that P contains is the one whose power is P_S.
+
+        Of the variance of a mode (`calstudy.power.errors`) the sample variance is common to both. The noise is left,
+        and the product of signal and noise.
+        """
+        noise, sample = self.noise_error, self.sample_error
+        modes = np.sqrt(2 * self.noise_modes * self.sample_modes)
+        both = np.divide(modes, self.cross_modes, out=np.zeros(self.k.size), where=self.cross_modes > 0)
+        return np.sqrt(noise**2 + both * noise * sample)
 
 
 def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndarray:
@@ -180,6 +210,7 @@ def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
     power = np.zeros((len(vectors), uvp.Ndlys), dtype=complex)
     np.add.at(power, unit, uvp.data_array[0].mean(axis=2))
     n_pairs = np.bincount(unit)
+    shares = _antenna_shares(uvp, pairs, unit)
     cosmology, frequency = make_cosmology(settings.cosmology), float(uvp.freq_array.mean())
     return DelaySpectra(
         power=power / n_pairs[:, None],
@@ -192,7 +223,27 @@ def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
         frequency=frequency,
         omega_pp=float(uvp.OmegaPP.mean()),
         taper=settings.taper,
+        share_unit=shares[0],
+        share_antenna=shares[1],
+        share_pairs=shares[2],
+        share_power=shares[3],
     )
+
+
+def _antenna_shares(
+    uvp: UVPSpec, pairs: np.ndarray, unit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return unit, antenna, number of pairs and summed power (mean over polarizations) of `DelaySpectra`'s shares."""
+    numbers = {int(code): uvp.bl_to_antnums(int(code)) for code in np.unique(pairs)}
+    antennas = np.array([[*numbers[first], *numbers[second]] for first, second in pairs.tolist()])
+    # A pair counts once for an antenna that both of its baselines have.
+    pair, column = np.nonzero(
+        [[antenna not in row[:place] for place, antenna in enumerate(row)] for row in antennas.tolist()]
+    )
+    (owner, antenna), share = np.unique(np.stack([unit[pair], antennas[pair, column]]), axis=1, return_inverse=True)
+    power = np.zeros((owner.size, uvp.Ndlys), dtype=complex)
+    np.add.at(power, share, uvp.data_array[0].mean(axis=2)[pair])
+    return owner, antenna, np.bincount(share), power
 
 
 def _units(uvp: UVPSpec, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

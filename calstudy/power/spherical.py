@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calstudy.power.errors import noise_modes, sample_modes
+from calstudy.power.errors import cross_modes, noise_modes, sample_modes
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import DelaySpectra, SphericalSpectrum, outside_wedge
 
@@ -52,6 +52,7 @@ def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_we
         n_modes=np.bincount(bins[used], minlength=n_bins),
         noise_modes=noise_modes(spectra, bins, n_bins),
         sample_modes=sample_modes(spectra, bins, n_bins),
+        cross_modes=cross_modes(spectra, bins, n_bins),
         noise_error=unknown,
         sample_error=unknown,
         wedge_excluded=exclude_wedge,

@@ -28,6 +28,7 @@ CSV_COLUMNS = {
     "modes": lambda s: s.n_modes,
     "independent modes of noise": lambda s: s.noise_modes,
     "independent modes of signal": lambda s: s.sample_modes,
+    "independent modes of signal x noise": lambda s: s.cross_modes,
 }
 
 
@@ -39,6 +40,9 @@ TRANSFER_COLUMNS = {
     "transfer error": lambda t: t.transfer_error,
     "cross transfer": lambda t: t.cross_transfer,
     "cross transfer error": lambda t: t.cross_transfer_error,
+    "transfer without flux scale": lambda t: t.scale_free_transfer,
+    "transfer without flux scale error": lambda t: t.scale_free_transfer_error,
+    "flux scale": lambda t: np.full(t.k.size, t.flux_scale),
     "squared coherence": lambda t: t.squared_coherence,
     "squared coherence error": lambda t: t.squared_coherence_error,
     "baselines or groups": lambda t: t.n_samples,

@@ -25,22 +25,25 @@ white, <D* D> = <S* M* M S> = <S* M S>: C and T are equal, and are the fraction 
 
 The flux scale of a calibration is not determined by the fit: gains times sqrt(s) and a model divided by s fit as well.
 The prior that fixes s (in the paper, on the summed model) has an error of some per cent. It multiplies the residual by
-1/s, hence C by 1/s and T by 1/s^2, which is a part of P^R / P^S but not a loss. The *squared coherence* of response and
-signal,
+1/s, hence C by 1/s and T by 1/s^2, which is a part of P^R / P^S but not a loss. In a simulation the true gains are
+known, and with them
+
+    s^-2 = Re < r_even* r_odd >,   r = g_a g_b* / (ghat_a ghat_b*) averaged over the integrations,
+
+the mean over baselines and channels with the weights of the taper's square: calibration with these gains multiplies the
+power of a white signal by that. T s^2 is the transfer function free of the flux scale. Where the true gains are not
+known, the *squared coherence* of response and signal,
 
     C^2 / T = (Re <S* D>)^2 / (<S* S> <D* D>),
 
-does not depend on it: it is 1 if only the scale was changed. If each baseline is crossed with itself, it is the
-fraction of the power that remains after a projection of white S. Between different baselines of a redundant group it
-does not depend on the scale either, but is not such a fraction.
+does not depend on the scale either: it is 1 if only the scale was changed. If each baseline is crossed with itself, it
+is the fraction of the power that remains after a projection of white S, and equals T s^2. Between different baselines
+of a redundant group it is not such a fraction.
 
 Numerator and denominator contain the same sky, so that most of the sample variance cancels. The rest is estimated from
 the scatter of independent samples within a bin, where each baseline or redundant group is one sample (one patch of the
-uv plane, whose delays share the taper): for sums x_i of P^D and y_i of P^S over n samples,
-
-    T = sum x_i / sum y_i,   var T = n / (n - 1) sum (x_i - T y_i)^2 / (sum y_i)^2
-
-(the estimator of a ratio from clusters, Cochran 1977, section 6.3), and likewise, to first order, for C^2 / T.
+uv plane, whose delays share the taper), and by leaving out antennas, for baselines share the gains of their antennas
+(`calstudy.power.clusters`).
 """
 
 from __future__ import annotations
@@ -52,12 +55,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calstudy.power.clusters import Clusters, linear_error
 from calstudy.power.delay import horizon_delay
 from calstudy.power.spectra import outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
+    from calstudy.power.clusters import Sums
     from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 
 BANDS = (0.1, 0.2, 0.3, 0.5, 1.0)
@@ -80,6 +85,8 @@ class TransferFunction:
         T = P^D / P^S and its standard deviation, (Nk,).
     cross_transfer, cross_transfer_error
         C = Re <S* D> / P^S and its standard deviation, (Nk,).
+    scale_free_transfer, scale_free_transfer_error
+        T s^2, the transfer function free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     squared_coherence, squared_coherence_error
         C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,). Of spectra of each
         baseline with itself it is the fraction of the power that is retained.
@@ -87,6 +94,8 @@ class TransferFunction:
         Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins.
     n_samples
         Baselines, or redundant groups, in each bin, (Nk,) int.
+    flux_scale
+        s: fitted gain products over the true ones; NaN if not known.
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})
@@ -95,10 +104,13 @@ class TransferFunction:
     transfer_error: np.ndarray = field(metadata={"unit": ""})
     cross_transfer: np.ndarray = field(metadata={"unit": "", "array": "coherence"})
     cross_transfer_error: np.ndarray = field(metadata={"unit": "", "array": "coherence_error"})
+    scale_free_transfer: np.ndarray = field(metadata={"unit": ""})
+    scale_free_transfer_error: np.ndarray = field(metadata={"unit": ""})
     squared_coherence: np.ndarray = field(metadata={"unit": "", "array": "retained"})
     squared_coherence_error: np.ndarray = field(metadata={"unit": "", "array": "retained_error"})
     signal: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     n_samples: np.ndarray = field(metadata={"unit": ""})
+    flux_scale: float = field(metadata={"unit": ""})
 
 
 @dataclass(frozen=True)
@@ -182,7 +194,53 @@ def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
     return response
 
 
-def spherical_transfer(injection: Injection, edges: ArrayLike, buffer: float, inside: bool) -> TransferFunction:
+def gain_ratio(true: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """Return the mean over integrations of g_a g_b* / (ghat_a ghat_b*) for all pairs of antennas, (Npairs, Nfreqs).
+
+    Parameters
+    ----------
+    true
+        Gains, (Nants, Nfreqs), complex.
+    fitted
+        Gains of each integration, (Ntimes, Nants, Nfreqs), complex; NaN where there are none. Integrations without a
+        gain are left out of the mean of its pairs, which is NaN if all are.
+    """
+    first, second = np.triu_indices(len(true), 1)
+    total, count = np.zeros((first.size, true.shape[1]), complex), np.zeros((first.size, true.shape[1]))
+    for gains in fitted:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = true / gains
+            product = ratio[first] * ratio[second].conj()
+        known = np.isfinite(product)
+        total[known] += product[known]
+        count += known
+    return np.divide(total, count, out=np.full(total.shape, np.nan, complex), where=count > 0)
+
+
+def flux_scale(even: np.ndarray, odd: np.ndarray, weights: np.ndarray) -> float:
+    """Return s, the flux scale of a calibration.
+
+    Parameters
+    ----------
+    even, odd
+        True over fitted gain products of the two data sets (`gain_ratio`), (Npairs, Nfreqs), complex; NaN is left out.
+    weights
+        Of each channel, (Nfreqs,): the square of the taper.
+
+    Returns
+    -------
+    NaN if the two have nothing in common, not even the sign.
+    """
+    power = (even.conj() * odd).real
+    known = np.isfinite(power)
+    total = np.sum(np.broadcast_to(weights, power.shape), where=known)
+    mean = np.sum(power * weights, where=known) / total if total > 0 else np.nan
+    return float(mean**-0.5) if mean > 0 else np.nan
+
+
+def spherical_transfer(
+    injection: Injection, edges: ArrayLike, buffer: float, inside: bool, flux_scale: float = np.nan
+) -> TransferFunction:
     """Return T in bins of |k|, outside or inside the wedge.
 
     Parameters
@@ -195,27 +253,44 @@ def spherical_transfer(injection: Injection, edges: ArrayLike, buffer: float, in
         Modes with |tau| <= |b|/c + buffer (s) are inside the wedge.
     inside
         Which modes to average.
+    flux_scale
+        s of the calibration; NaN if not known.
     """
     limits = np.asarray(edges, dtype=float)
     signal = injection.signal
     bins = np.searchsorted(limits, np.hypot(signal.k_perp[:, None], signal.k_parallel), side="left") - 1
     bins[(bins >= limits.size - 1) | (outside_wedge(signal, buffer) == inside)] = -1
     samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
-    sums = _Sums.of(injection, bins, samples, limits.size - 1)
-    transfer, cross_transfer = sums.ratio(sums.response), sums.ratio(sums.cross)
-    squared_coherence = sums.squared_coherence()
+    clusters = Clusters.of(signal, bins, samples, limits.size - 1)
+    of_signal, response, cross = (clusters.powers(part) for part in (signal, injection.response, injection.cross))
+    transfer, transfer_error = response.ratio(of_signal)
+    cross_transfer, cross_transfer_error = cross.ratio(of_signal)
+    squared_coherence, squared_coherence_error = _squared_coherence(of_signal, response, cross)
     return TransferFunction(
         k=(limits[1:] + limits[:-1]) / 2,
         bin_edges=limits,
-        transfer=transfer[0],
-        transfer_error=transfer[1],
-        cross_transfer=cross_transfer[0],
-        cross_transfer_error=cross_transfer[1],
-        squared_coherence=squared_coherence[0],
-        squared_coherence_error=squared_coherence[1],
-        signal=sums.total(sums.signal),
-        n_samples=sums.n_samples,
+        transfer=transfer,
+        transfer_error=transfer_error,
+        cross_transfer=cross_transfer,
+        cross_transfer_error=cross_transfer_error,
+        scale_free_transfer=transfer * flux_scale**2,
+        scale_free_transfer_error=transfer_error * flux_scale**2,
+        squared_coherence=squared_coherence,
+        squared_coherence_error=squared_coherence_error,
+        signal=of_signal.total,
+        n_samples=clusters.n_samples,
+        flux_scale=flux_scale,
     )
+
+
+def _squared_coherence(signal: Sums, response: Sums, cross: Sums) -> tuple[np.ndarray, np.ndarray]:
+    """Return C^2 / T in each bin, and its standard deviation."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = cross.total**2 / (signal.total * response.total)
+        terms = ((2 / cross.total, cross), (-1 / signal.total, signal), (-1 / response.total, response))
+    known = np.isfinite(value)
+    error = np.abs(value) * linear_error(terms)
+    return np.where(known, value, np.nan), np.where(known, error, np.nan)
 
 
 def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap:
@@ -225,11 +300,14 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
     spacing = signal.delay[1] - signal.delay[0]
     step = np.rint(signal.delay / spacing).astype(int)
     column = np.abs(step)
-    bins = row[:, None] * (column.max() + 1) + column
-    samples = 2 * np.arange(row.size)[:, None] + (step < 0)
     shape = (lengths.size, column.max() + 1)
-    sums = _Sums.of(injection, bins, samples, lengths.size * shape[1])
-    transfer, cross_transfer = sums.ratio(sums.response), sums.ratio(sums.cross)
+    bins = row[:, None] * shape[1] + column
+    samples = 2 * np.arange(row.size)[:, None] + (step < 0)
+    clusters = Clusters.of(signal, bins, samples, lengths.size * shape[1])
+    of_signal = clusters.powers(signal)
+    transfer, cross_transfer = (
+        clusters.powers(part).ratio(of_signal) for part in (injection.response, injection.cross)
+    )
     pairs = np.bincount(row, signal.n_pairs)
     length = np.bincount(row, signal.n_pairs * signal.length) / pairs
     return TransferMap(
@@ -244,71 +322,6 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
         cross_transfer_error=cross_transfer[1].reshape(shape),
         horizon_delay=horizon_delay(length),
     )
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Sums of powers over the modes of each sample in each bin, all of length Nsums.
-
-    Attributes
-    ----------
-    owner
-        Bin of each sum.
-    n_samples
-        Number of samples in each bin, (n_bins,).
-    signal, response, cross
-        Sums of the real parts, each pair of baselines counting the same.
-    """
-
-    owner: np.ndarray
-    n_samples: np.ndarray
-    signal: np.ndarray
-    response: np.ndarray
-    cross: np.ndarray
-
-    @classmethod
-    def of(cls, injection: Injection, bins: np.ndarray, samples: np.ndarray, n_bins: int) -> _Sums:
-        """Add up; `bins` (-1: left out) and `samples` number the modes, (Nu, Nd) each."""
-        used = bins >= 0
-        weights = np.broadcast_to(injection.signal.n_pairs[:, None], bins.shape)[used]
-        (owner, _), index = np.unique(np.stack([bins[used], samples[used]]), axis=1, return_inverse=True)
-        signal, response, cross = (
-            np.bincount(index, weights * part.power.real[used])
-            for part in (injection.signal, injection.response, injection.cross)
-        )
-        return cls(owner, np.bincount(owner, minlength=n_bins), signal, response, cross)
-
-    def total(self, sums: np.ndarray) -> np.ndarray:
-        """Return the sum over the samples of each bin, (n_bins,); NaN for empty bins."""
-        return np.where(self.n_samples > 0, np.bincount(self.owner, sums, self.n_samples.size), np.nan)
-
-    def ratio(self, numerator: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ratio of a sum to that of the signal in each bin, and its standard deviation."""
-        total = self.total(self.signal)
-        value = self.total(numerator) / total
-        return value, self._scatter((numerator - value[self.owner] * self.signal) / total[self.owner])
-
-    def squared_coherence(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return C^2 / T in each bin, and its standard deviation."""
-        signal, response, cross = (self.total(part) for part in (self.signal, self.response, self.cross))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            value = cross**2 / (signal * response)
-            relative = (
-                2 * self.cross / cross[self.owner]
-                - self.signal / signal[self.owner]
-                - self.response / response[self.owner]
-            )
-            known = np.isfinite(value)
-            error = np.abs(value) * self._scatter(relative)
-        return np.where(known, value, np.nan), np.where(known, error, np.nan)
-
-    def _scatter(self, deviations: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of the sum over samples of deviations that add up to zero in each bin."""
-        squares = np.bincount(self.owner, deviations**2, self.n_samples.size)
-        factor = np.full(squares.size, np.nan)
-        known = self.n_samples > 1
-        factor[known] = self.n_samples[known] / (self.n_samples[known] - 1)
-        return np.sqrt(factor * squares)
 
 
 def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
@@ -343,10 +356,13 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
         transfer_error=error("transfer_error"),
         cross_transfer=mean("cross_transfer"),
         cross_transfer_error=error("cross_transfer_error"),
+        scale_free_transfer=mean("scale_free_transfer"),
+        scale_free_transfer_error=error("scale_free_transfer_error"),
         squared_coherence=mean("squared_coherence"),
         squared_coherence_error=error("squared_coherence_error"),
         signal=total,
         n_samples=np.sum([item.n_samples for item in transfers], axis=0),
+        flux_scale=float(np.mean([item.flux_scale for item in transfers])),
     )
 
 

@@ -104,4 +104,4 @@ def _cost(task: Task) -> Cost:
     return Cost(2 + samples * 1e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
 
 
-MEASURE_AGREEMENT = Stage(name="agreement", version=2, make=measure, cost=_cost)
+MEASURE_AGREEMENT = Stage(name="agreement", version=3, make=measure, cost=_cost)

@@ -8,7 +8,7 @@ from typing import Any
 
 from calstudy.base.resources import Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
-from calstudy.products import spectra
+from calstudy.products import calibration, corruption, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import AVERAGE, read_visibilities, spectrum_file, write_visibilities
 from calstudy.products.graph import Graph, once, size_of
@@ -44,7 +44,10 @@ def transfer(graph: Graph) -> Task | None:
         "response": spectra.crossed(graph, "response to the EoR", responses),
         "cross": spectra.crossed(graph, "EoR x response", {"even": signal, "odd": responses["odd"]}),
         "spectra": spectra.spectra(graph),
+        **{f"calibration {parity}": calibration.calibration(graph, residual, parity) for parity in PARITIES},
     }
+    if residual.effects:
+        inputs["gains"] = corruption.gains(graph)
     return Task(TRANSFER_STAGE, "signal loss", {"power": graph.experiment.power}, inputs)
 
 
@@ -67,10 +70,11 @@ def measure(job: Job) -> Mapping[str, Any]:
     delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
     injection = Injection(**delays)
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
-    summary = {}
+    scale = _flux_scale(job, injection.signal.taper)
+    summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
         for name, edges in ((TRANSFER, fine), (BAND, BANDS)):
-            found = spherical_transfer(injection, edges, buffer, inside)
+            found = spherical_transfer(injection, edges, buffer, inside, scale)
             save_spectrum(job.output / spectrum_file(name, region), found)
             write_transfer_csv(job.output / f"{name}.{region}.csv", found)
         summary[region] = [
@@ -79,7 +83,25 @@ def measure(job: Job) -> Mapping[str, Any]:
         ]
     save_spectrum(job.output / spectrum_file(TRANSFER, "wedge"), cylindrical_transfer(injection, settings.length_bin))
     _write_corrected(job)
-    return {"transfer": summary}
+    return {"transfer": summary, "flux_scale": _json(scale)}
+
+
+def _flux_scale(job: Job, taper: str) -> float:
+    """Return the flux scale of the calibration of data with the EoR, first polarization."""
+    import numpy as np
+
+    from calstudy.power.delay import make_taper
+    from calstudy.power.transfer import flux_scale, gain_ratio
+    from calstudy.products.selection import read_gains
+
+    ratios = []
+    for parity in PARITIES:
+        fitted = read_gains(job.inputs[f"calibration {parity}"])
+        true = np.ones(fitted.values.shape[1:])
+        if "gains" in job.inputs:
+            true = read_gains(job.inputs["gains"]).of(fitted.numbers)[0]
+        ratios.append(gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values)))
+    return flux_scale(ratios[0], ratios[1], make_taper(taper, fitted.frequency.size) ** 2)
 
 
 def _json(value: float) -> float | None:
@@ -118,4 +140,4 @@ def _cost_of_difference(task: Task) -> Cost:
 
 
 DIFFERENCE = Stage(name="difference", version=2, make=difference, cost=_cost_of_difference)
-TRANSFER_STAGE = Stage(name="transfer", version=2, make=measure, cost=lambda task: Cost(4, disk=1e6))
+TRANSFER_STAGE = Stage(name="transfer", version=3, make=measure, cost=lambda task: Cost(8, disk=1e6))

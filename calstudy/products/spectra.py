@@ -171,9 +171,10 @@ def _cost_of_average(task: Task) -> Cost:
 
 def _cost_of_power(task: Task) -> Cost:
     size = size_of(task)
-    return Cost(6, 1.6e9, 2 * size.baselines * size.channels.count * COMPLEX128)
+    # The file of the estimator, the spectra, and what each unit owes to its antennas.
+    return Cost(6, 1.6e9, 4 * size.baselines * size.channels.count * COMPLEX128)
 
 
 AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)
-POWER = Stage(name="power", version=3, make=estimate, cost=_cost_of_power)
-SPECTRA = Stage(name="spectra", version=2, make=average_spectra, cost=lambda task: Cost(10, disk=5e6))
+POWER = Stage(name="power", version=4, make=estimate, cost=_cost_of_power)
+SPECTRA = Stage(name="spectra", version=3, make=average_spectra, cost=lambda task: Cost(10, disk=5e6))

@@ -128,6 +128,11 @@ def own_error(arrays: Arrays, name: str) -> np.ndarray:
     return arrays[f"{name}_error"]
 
 
+def spread_of_scale(arrays: Arrays, name: str) -> np.ndarray:
+    """Return by how much the flux scale of one sky and array differs between noise realizations, 0.3 %."""
+    return np.full(np.shape(arrays[name]), 3e-3)
+
+
 def typical_error(arrays: Arrays, name: str) -> np.ndarray:
     """Return the error bars of a map, or their median over delays where that is larger.
 

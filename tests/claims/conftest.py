@@ -15,6 +15,7 @@ from calstudy.claims.results import RunResults
 from calstudy.experiment.files import validate
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import save_spectrum
+from calstudy.power.transfer import TransferFunction
 
 SIGNAL = 1e7
 EDGES = 0.04 * np.arange(85)
@@ -35,11 +36,13 @@ class World:
     noise: float = 0.03
     without_eor_bias: float = 0.0
     leakage: float = 1e6
-    foregrounds: float = 1e9
+    foregrounds: float = 3e8
     sidelobes: float = 10.0
     window_leak: float = 0.0
     artefact: float = 0.0
     artefact_left: float = 0.0
+    scale_free_transfer: float = 0.94
+    flux_scale: float = 1.01
     redundant_fraction: float = 0.02
     agreement: dict[str, float] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
@@ -50,6 +53,8 @@ PAPERS_AGREEMENT = {
     "gains_raw": 0.12,
     "gains_by_delay": 0.1,
     "gains_worst_delay": 0.18,
+    "gains_raw_by_delay": 0.11,
+    "gains_raw_worst_delay": 0.19,
     "model_aligned": 0.15,
     "model_raw": 0.16,
     "model_over_noise": 100.0,
@@ -88,6 +93,7 @@ def spherical(world: World, rng: np.random.Generator, kind: str, modes: str) -> 
         n_modes=np.where(np.arange(K.size) < first, 0, 1000),
         noise_modes=1000 * ones,
         sample_modes=1000 * ones,
+        cross_modes=1000 * ones,
         noise_error=SIGNAL * world.noise * ones * has_noise,
         sample_error=SIGNAL / np.sqrt(1000) * ones * has_signal,
         wedge_excluded=modes == "outside-wedge",
@@ -119,6 +125,27 @@ def wedge(world: World, rng: np.random.Generator, kind: str) -> CylindricalSpect
     )
 
 
+def transfer(world: World) -> TransferFunction:
+    ones = np.ones(K.size)
+    scale_free = world.scale_free_transfer * ones
+    value = scale_free / world.flux_scale**2
+    return TransferFunction(
+        k=K,
+        bin_edges=EDGES,
+        transfer=value,
+        transfer_error=0.01 * ones,
+        cross_transfer=value,
+        cross_transfer_error=0.01 * ones,
+        scale_free_transfer=scale_free,
+        scale_free_transfer_error=0.01 * ones,
+        squared_coherence=scale_free,
+        squared_coherence_error=0.01 * ones,
+        signal=SIGNAL * ones,
+        n_samples=100 * np.ones(K.size, int),
+        flux_scale=world.flux_scale,
+    )
+
+
 KINDS = ("eor", "noise", "uncorrupted", "uncalibrated", "residual", "residual_without_eor")
 
 
@@ -135,6 +162,7 @@ def make_study(tmp_path) -> Callable[..., RunResults]:
             for modes in ("all-modes", "outside-wedge"):
                 save_spectrum(folder / f"{kind}.{modes}.h5", spherical(world, rng, kind, modes))
             save_spectrum(folder / f"{kind}.wedge.h5", wedge(world, rng, kind))
+        save_spectrum(folder / "transfer.outside-wedge.h5", transfer(world))
         values = PAPERS_AGREEMENT | world.agreement
         measurements = {
             key: {"value": value, "scatter": 0.1 * value, "count": 100, "over": "baselines"}

@@ -8,11 +8,11 @@ import pytest
 from tiny import tiny
 
 from calstudy.base.errors import InputError
+from calstudy.claims.bins import bias_extent, difference_of_ratios, fraction_within, recovered
 from calstudy.claims.evaluation import evaluate_members, evaluate_run, refusals_of_run
 from calstudy.claims.folders import evaluate_folder
 from calstudy.experiment.files import dump, override, validate
 from calstudy.experiment.model import PAPERS
-from calstudy.papers.calamity2022.bins import bias_extent, difference_error, fraction_within, recovered
 from calstudy.studies.load import load_study
 from calstudy.verdicts.tables import from_json
 
@@ -86,7 +86,14 @@ def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(ma
         ),
         ({"leakage": 30.0}, {"leakage-far-above-signal", "systematics-removed-from-window"}),
         ({"window_leak": 50.0}, {"foregrounds-contained"}),
-        ({"foregrounds": 1e5, "sidelobes": 10.0}, {"residual-without-eor-90-db-below-foregrounds"}),
+        (
+            {"foregrounds": 1e5, "sidelobes": 10.0},
+            {
+                "residual-without-eor-90-db-below-foregrounds",
+                "residual-without-eor-neither-more-nor-less-than-90-db-below",
+            },
+        ),
+        ({"foregrounds": 1e11}, {"residual-without-eor-neither-more-nor-less-than-90-db-below"}),
         ({"sidelobes": 0.0}, {"residual-beats-taper-outside-wedge"}),
         ({"biased_below": 0.0}, {"residual-biased-with-wedge", "bias-with-wedge-ends-near-0p3"}),
         ({"biased_below": 0.6}, {"bias-with-wedge-ends-near-0p3", "bias-with-wedge-ends-below-0p25"}),
@@ -95,8 +102,19 @@ def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(ma
             {"agreement": {"gains_aligned": 0.001}},
             {"gains-of-order-10-percent", "product-far-better-than-gains"},
         ),
-        ({"agreement": {"gains_raw": 0.3}}, {"gains-within-20-percent-raw"}),
-        ({"agreement": {"gains_by_delay": 0.3}}, {"gains-within-20-percent-at-typical-delay"}),
+        (
+            {"agreement": {"gains_raw": 0.3}},
+            {"gains-within-20-percent-raw", "gains-of-order-10-percent-raw"},
+        ),
+        (
+            {"agreement": {"gains_by_delay": 0.3}},
+            {"gains-within-20-percent-at-typical-delay", "gains-of-order-10-percent-at-typical-delay-aligned"},
+        ),
+        (
+            {"agreement": {"gains_by_delay": 0.02}},
+            {"gains-of-order-10-percent-at-typical-delay-aligned"},
+        ),
+        ({"agreement": {"gains_raw_by_delay": 0.02}}, {"gains-of-order-10-percent-at-typical-delay"}),
         ({"agreement": {"gains_worst_delay": 0.3}}, {"gains-within-20-percent-at-every-delay"}),
         ({"agreement": {"model_aligned": 0.9}}, {"model-of-order-10-to-20-percent"}),
         ({"agreement": {"model_raw": 0.9}}, {"model-of-order-10-to-20-percent-raw"}),
@@ -132,7 +150,14 @@ def test_a_strong_residual_without_eor_is_neither_low_nor_at_the_noise(make_stud
 
 
 def compare(make_study, **redundant):
-    truth = {"recovered_small_k": 0.5, "recovered": 0.9, "noise": 0.003, "leakage": 2e4, "redundant_fraction": 0.9}
+    truth = {
+        "recovered_small_k": 0.5,
+        "recovered": 0.9,
+        "noise": 0.003,
+        "leakage": 2e4,
+        "redundant_fraction": 0.9,
+        "scale_free_transfer": 0.9,
+    }
     studies = {
         "minimally_redundant": make_study("minimal", without_eor_bias=0.03),
         "redundant": make_study("redundant", seed=2, **(truth | redundant)),
@@ -157,7 +182,15 @@ def test_claims_on_the_redundant_array_hold_in_the_papers_world(make_study):
         ({"recovered": 0.3}, {"redundant-signal-recovered", "redundant-modelling-same-power"}),
         ({"recovered": 1.0}, {"more-loss-on-all-scales"}),
         ({"recovered": 0.96}, {"redundant-residual-unbiased"}),
-        ({"recovered_small_k": 1.0, "recovered": 1.0}, {"more-loss-at-small-k", "bias-reaches-larger-k"}),
+        (
+            {"recovered_small_k": 1.0, "recovered": 1.0},
+            {"more-loss-at-small-k", "more-loss-below-0p3", "bias-reaches-larger-k"},
+        ),
+        # The scale of the residual alone is not a loss.
+        (
+            {"flux_scale": 1.05, "scale_free_transfer": 0.94},
+            {"more-loss-on-all-scales-without-flux-scale"},
+        ),
         ({"agreement": {"residual_over_noise_outside": 3.0}}, {"redundant-modelling-same-visibilities"}),
     ],
 )
@@ -334,23 +367,6 @@ def test_what_a_run_lacks_is_said(make_study):
     assert claims["noise-reduced"].measured is None
 
 
-def test_the_error_of_the_difference_is_what_common_signal_and_noise_scatter(make_study):
-    rng = np.random.default_rng(8)
-    modes, signal, noise = 400, 2.0, 0.7
-
-    def gaussian(power):
-        shape = (4000, modes)
-        return np.sqrt(power / 2) * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
-
-    sky = gaussian(signal)
-    crossed = ((sky + gaussian(noise)).conj() * (sky + gaussian(noise))).real.mean(axis=1)
-    scatter = np.std(crossed - (np.abs(sky) ** 2).mean(axis=1))
-    spectrum = make_study().spherical("residual", "all-modes")
-    object.__setattr__(spectrum, "noise_error", np.array([noise / np.sqrt(2 * modes)]))
-    object.__setattr__(spectrum, "sample_error", np.array([signal / np.sqrt(modes)]))
-    assert difference_error(spectrum)[0] == pytest.approx(scatter, rel=0.04)
-
-
 @pytest.mark.parametrize("truth", [0.3, 0.8, 1.0, 1.2])
 def test_the_recovered_fraction_is_found_within_its_error(make_study, truth):
     study = make_study(recovered=truth)
@@ -363,6 +379,54 @@ def test_the_bias_ends_where_it_was_made_to(make_study, edge):
     study = make_study(biased_below=edge, noise=1e-4)
     found = bias_extent(*(study.spherical(name, "all-modes") for name in ("residual", "eor")))
     assert found.value == pytest.approx(edge, abs=1e-9)
+
+
+def residual_and_eor(make_study, name, pulls):
+    """P^R and P^S outside the wedge whose first bins differ by given numbers of standard deviations."""
+    study = make_study(name, noise=0.03)
+    residual, eor = (study.spherical(kind, "outside-wedge") for kind in ("residual", "eor"))
+    first = np.flatnonzero(np.isfinite(residual.power))[0]
+    residual.power[first:] = eor.power[first:]
+    deviation = np.array(pulls) * residual.difference_error[first : first + len(pulls)]
+    residual.power[first : first + len(pulls)] -= deviation
+    return residual, eor, residual.bin_edges[first:]
+
+
+@pytest.mark.parametrize(
+    ("pulls", "biased"),
+    [
+        # The minimally redundant array at full scale: its lowest bin has few modes, and is low by 1.83 sigma only.
+        ((1.83, 6.77, 7.07, 4.85, 3.92, 3.09, 1.80, 1.59), 6),
+        ((13.7, 16.3, 9.3, 1.51), 3),
+        ((13.7, 16.3, 9.3, 1.51, 0.2, -0.5, 0.7, 0.1, 2.5), 3),
+        ((0.5, -1.0, 1.2, 0.3), 0),
+        ((-9.0, -9.0, 0.3), 0),
+    ],
+)
+def test_the_bias_ends_at_the_last_biased_bin_whatever_single_bins_do(make_study, pulls, biased):
+    residual, eor, edges = residual_and_eor(make_study, "run", pulls)
+    assert bias_extent(residual, eor).value == pytest.approx(edges[biased])
+
+
+def test_runs_that_lose_the_same_in_each_bin_do_not_differ_whatever_their_errors(make_study):
+    """The ratio rises from 0.03 to 1; pooled with the weights of each run it would differ."""
+    ratio = np.array([0.05, 0.4, 0.7, 0.9, 1.0])
+    runs = []
+    for name, spread in (("first", np.array([1, 1, 1, 9, 9])), ("second", np.array([9, 9, 9, 1, 1]))):
+        residual, eor, edges = residual_and_eor(make_study, name, ())
+        kept = slice(np.flatnonzero(residual.bin_edges == edges[0])[0], None)
+        residual.power[kept][:5] = ratio * eor.power[kept][:5]
+        residual.noise_error[kept][:5] *= spread
+        runs.append((residual, eor))
+    found = difference_of_ratios(*runs, k_min=0.0, k_max=edges[5])
+    assert found.value == pytest.approx(0.0, abs=1e-12)
+    assert found.uncertainty > 0
+    pooled = [recovered(*run, 0.0, edges[5]).value for run in runs]
+    assert abs(pooled[0] - pooled[1]) > 0.3
+    lost = difference_of_ratios(runs[0], runs[0], 0.0, edges[5])
+    runs[1][0].power[:] = 0.5 * runs[0][0].power
+    assert lost.value == 0
+    assert difference_of_ratios(*runs, k_min=0.0, k_max=edges[5]).value > 0.1
 
 
 def test_half_of_the_values_within_their_bars_is_a_half():

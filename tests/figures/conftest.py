@@ -75,6 +75,7 @@ def make_spherical_spectrum() -> Callable[..., SphericalSpectrum]:
             n_modes=ones.astype(int),
             noise_modes=ones,
             sample_modes=ones,
+            cross_modes=ones,
             noise_error=noise_error * ones,
             sample_error=sample_error * ones,
             wedge_excluded=True,

@@ -21,10 +21,13 @@ def function(transfer: list[float], edges: list[float], error: float = 0.02) -> 
         transfer_error=errors,
         cross_transfer=values - 0.01,
         cross_transfer_error=errors,
+        scale_free_transfer=values + 0.03,
+        scale_free_transfer_error=errors,
         squared_coherence=values - 0.02,
         squared_coherence_error=errors,
         signal=np.ones(values.size),
         n_samples=np.full(values.size, 9),
+        flux_scale=1.02,
     )
 
 
@@ -81,10 +84,11 @@ def test_published_arrays_keep_their_names(loss):
     assert not any("squared" in name or "cross" in name for name in arrays)
 
 
-def test_the_squared_coherence_is_the_line(loss):
+def test_the_transfer_without_the_flux_scale_is_the_line_and_the_scale_is_in_the_legend(loss):
     figure = draw_signal_loss(loss)
     line = next(item for item in figure.axes[0].lines if "flux scale" in str(item.get_label()))
-    assert line.get_ydata() == pytest.approx(loss.outside.squared_coherence, nan_ok=True)
+    assert line.get_ydata() == pytest.approx(loss.outside.scale_free_transfer, nan_ok=True)
+    assert "1.020" in str(line.get_label())
 
 
 def test_the_map_has_a_cell_per_bin_and_none_where_there_are_no_baselines(loss):
@@ -135,7 +139,8 @@ def test_a_sweep_has_a_panel_per_field_with_its_values_below():
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "0.1" in labels[0]
     assert "Mpc" in labels[1]
-    assert labels[2] == "free of the flux scale"
+    assert labels[2] == "free of the flux scale $s$"
+    assert [text.get_text() for text in one.texts] == ["$s$ = 1.020"] * 2
 
 
 def test_sweeps_without_panels_or_with_different_bands_are_refused():

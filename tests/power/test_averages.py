@@ -240,6 +240,33 @@ def test_signal_of_neighbouring_baselines_is_not_counted_twice():
     assert trials[0].sample_modes[0] < 0.75 * trials[0].n_modes[0]
 
 
+@pytest.mark.parametrize("n", [1, 4])
+def test_the_error_of_the_difference_is_the_scatter_where_the_signal_is_common(n):
+    """Signal and noise of power 1 on close baselines, whose signal is partly the same, or on groups of n."""
+    rng, n_delays, n_trials = np.random.default_rng(25), 32, 2000
+    vectors = np.array([[40, 0, 0], [90, 3, 0], [20, 70, 0]], dtype=float)
+    if n == 1:
+        # Each three times: independent noise, the same signal.
+        vectors = np.repeat(vectors, 3, axis=0)
+    shape = (n_trials, len(vectors), n, n_delays)
+    signal = white_delay_spectra(rng, (n_trials, 3, 1, n_delays), "blackman-harris")
+    signal = np.repeat(signal, len(vectors) // 3, axis=1)
+    even, odd = (signal + white_delay_spectra(rng, shape, "blackman-harris") for _ in range(2))
+    power = (even.conj() * odd)[:, :, 0] if n == 1 else cross_group(even, odd)
+    n_pairs = np.full(len(vectors), 1 if n == 1 else n * (n - 1))
+    settings = PowerSettings(bins=KBins(min="1.5 h/Mpc", max="4.5 h/Mpc", width="1.0 h/Mpc"))
+
+    def average(values):
+        return spherical_average(make_spectra(values, vectors, n_pairs), settings, False)
+
+    both = [(average(p), average(np.abs(s[:, 0]) ** 2 + 0j)) for p, s in zip(power, signal, strict=True)]
+    scatter = np.std([(total.power - sky.power).real for total, sky in both], axis=0)
+    expected = dataclasses.replace(both[0][1], power=np.ones_like(both[0][1].power))
+    predicted = errors.with_errors(both[0][0], noise=np.sqrt(0.5), signal=expected).difference_error
+    # 2000 trials give each standard deviation to 1.6 %; limits are four times that.
+    np.testing.assert_allclose(scatter / predicted, 1.0, atol=0.065)
+
+
 def test_polarizations_share_the_signal_not_the_noise():
     spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
     two = dataclasses.replace(spectra, n_polarizations=2)

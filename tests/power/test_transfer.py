@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calstudy.power.delay import delay_transform, delays
+from calstudy.power.delay import delay_transform, delays, make_taper
 from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 from calstudy.power.tables import load_spectrum, save_spectrum, write_transfer_csv
 from calstudy.power.transfer import (
@@ -16,6 +16,8 @@ from calstudy.power.transfer import (
     TransferMap,
     correct,
     cylindrical_transfer,
+    flux_scale,
+    gain_ratio,
     pool,
     signal_response,
     spherical_transfer,
@@ -121,6 +123,39 @@ def test_gains_that_absorb_some_of_all_baselines_lose_their_share_at_all_delays(
         assert error[0] < 0.02
 
 
+def test_the_flux_scale_is_what_gains_multiply_a_white_signal_by(rng):
+    """Gains of the wrong scale, with errors of 10 %: T free of the scale is what is left without them."""
+    signal = noise(rng)
+    ratio = (1 + 0.1 * noise(rng) / np.sqrt(2)) / 1.07
+    scale = flux_scale(ratio, ratio, make_taper("blackman-harris", CHANNELS) ** 2)
+    found = spherical_transfer(
+        inject(signal, 0.9 * ratio * signal, 0.9 * ratio * signal, "blackman-harris"),
+        ONE_BIN, BUFFER, inside=False, flux_scale=scale,
+    )  # fmt: skip
+    assert scale == pytest.approx(1.07 / np.sqrt(1.01), rel=0.005)
+    assert found.flux_scale == scale
+    assert found.scale_free_transfer[0] == pytest.approx(0.81, abs=4 * found.scale_free_transfer_error[0])
+    assert found.scale_free_transfer_error[0] < 0.01
+    assert found.transfer[0] * scale**2 == pytest.approx(found.scale_free_transfer[0])
+
+
+def test_the_flux_scale_is_that_of_the_gains_whatever_their_noise_phases_and_gaps(rng):
+    antennas, times = 12, 5
+    true = 1 + 0.1 * (rng.normal(size=(antennas, CHANNELS)) + 1j * rng.normal(size=(antennas, CHANNELS)))
+    ratios = []
+    for _ in range(2):
+        fitted = np.repeat(true[None], times, axis=0) * np.sqrt(1.05)
+        fitted *= np.exp(2j * np.pi * rng.random((times, 1, CHANNELS)))
+        fitted *= 1 + 0.02 * (rng.normal(size=fitted.shape) + 1j * rng.normal(size=fitted.shape))
+        fitted[2, 3], fitted[:, 5, :7], fitted[0, 0, 1] = np.nan, np.nan, 0
+        ratios.append(gain_ratio(true, fitted))
+    assert np.isnan(ratios[0][:, :7]).any(axis=0).all()
+    assert np.isfinite(ratios[0][:, 7:]).all()
+    # Noise of 2 % in single gains, even and odd apart, averages down to far below 1e-3.
+    assert flux_scale(*ratios, np.ones(CHANNELS)) == pytest.approx(1.05, abs=1e-3)
+    assert np.isnan(flux_scale(np.nan * ratios[0], ratios[1], np.ones(CHANNELS)))
+
+
 def test_noise_that_both_residuals_share_cancels(template, rng, white):
     """The difference of powers scatters by the noise; the power of the difference does not see it."""
     from calstudy.base.visibilities import from_cube, to_cube
@@ -182,7 +217,7 @@ def test_pooling_is_as_if_all_modes_were_of_one_injection(rng):
 def spectrum(power: list[float], error: float, edges: np.ndarray) -> SphericalSpectrum:
     ones = np.ones(len(power))
     return SphericalSpectrum(
-        (edges[1:] + edges[:-1]) / 2, edges, np.array(power, dtype=complex), ones, ones, ones, error * ones, 0 * ones,
+        (edges[1:] + edges[:-1]) / 2, edges, np.array(power, dtype=complex), *(4 * [ones]), error * ones, 0 * ones,
         wedge_excluded=True,
     )  # fmt: skip
 
@@ -191,7 +226,7 @@ def test_corrected_power_is_unbiased_with_both_errors_and_unknown_where_all_is_l
     edges = np.array([0.0, 1.0, 2.0, 3.0])
     ones = np.ones(3)
     transfer = TransferFunction(
-        (edges[1:] + edges[:-1]) / 2, edges, np.array([0.5, 1.0, 0.01]), 0.01 * ones, *(6 * [ones])
+        (edges[1:] + edges[:-1]) / 2, edges, np.array([0.5, 1.0, 0.01]), 0.01 * ones, *(8 * [ones]), 1.0
     )
     power, error = correct(spectrum([50.0, 100.0, 1.0], 3.0, edges), transfer)
     assert power[:2] == pytest.approx([100.0, 100.0])

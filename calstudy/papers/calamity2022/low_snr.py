@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from calstudy.claims.bins import SIGMAS_95, bins_at_delays, fraction_within, used_bins
 from calstudy.claims.results import RunResults
 from calstudy.corrupt.effects.reflection_gains import ReflectionGains
-from calstudy.papers.calamity2022.bins import SIGMAS_95, bins_at_delays, fraction_within, used_bins
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within

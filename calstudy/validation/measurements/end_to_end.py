@@ -2,7 +2,7 @@
 
 Pulls (P^R - P^S) / sigma outside wedge and buffer, with two readings of sigma: the paper's error bar sigma_N + sigma_S,
 and the error of the difference, from which the sample variance that P^R and P^S share is gone
-(`calstudy.papers.calamity2022.bins.difference_error`). The second is the harder.
+(`calstudy.power.spectra.SphericalSpectrum.difference_error`). The second is the harder.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.units import Wavenumber
-from calstudy.papers.calamity2022.bins import difference_error, recovered, used_bins
+from calstudy.claims.bins import recovered, used_bins
 from calstudy.products import spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
@@ -41,7 +41,7 @@ class EndToEnd(Measurement):
             residual, signal = (inputs.spherical(name, variant) for variant in ("residual", "eor"))
             used = used_bins(residual, signal, k_min=self.k_min)
             difference = (residual.power - signal.power).real[used]
-            for reading, error in (("bars", residual.error), ("difference", difference_error(residual))):
+            for reading, error in (("bars", residual.error), ("difference", residual.difference_error)):
                 within = np.abs(difference / error[used]) <= SIGMAS
                 sampling = np.sqrt(EXPECTED * (1 - EXPECTED) / within.size)
                 values[f"{name}_{reading}"] = Finding(float(within.mean()), float(sampling))

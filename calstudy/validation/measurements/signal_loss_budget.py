@@ -12,7 +12,7 @@ The spectrum of the EoR alone is followed through the chain, each entry in units
 
 The end-to-end loss is measured apart from these: P_in - P^R, from the residual of the whole chain. The sum must agree
 with it; the difference is the cross term of the EoR's response and what is left, whose mean is zero, and whose error
-comes from the scatter of baselines or groups.
+comes from leaving out antennas (`calstudy.power.clusters`).
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from calstudy.base.visibilities import to_cube
 from calstudy.experiment.model import Variant
 from calstudy.instrument.beams import make_beam
 from calstudy.power.average import fringe_stop_and_average
+from calstudy.power.clusters import Clusters
 from calstudy.power.interface import estimate_spectra
 from calstudy.power.spectra import DelaySpectra, outside_wedge
 from calstudy.power.transfer import BANDS
@@ -36,7 +37,6 @@ from calstudy.products import corruption, signal_loss, spectra
 from calstudy.products.files import DATA, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.means import clustered_mean
 from calstudy.validation.measurement import Findings, Inputs, Measurement, required
 from calstudy.verdicts.criterion import Finding
 
@@ -146,8 +146,14 @@ def budget(inputs: Inputs, name: str) -> list[Band]:
 
 
 def _mean(modes: DelaySpectra, used: np.ndarray, minus: Sequence[DelaySpectra] = ()) -> Finding:
-    power = modes.power.real - sum(other.power.real for other in minus)
-    return clustered_mean(np.where(used, power, np.nan), modes.n_pairs)
+    """Return the mean power of the modes that are used, each once per pair, and its error by leaving out antennas."""
+    bins = np.where(used, 0, -1)
+    clusters = Clusters.of(modes, bins, np.broadcast_to(np.arange(len(bins))[:, None], bins.shape), 1)
+    power = clusters.powers(modes)
+    for other in minus:
+        power = power - clusters.powers(other)
+    value, error = power.ratio(clusters.counts)
+    return Finding(float(value[0]), float(error[0]))
 
 
 def _before_calibration(inputs: Inputs, name: str) -> list[DelaySpectra]:

@@ -1,4 +1,4 @@
-"""Comparisons of spherical spectra bin by bin, with the error model of the paper."""
+"""Comparisons of spherical spectra bin by bin, as statements of papers and steps of the validation ladder need them."""
 
 from __future__ import annotations
 
@@ -55,16 +55,6 @@ def bins_at_delays(spectrum: SphericalSpectrum, wedge: CylindricalSpectrum, low:
     return chosen
 
 
-def difference_error(residual: SphericalSpectrum) -> np.ndarray:
-    r"""Return the standard deviation of P^R - P^S, (Nk,), where both hold the same EoR.
-
-    Of the variance P_S^2 + P_S P_N + P_N^2 / 2 of a mode (`calstudy.power.errors`) the first term is common to both, so
-    that sigma_N^2 + sqrt(2) sigma_S sigma_N is left.
-    """
-    noise, sample = residual.noise_error, residual.sample_error
-    return np.sqrt(noise**2 + np.sqrt(2) * noise * sample)
-
-
 def recovered(residual: SphericalSpectrum, eor: SphericalSpectrum, k_min: float, k_max: float = np.inf) -> Finding:
     """Return the ratio P^R / P^S, averaged over bins with the inverse variance of the difference of the two.
 
@@ -76,7 +66,7 @@ def recovered(residual: SphericalSpectrum, eor: SphericalSpectrum, k_min: float,
         Bins that are used, h/Mpc.
     """
     used = used_bins(residual, eor, k_min=k_min, k_max=k_max)
-    signal, error = eor.power.real[used], difference_error(residual)[used]
+    signal, error = eor.power.real[used], residual.difference_error[used]
     weights = signal / error**2
     norm = np.sum(weights * signal)
     return Finding(float(np.sum(weights * residual.power.real[used]) / norm), float(norm**-0.5))
@@ -100,15 +90,46 @@ def ratio(above: Finding, below: Finding) -> Finding:
     return Finding(value, abs(value) * np.hypot(above.uncertainty / above.value, below.uncertainty / below.value))
 
 
-def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
-    """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error, without a gap.
+def difference_of_ratios(
+    first: tuple[SphericalSpectrum, SphericalSpectrum],
+    second: tuple[SphericalSpectrum, SphericalSpectrum],
+    k_min: float,
+    k_max: float = np.inf,
+) -> Finding:
+    """Return P^R / P^S of one run minus that of another: the mean of the differences of single bins.
 
-    That is the upper edge of the last such bin, counted from the lowest that has modes, or the lower edge of that one
-    if it is none; the uncertainty is half a bin.
+    Each bin has the same weight in both runs, the inverse variance of its difference, so that a difference between the
+    runs cannot come from how bins of unlike ratios are averaged.
+
+    Parameters
+    ----------
+    first, second
+        P^R and P^S of each run, in the same bins.
+    k_min, k_max
+        Bins that are used, h/Mpc.
+    """
+    used = used_bins(*first, *second, k_min=k_min, k_max=k_max)
+    ratios, variances = [], []
+    for residual, eor in (first, second):
+        signal = eor.power.real[used]
+        ratios.append(residual.power.real[used] / signal)
+        variances.append((residual.difference_error[used] / signal) ** 2)
+    weights = 1 / sum(variances)
+    return Finding(float(np.sum(weights * (ratios[0] - ratios[1])) / weights.sum()), float(weights.sum() ** -0.5))
+
+
+def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
+    """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error.
+
+    The bins up to that wavenumber are those for which the sum of (pull^2 - 1.96^2) is largest, where pull is
+    (P^S - P^R) / sigma, or zero if negative: the change point of least squares between biased and unbiased bins, at the
+    cost of a 95 % deviation for each biased bin. Neither a single bin of few modes below it nor a chance deviation far
+    above it changes the result. Without any bias it is the lower edge of the first bin. The uncertainty is half a bin.
     """
     used = np.flatnonzero(used_bins(residual, eor))
-    low = (eor.power.real - residual.power.real > SIGMAS_95 * difference_error(residual))[used]
-    count = low.size if low.all() else int(np.argmin(low))
+    pull = ((eor.power.real - residual.power.real) / residual.difference_error)[used]
+    gain = np.cumsum(np.maximum(pull, 0) ** 2 - SIGMAS_95**2)
     edges = residual.bin_edges
-    edge = edges[used[0]] if count == 0 else edges[used[count - 1] + 1]
+    last = int(np.argmax(gain))
+    edge = edges[used[last] + 1] if gain[last] > 0 else edges[used[0]]
     return Finding(float(edge), float(np.diff(edges)[0] / 2))

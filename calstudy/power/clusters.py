@@ -1,0 +1,222 @@
+r"""Errors of sums over baselines that have antennas in common.
+
+What a calibration does to a signal is done by its gains, and each gain acts on all baselines of its antenna. The
+scatter of baselines, taken as independent, therefore understates the error of a sum over them. Errors here come from
+leaving out antennas.
+
+Let d_s be the deviation that each sample s (a baseline, or a redundant group) adds to a sum of mean zero, d_a that of
+all pairs of baselines that contain antenna a, w_a the part of the modes that these pairs have, and f_{sa} their part of
+the pairs of sample s. Leaving out antenna a moves the sum by d_a / (1 - w_a). Where deviations are
+
+- due to the samples themselves, the variance of the sum is the sum of d_s^2 over the samples;
+- due to the N antennas, it is that of the jackknife, (N - 1) / N times the sum of (d_a / (1 - w_a))^2.
+
+The second counts the first as well, f_{sa}^2 of it for each antenna of a sample. This is subtracted, so that
+
+    var = n / (n - 1) sum_s d_s^2 + (N - 1) / N sum_a [d_a^2 - sum_s (f_{sa} d_s)^2] / (1 - w_a)^2
+
+for n samples. For samples of one baseline and many antennas this is the sum of d_s d_t over all baselines s and t with
+an antenna in common, the variance of dyadic data (Fafchamps & Gubert 2007, J. Dev. Econ. 83, 326). What the antennas
+add may come out negative by chance, and is then taken as zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from calstudy.power.spectra import DelaySpectra
+
+
+LARGEST_PART = 0.5
+"""Where an antenna has a larger part of the modes of a bin, little is left without it; this part is assumed."""
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """How the modes of delay spectra fall into bins, and within these into samples and antennas.
+
+    Attributes
+    ----------
+    n_bins
+        Number of bins.
+    mode, share_mode
+        Sum to which each mode (Nu, Nd) and each antenna's share of a unit (Nm, Nd) belongs; -1 for none.
+    owner
+        Bin of each sum over a sample, (Nsums,).
+    weight
+        Modes in each sum over a sample, each once per pair of baselines, (Nsums,).
+    share_sample, share_antenna
+        Sum over a sample, and antenna, of each sum over the share of an antenna in a sample, (Nshares,). Empty if the
+        antennas are not known.
+    share_weight
+        As `weight`, of the pairs that contain the antenna, (Nshares,).
+    """
+
+    n_bins: int
+    mode: np.ndarray
+    share_mode: np.ndarray
+    owner: np.ndarray
+    weight: np.ndarray
+    share_sample: np.ndarray
+    share_antenna: np.ndarray
+    share_weight: np.ndarray
+
+    @classmethod
+    def of(cls, spectra: DelaySpectra, bins: np.ndarray, samples: np.ndarray, n_bins: int) -> Clusters:
+        """Find the sums.
+
+        Parameters
+        ----------
+        spectra
+            Give the units and what their antennas share.
+        bins
+            Bin of each mode, (Nu, Nd) int; -1 for those left out.
+        samples
+            Number of the sample of each mode, (Nu, Nd) int. A sample has modes of one unit only.
+        n_bins
+            Number of bins.
+        """
+        mode, (owner, _) = _number(bins, samples)
+        unit = spectra.share_unit
+        antenna = np.broadcast_to(spectra.share_antenna[:, None], (unit.size, bins.shape[1]))
+        share_mode, (share_sample, share_antenna) = _number(mode[unit], antenna)
+        pairs, share_pairs = (
+            np.broadcast_to(count[:, None], bins[rows].shape)
+            for count, rows in ((spectra.n_pairs, slice(None)), (spectra.share_pairs, unit))
+        )
+        weight = _added(pairs, mode, owner.size)
+        share_weight = _added(share_pairs, share_mode, share_sample.size)
+        return cls(n_bins, mode, share_mode, owner, weight, share_sample, share_antenna, share_weight)
+
+    @classmethod
+    def of_baselines(cls, antennas: np.ndarray) -> Clusters:
+        """Return those of one number per baseline, all in one bin, from its antennas, (Nbls, 2)."""
+        baselines = np.arange(len(antennas))
+        return cls(
+            n_bins=1,
+            mode=baselines[:, None],
+            share_mode=np.arange(antennas.size)[:, None],
+            owner=np.zeros(baselines.size, int),
+            weight=np.ones(baselines.size),
+            share_sample=np.repeat(baselines, 2),
+            share_antenna=antennas.ravel(),
+            share_weight=np.ones(antennas.size),
+        )
+
+    @property
+    def n_samples(self) -> np.ndarray:
+        """Samples in each bin, (n_bins,) int."""
+        return np.bincount(self.owner, minlength=self.n_bins)
+
+    def sums(self, values: np.ndarray, shares: np.ndarray) -> Sums:
+        """Add up.
+
+        Parameters
+        ----------
+        values
+            What each mode adds, summed over the pairs of its unit, (Nu, Nd).
+        shares
+            The part of it by the pairs that contain an antenna, (Nm, Nd).
+        """
+        samples = _added(values, self.mode, self.owner.size)
+        return Sums(self, samples, _added(shares, self.share_mode, self.share_sample.size))
+
+    def powers(self, spectra: DelaySpectra) -> Sums:
+        """Add up the real parts of powers, each pair of baselines counting the same."""
+        return self.sums(spectra.n_pairs[:, None] * spectra.power.real, spectra.share_power.real)
+
+    @property
+    def counts(self) -> Sums:
+        """Numbers of modes, each once per pair of baselines."""
+        return Sums(self, self.weight, self.share_weight)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over the samples of each bin, and over the antennas' shares in them.
+
+    Attributes
+    ----------
+    clusters
+        What is added up.
+    samples, shares
+        (Nsums,) and (Nshares,).
+    """
+
+    clusters: Clusters
+    samples: np.ndarray
+    shares: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """Sum over the samples of each bin, (n_bins,); NaN for empty bins."""
+        total = np.bincount(self.clusters.owner, self.samples, self.clusters.n_bins)
+        return np.where(self.clusters.n_samples > 0, total, np.nan)
+
+    def __sub__(self, other: Sums) -> Sums:
+        """Return the sums of the difference."""
+        return Sums(self.clusters, self.samples - other.samples, self.shares - other.shares)
+
+    def ratio(self, reference: Sums) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ratio of the totals in each bin, and its standard deviation, (n_bins,) each.
+
+        To first order (Cochran 1977, section 6.3): the deviation of a sample is x - (sum x / sum y) y, over sum y.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value, total = self.total / reference.total, reference.total
+        return value, linear_error(((1 / total, self), (-value / total, reference)))
+
+
+def linear_error(terms: tuple[tuple[np.ndarray, Sums], ...]) -> np.ndarray:
+    """Return the standard deviation of a linear combination of totals whose deviations add up to zero in each bin.
+
+    Parameters
+    ----------
+    terms
+        Factors, (n_bins,), and the sums that they multiply.
+
+    Returns
+    -------
+    (n_bins,); NaN in bins of one sample, whose scatter is not known.
+    """
+    clusters = terms[0][1].clusters
+    share_owner = clusters.owner[clusters.share_sample]
+    with np.errstate(invalid="ignore"):
+        samples = sum(factor[clusters.owner] * sums.samples for factor, sums in terms)
+        shares = sum(factor[share_owner] * sums.shares for factor, sums in terms)
+    count = clusters.n_samples
+    scale = np.divide(count, count - 1, out=np.full(count.size, np.nan), where=count > 1)
+    variance = scale * np.bincount(clusters.owner, samples**2, count.size)
+    # The antennas in each bin.
+    owner, _, antenna = _combinations(share_owner, clusters.share_antenna)
+    part = np.bincount(antenna, clusters.share_weight) / np.bincount(clusters.owner, clusters.weight)[owner]
+    left = 1 - np.minimum(part, LARGEST_PART)
+    own = clusters.share_weight / clusters.weight[clusters.share_sample] * samples[clusters.share_sample]
+    moved = (np.bincount(antenna, shares) ** 2 - np.bincount(antenna, own**2)) / left**2
+    antennas = np.maximum(np.bincount(owner, minlength=count.size), 1)
+    by_antennas = (antennas - 1) / antennas * np.bincount(owner, moved, count.size)
+    return np.sqrt(variance + np.maximum(by_antennas, 0.0))
+
+
+def _number(groups: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return the number of each mode's combination of group and label, -1 without a group, and the combinations."""
+    number = np.full(groups.shape, -1)
+    used = groups >= 0
+    group, found, number[used] = _combinations(groups[used], label[used])
+    return number, (group, found)
+
+
+def _combinations(group: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the groups and labels of all combinations of the two, not negative, and the number of each entry's."""
+    count = int(label.max(initial=0)) + 1
+    found, index = np.unique(group * count + label, return_inverse=True)
+    return found // count, found % count, index
+
+
+def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
+    used = number >= 0
+    return np.bincount(number[used], np.reshape(values, number.shape)[used], size)
