@@ -51,7 +51,7 @@ class Calamity2022(Paper):
         "redundant": "redundant",
         "redundant_modelling": "redundant-modelling",
         "low_snr": "lowsnr",
-        "paper_solver": "paper-solver",
+        "paper_solver": "minredundant-adamax",
     }
 
     def statements(self) -> Sequence[Statement]:
