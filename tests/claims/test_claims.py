@@ -47,7 +47,8 @@ def test_names_are_unique_and_every_statement_says_what_and_why():
     names = [statement.name for statement in statements]
     assert len(set(names)) == len(names) >= 40
     assert all(item.sentence and item.quantity and item.why and item.section for item in statements)
-    assert {role for item in statements for role in item.roles} == set(PAPER.roles)
+    about = {role for item in statements for role in item.roles}
+    assert about | set(PAPER.own_solver_roles.values()) == set(PAPER.roles)
 
 
 def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(make_study):
@@ -205,8 +206,9 @@ def test_claims_at_low_snr_fail_where_they_are_false(make_study, truth, fail):
         (GROUPS, 0.9, ("redundant_modelling",)),
         (GROUPS, 0.02, ()),
         (ADAMAX, 0.02, ("minimally_redundant", "paper_solver")),
-        (ADAMAX, 0.9, ("redundant",)),
+        (ADAMAX, 0.9, ("redundant", "redundant_paper_solver")),
         (LOW_SNR_FACTS, 0.02, ("low_snr",)),
+        (LOW_SNR_FACTS | ADAMAX, 0.02, ("low_snr", "low_snr_paper_solver")),
     ],
 )
 def test_a_run_plays_the_role_that_it_was_made_for(make_study, facts, fraction, roles):
@@ -250,7 +252,7 @@ def changed(experiment: dict, changes: dict) -> dict:
         ),
     ],
 )
-@pytest.mark.parametrize("role", ["minimally_redundant", "redundant", "paper_solver"])
+@pytest.mark.parametrize("role", ["minimally_redundant", "redundant", "paper_solver", "redundant_paper_solver"])
 def test_what_is_not_the_papers_study_plays_no_role_of_it(tmp_path, changes, reason, role):
     data = changed({"name": "changed", "outputs": {"figures": []}}, changes)
     assert PAPER.refusal(role, validate(data, tmp_path)).startswith(reason)
@@ -269,6 +271,9 @@ def test_what_is_not_the_papers_study_plays_no_role_of_it(tmp_path, changes, rea
         ("redundant_modelling", {}, "calibration.calibrator is 'calamity', not 'calamity-redundant'"),
         ("redundant_modelling", {"calibration.calibrator": "sky-based"}, "calibration.calibrator is 'sky-based'"),
         ("paper_solver", {}, "calibration.solver is not the paper's"),
+        ("redundant_paper_solver", {}, "calibration.solver is not the paper's"),
+        ("low_snr_paper_solver", LOW_SNR_FACTS, "calibration.solver is not the paper's"),
+        ("low_snr_paper_solver", {}, "corruption.effects is per-channel-gains, not reflection-gains alone"),
         (
             "paper_solver",
             {"calibration.solver": {"name": "adamax", "learning_rate": 0.1}},
@@ -317,7 +322,8 @@ def test_a_run_without_a_role_has_no_claims_and_says_why_in_a_sentence(make_stud
     assert found.verdicts == []
     (sentence,) = found.without_role
     assert sentence.startswith("The run plays no role in calamity2022: calibration.calibrator is 'sky-based', not ")
-    assert sentence.count("'calamity' (minimally_redundant, redundant, low_snr, paper_solver)") == 1
+    others = "minimally_redundant, redundant, low_snr, paper_solver, redundant_paper_solver, low_snr_paper_solver"
+    assert sentence.count(f"'calamity' ({others})") == 1
 
 
 def test_a_run_is_held_to_the_statements_about_its_role_alone(make_study):
