@@ -1,6 +1,7 @@
 """Claims: PASS where the sentence is true by construction, FAIL where it is false, a reason where it cannot be told."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from calstudy.claims.folders import evaluate_folder
 from calstudy.experiment.files import dump, override, validate
 from calstudy.experiment.model import PAPERS
 from calstudy.papers.calamity2022.bins import bias_extent, difference_error, fraction_within, recovered
+from calstudy.power.tables import save_spectrum
 from calstudy.studies.load import load_study
 from calstudy.verdicts.tables import from_json
 
@@ -40,6 +42,7 @@ def roles_of(study) -> tuple[str, ...]:
 
 
 BIAS_CLAIM = "positive-bias-at-small-k"
+BIAS_CLAIMS = {BIAS_CLAIM, "bias-at-level-of-noise-below-0p2", "bias-at-level-of-noise-from-0p2-to-0p5"}
 
 
 def test_names_are_unique_and_every_statement_says_what_and_why():
@@ -115,8 +118,42 @@ def test_a_claim_fails_where_its_sentence_is_false_and_the_others_do_not(make_st
     assert failing(alone(make_study(without_eor_bias=0.03, **truth))) == fail
 
 
-def test_residuals_of_noise_alone_show_no_bias_and_the_claim_of_one_fails(make_study):
-    assert failing(alone(make_study())) == {BIAS_CLAIM}
+def test_residuals_of_noise_alone_show_no_bias_and_the_claims_of_one_fail(make_study):
+    assert failing(alone(make_study())) == BIAS_CLAIMS
+
+
+def test_a_bias_above_the_eor_is_neither_slight_nor_at_the_level_of_the_noise(make_study):
+    levels = BIAS_CLAIMS - {BIAS_CLAIM}
+    strong = alone(make_study("strong", without_eor_bias=3.0))
+    assert levels | {"bias-slight-below-0p2", "bias-slight-from-0p2-to-0p5"} <= failing(strong)
+    assert verdicts(strong)["no-bias-beyond-small-k"] == verdicts(strong)[BIAS_CLAIM] == "PASS"
+    # Ten times the noise, and half the EoR.
+    weaker = verdicts(alone(make_study("weaker", without_eor_bias=0.5, noise=0.05)))
+    assert {weaker[name] for name in levels} == {"FAIL"}
+    assert weaker["bias-slight-below-0p2"] == weaker["bias-slight-from-0p2-to-0p5"] == "PASS"
+
+
+def test_each_band_of_the_bias_is_measured_by_itself(make_study):
+    study = make_study()
+    path = study.folders[0] / "residual_without_eor.outside-wedge.h5"
+    clean, eor = (study.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
+    signal = np.nanmean(eor.power.real)
+    bands = {
+        "bias-slight-below-0p2": (0.0, 0.2),
+        "bias-slight-from-0p2-to-0p5": (0.2, 0.51),
+        "no-bias-beyond-small-k": (0.51, 9.0),
+    }
+    before = {claim.name: claim for claim in alone(study)}
+    for name, (low, high) in bands.items():
+        chosen = (clean.k > low) & (clean.k < high)
+        path.unlink()
+        save_spectrum(path, replace(clean, power=clean.power + 5 * signal * chosen))
+        after = {claim.name: claim for claim in alone(study)}
+        for other in bands:
+            expected = 5 / (0.03 if other.startswith("no-bias") else 1) if other == name else 0
+            assert after[other].measured - before[other].measured == pytest.approx(expected, abs=1e-5)
+        assert before[name].verdict == "PASS"
+        assert after[name].verdict == "FAIL"
 
 
 def test_the_papers_solver_is_held_to_its_own_claim(make_study):
