@@ -2,12 +2,19 @@
 
 import json
 
+import numpy as np
 import pytest
 from test_claims import ADAMAX, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_folder, verdicts
 
+from calstudy.base.errors import InputError
 from calstudy.claims.evaluation import evaluate_by_solver
 from calstudy.claims.folders import evaluate_folder
+from calstudy.claims.product import evaluate
+from calstudy.figures.solver_comparison import SolverComparison
+from calstudy.plotting.save import figure_arrays
+from calstudy.run.task import Job
 from calstudy.studies.load import load_study
+from calstudy.verdicts.tables import CLAIMS_FILES
 
 BIAS = "positive-bias-at-small-k"
 
@@ -76,6 +83,38 @@ def test_the_folder_of_a_collection_gets_the_table_and_a_single_run_does_not(stu
     alone = runs / "minimal-adamax-1"
     evaluate_folder(alone)
     assert not (alone / "claims-by-solver.json").exists()
+
+
+def as_collection(studies, output):
+    """The job of the claims of a collection with these members."""
+    output.mkdir()
+    experiments = {study.name: study.experiment for study in studies.values()}
+    settings = {"papers": [PAPER], "title": "both", "notes": [], "experiments": experiments}
+    roles = {role: study.name for role, study in studies.items()}
+    inputs = {
+        f"{kind}:{study.name}": study.folders[0] for study in studies.values() for kind in ("spectra", "agreement")
+    }
+    return Job(settings={**settings, "roles": roles}, inputs=inputs, output=output)
+
+
+def test_the_product_of_a_collection_has_the_table_if_both_solvers_are_in_it(studies, tmp_path):
+    evaluate(as_collection(studies, tmp_path / "both"))
+    assert {path.name for path in (tmp_path / "both").iterdir()} == set(CLAIMS_FILES)
+    default = {role: studies[role] for role in ("minimally_redundant", "redundant")}
+    evaluate(as_collection(default, tmp_path / "default"))
+    assert {path.name for path in (tmp_path / "default").iterdir()} == {"claims.json", "claims.md"}
+
+
+def test_the_figure_shows_the_tables_of_the_members(studies, tmp_path):
+    inputs = {f"spectra:{role}": study.folders[0] for role, study in studies.items()}
+    drawing = SolverComparison().draw(Job(settings={"notes": ["a small sky"]}, inputs=inputs, output=tmp_path))
+    shown = figure_arrays(drawing.shown)
+    for role, study in studies.items():
+        for name in ("residual", "residual_without_eor"):
+            np.testing.assert_array_equal(shown[f"{role}.{name}.power"], study.spherical(name, "outside-wedge").power)
+    (study.folders[0] / "residual_without_eor.outside-wedge.h5").unlink()
+    with pytest.raises(InputError, match=r"the member in the role \w+ has no variant residual_without_eor"):
+        SolverComparison().draw(Job(settings={"notes": []}, inputs=inputs, output=tmp_path))
 
 
 @pytest.mark.parametrize("scale", [None, "small"])
