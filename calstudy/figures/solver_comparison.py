@@ -62,9 +62,9 @@ def draw_solver_comparison(
         column[0].set_title(title)
         column[-1].set_xlabel(style.WAVENUMBER)
     shown = [column for solvers in arrays.values() for column in solvers]
-    first = min(column.eor.k[np.isfinite(column.eor.power.real)].min() for column in shown)
+    first = min(_first_k(column.eor) for column in shown)
     for row, name in zip(grid, ROWS, strict=True):
-        row[0].set(xscale="log", yscale="log", xlim=(0.85 * first, last_k), ylim=_limits(shown, name, last_k))
+        row[0].set(xscale="log", yscale="log", xlim=(0.9 * first, last_k), ylim=_limits(shown, name, last_k))
         row[0].set_ylabel(rf"{ROWS[name]} ({style.POWER_UNIT})")
         row[0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         row[0].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -79,6 +79,12 @@ def _draw_panel(axes: Axes, solvers: Sequence[SphericalColumn], name: str) -> No
     axes.plot(noise.k, SIGMAS_95 * noise.noise_error, ":", color=style.GREY, linewidth=0.9, zorder=1, label="noise")
     for place, (column, marking) in enumerate(zip(solvers, SOLVERS, strict=True)):
         draw_points(axes, getattr(column, name), marking, f"{name}, {marking.label}", 2 + place)
+
+
+def _first_k(spectrum: SphericalSpectrum) -> float:
+    """Return where the leftmost point is drawn."""
+    left = spectrum.k + min(marking.shift for marking in SOLVERS) * np.diff(spectrum.bin_edges)
+    return float(left[np.isfinite(spectrum.power.real)].min())
 
 
 def _limits(shown: Sequence[SphericalColumn], name: str, last_k: float) -> tuple[float, float]:
