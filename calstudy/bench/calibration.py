@@ -218,6 +218,8 @@ def _against_paper(problem: CalibrationProblem, cold: Solution, adamax_steps: in
     # The loss is looked at, for a GPU returns before it has finished.
     paper = mean_seconds(lambda: float(paper_step.step()), PAPER_STEPS, clock)
     rows.append(Row("Adamax step, paper-style graph", f"{1e3 * paper:.1f} ms", f"{paper / ours:.1f} x ours"))
+    eager = mean_seconds(lambda: float(paper_step.eager_step()), PAPER_STEPS, clock)
+    rows.append(Row("Adamax step, paper-style without a graph", f"{1e3 * eager:.1f} ms", f"{eager / ours:.1f} x ours"))
     if adamax_steps == 0:
         return rows
     steps = steps_to(problem, ABOVE_FLOOR * floor, adamax_steps)

@@ -29,7 +29,7 @@ def make_solver(settings: GainFit) -> Solver:
     if isinstance(solver, LbfgsSettings):
         return Lbfgs(solver.tolerance, solver.max_steps, solver.memory)
     optimizer = Optimizer(solver.name, solver.learning_rate, solver.schedule, solver.final_rate, solver.max_steps)
-    return FirstOrder(optimizer, solver.tolerance, solver.precision)
+    return FirstOrder(optimizer, solver.tolerance, solver.precision, solver.stop, solver.keep)
 
 
 class Solve(NamedTuple):

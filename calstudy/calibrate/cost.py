@@ -36,7 +36,7 @@ PAPER_SAMPLES = 630 * 384
 COLD_SECONDS, WARM_SECONDS = 1.5, 0.2
 # A step, and how many it takes to the minimum.
 LBFGS_STEP, LBFGS_STEPS = 0.06, 180
-FIRST_ORDER_STEP = 2.2e-3
+FIRST_ORDER_STEP = 4e-3
 
 
 @dataclass(frozen=True)

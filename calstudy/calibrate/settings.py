@@ -52,8 +52,18 @@ class FirstOrderSettings(Section):
     final_rate: float = Field(
         0.01, gt=0, le=1, description="Learning rate at the last step over that at the first, unless constant."
     )
-    tolerance: float = Field(1e-14, ge=0, description="Stop when the loss changes by less than this between checks.")
+    stop: Literal["best-loss", "published"] = Field(
+        "best-loss",
+        description="Stop when the best loss falls by less than `tolerance` over 50 steps; `published`, as the code of "
+        "the paper's authors: when the loss changes by less than `tolerance` from one step to the next.",
+    )
+    tolerance: float = Field(
+        1e-14, ge=0, description="In units of the mean square of the data; 0: always make max_steps steps."
+    )
     max_steps: int = Field(10_000, ge=1)
+    keep: Literal["best", "last"] = Field(
+        "best", description="Return the gains with the lowest loss, or those after the last step, as the authors do."
+    )
     precision: Literal["single", "double"] = "single"
     warm_start: bool = False
 

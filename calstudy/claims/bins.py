@@ -121,15 +121,16 @@ def difference_of_ratios(
 def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
     """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error.
 
-    The bins up to that wavenumber are those for which the sum of (pull^2 - 1.96^2) is largest, where pull is
-    (P^S - P^R) / sigma, or zero if negative: the change point of least squares between biased and unbiased bins, at the
-    cost of a 95 % deviation for each biased bin. Neither a single bin of few modes below it nor a chance deviation far
-    above it changes the result. Without any bias it is the lower edge of the first bin. The uncertainty is half a bin.
+    That is the upper edge of the first run of such bins, from small k up. Before it there may be bins in which P^R is
+    below P^S by less than their errors, because few modes are in them. If there is no such run before the first bin in
+    which P^R is not below P^S, it is the lower edge of the first bin. The uncertainty is half a bin.
     """
     used = np.flatnonzero(used_bins(residual, eor))
     pull = ((eor.power.real - residual.power.real) / residual.difference_error)[used]
-    gain = np.cumsum(np.maximum(pull, 0) ** 2 - SIGMAS_95**2)
+    biased = pull > SIGMAS_95
+    # Each search ends at the end of the bins at the latest.
+    start = int(np.argmax(np.append(biased | ~(pull > 0), True)))
+    end = start + int(np.argmax(np.append(~biased[start:], True)))
     edges = residual.bin_edges
-    last = int(np.argmax(gain))
-    edge = edges[used[last] + 1] if gain[last] > 0 else edges[used[0]]
+    edge = edges[used[end - 1] + 1] if end > start else edges[used[0]]
     return Finding(float(edge), float(np.diff(edges)[0] / 2))

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from calstudy.base.plugins import guarded
+from calstudy.calibrate.settings import GainFit
 from calstudy.claims.paper import Paper
 from calstudy.claims.results import RunResults
 from calstudy.claims.run_times import RUN_TIME, RunTimes
@@ -82,6 +83,42 @@ def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults]) ->
         By the role that they play; statements whose roles nobody plays come back as not evaluated, with the reason.
     """
     return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs))])
+
+
+def evaluate_by_solver(papers: Sequence[Paper], runs: Mapping[str, RunResults]) -> dict[str, list[Verdict]]:
+    """Evaluate every statement of papers on the runs with the paper's own solver, and on the same runs with another.
+
+    Parameters
+    ----------
+    papers
+        Whose statements; those in which no run plays both roles of a pair in `Paper.own_solver_roles` are left out.
+    runs
+        By the role that they play.
+
+    Returns
+    -------
+    dict
+        Verdicts by solver, on the same statements in the same order; empty without any.
+    """
+    own: list[Verdict] = []
+    other: list[Verdict] = []
+    names: dict[str, None] = {}
+    for paper in papers:
+        played = _accepted(paper, runs)
+        pairs = {role: role_of_own for role, role_of_own in paper.own_solver_roles.items() if role_of_own in played}
+        if not any(role in played for role in pairs):
+            continue
+        with_own = {name: played[pairs[role]] for role in pairs for name in (role, pairs[role])}
+        with_other = {role: played[role] for role in paper.own_solver_roles if role in played}
+        own += _evaluate(paper, with_own)
+        other += _evaluate(paper, with_other)
+        names |= dict.fromkeys(_solver(run) for run in with_other.values())
+    return {"the paper's solver": own, ", ".join(names): other} if own else {}
+
+
+def _solver(run: RunResults) -> str:
+    calibration = run.experiment.calibration
+    return calibration.solver.name if isinstance(calibration, GainFit) else calibration.label
 
 
 def _accepted(paper: Paper, runs: Mapping[str, RunResults]) -> dict[str, RunResults]:

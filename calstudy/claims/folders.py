@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from calstudy.base.errors import InputError
 from calstudy.claims.evaluation import (
-    Evaluation,
+    evaluate_by_solver,
     evaluate_members,
     evaluate_run,
     evaluate_run_times,
@@ -25,7 +25,7 @@ from calstudy.experiment.files import read_mapping, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import PAPERS
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.tables import write_claims
+from calstudy.verdicts.tables import write_claims, write_claims_by_solver
 
 MANIFEST, EXPERIMENT = "manifest.json", "experiment.yaml"
 
@@ -41,6 +41,8 @@ class EvaluatedRun:
 
 def evaluate_folder(folder: Path, papers: Sequence[str] = ()) -> EvaluatedRun:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
+
+    If members of a collection are the same but for the paper's own solver, also claims-by-solver.json and .md.
 
     Parameters
     ----------
@@ -58,30 +60,37 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = ()) -> EvaluatedRun:
     if "points" in manifest:
         raise InputError(f"{folder}: is the folder of a sweep; give that of one of its points, below {folder}/points")
     named = [_paper(name) for name in papers]
+    by_solver: Mapping[str, list[Verdict]] = {}
     if manifest.get("kind") == "runtime":
         study = read_mapping(folder / EXPERIMENT)
         times = RunTimes.of(manifest["name"], _tables(folder))
         found = evaluate_run_times(_named(named, study.get("papers", ()), folder), times)
     elif "members" in manifest:
-        found = _evaluate_collection(folder, manifest, named)
+        held_to, runs = _played(folder, manifest, named)
+        found, by_solver = evaluate_members(held_to, runs), evaluate_by_solver(held_to, runs)
     else:
         run = _results(folder)
         found = evaluate_run(_named(named, run.experiment.papers, folder), run)
     evaluated = EvaluatedRun(manifest["name"], found.verdicts, found.without_role)
     try:
         write_claims(found.verdicts, folder, evaluated.title, manifest["stand_ins"], found.without_role)
+        if by_solver:
+            write_claims_by_solver(by_solver, folder, evaluated.title, manifest["stand_ins"])
     except OSError as error:
         raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
     return evaluated
 
 
-def _evaluate_collection(folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]) -> Evaluation:
+def _played(
+    folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]
+) -> tuple[list[Paper], dict[str, RunResults]]:
+    """Return the papers of a collection, and its members by the role that they play."""
     members = {name: _results(folder.resolve().parent / place) for name, place in manifest["members"].items()}
     own = {paper.reference: paper for run in members.values() for paper in run.experiment.papers}
-    papers = _named(named, list(own.values()), folder)
+    chosen = _named(named, list(own.values()), folder)
     experiments = {name: run.experiment for name, run in members.items()}
-    roles = members_by_role(papers, experiments, manifest["roles"])
-    return evaluate_members(papers, {role: members[name] for role, name in roles.items()})
+    roles = members_by_role(chosen, experiments, manifest["roles"])
+    return chosen, {role: members[name] for role, name in roles.items()}
 
 
 def _paper(block: Any) -> Paper:

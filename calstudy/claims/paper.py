@@ -24,12 +24,16 @@ class Paper(Plugin):
         The roles that runs play in the paper's statements, and which run plays each, in words that follow "needs".
     usual_members
         Names of members of a collection that play a role unless its file says otherwise.
+    own_solver_roles
+        For a role, the role of the run that is the same but for its solver, which is the paper's own. If both are
+        played, every statement is evaluated with either solver.
     """
 
     registry: ClassVar = PAPERS
     citation: ClassVar[str] = ""
     roles: ClassVar[Mapping[str, str]] = {}
     usual_members: ClassVar[Mapping[str, str]] = {}
+    own_solver_roles: ClassVar[Mapping[str, str]] = {}
 
     kind: str
 

@@ -102,9 +102,10 @@ def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Tas
 
 
 def evaluate(job: Job) -> Mapping[str, Any]:
-    """Write claims.json and claims.md of one run, or of the members of a collection in the roles that they play."""
-    from calstudy.claims.evaluation import evaluate_members, evaluate_run
+    """Write the claims of one run, or of the members of a collection in the roles that they play."""
+    from calstudy.claims.evaluation import evaluate_by_solver, evaluate_members, evaluate_run
     from calstudy.claims.results import RunResults
+    from calstudy.verdicts.tables import write_claims_by_solver
 
     results = {
         name: RunResults(
@@ -113,11 +114,12 @@ def evaluate(job: Job) -> Mapping[str, Any]:
         for name, experiment in job.settings["experiments"].items()
     }
     papers = job.settings["papers"]
-    if "roles" in job.settings:
-        return _write(
-            job, evaluate_members(papers, {role: results[name] for role, name in job.settings["roles"].items()})
-        )
-    return _write(job, evaluate_run(papers, results[""]))
+    if "roles" not in job.settings:
+        return _write(job, evaluate_run(papers, results[""]))
+    runs = {role: results[name] for role, name in job.settings["roles"].items()}
+    if by_solver := evaluate_by_solver(papers, runs):
+        write_claims_by_solver(by_solver, job.output, job.settings["title"], job.settings["notes"])
+    return _write(job, evaluate_members(papers, runs))
 
 
 def evaluate_run_times(job: Job) -> Mapping[str, Any]:
@@ -137,7 +139,7 @@ def _write(job: Job, found: Evaluation) -> dict[str, Any]:
     return {"verdicts": tally(found.verdicts), "failed": failed, "without_role": list(found.without_role)}
 
 
-EVALUATE = Stage(name="claims", version=6, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
+EVALUATE = Stage(name="claims", version=7, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
 EVALUATE_RUN_TIMES = Stage(
     name="runtime-claims", version=3, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
 )

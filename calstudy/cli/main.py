@@ -120,7 +120,8 @@ def claims(
 ) -> None:
     """Compare a finished run with published statements: the measured number, its threshold, PASS or FAIL.
 
-    Writes claims.json and claims.md into the folder.
+    Writes claims.json and claims.md into the folder, and for a collection that has studies with the paper's own solver
+    and with another one claims-by-solver.json and claims-by-solver.md.
     """
     from calstudy.claims.folders import evaluate_folder
     from calstudy.verdicts.tables import show_verdicts

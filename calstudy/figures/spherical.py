@@ -141,19 +141,37 @@ def _check(column: SphericalColumn) -> None:
 
 
 def _draw_column(axes: Axes, column: SphericalColumn, names: Sequence[str]) -> None:
-    eor = column.eor
+    draw_band(axes, column.eor)
+    for name in names:
+        spectrum = getattr(column, name)
+        if spectrum is not None:
+            draw_points(axes, spectrum, MARKINGS[name], name, 2 + list(MARKINGS).index(name))
+
+
+def draw_band(axes: Axes, eor: SphericalSpectrum) -> None:
+    """Draw P^S with its sample variance, the grey band."""
     finite = np.isfinite(eor.power.real)
     power, half = eor.power.real[finite], SIGMAS_95 * eor.error[finite]
     axes.fill_between(eor.k[finite], power - half, power + half, color=style.BAND, linewidth=0, zorder=0, label="eor")
     axes.plot(eor.k[finite], power, color=style.GREY, linewidth=0.7, zorder=1)
-    for name in names:
-        spectrum = getattr(column, name)
-        if spectrum is not None:
-            _draw_series(axes, spectrum, name)
 
 
-def _draw_series(axes: Axes, spectrum: SphericalSpectrum, name: str) -> None:
-    marking = MARKINGS[name]
+def draw_points(axes: Axes, spectrum: SphericalSpectrum, marking: Marking, name: str, zorder: float) -> None:
+    """Draw |P| with 95 % bars, open where P is negative.
+
+    Parameters
+    ----------
+    axes
+        With a logarithmic scale of power.
+    spectrum
+        What is drawn.
+    marking
+        How.
+    name
+        What the artists are called.
+    zorder
+        Of the artists.
+    """
     power = spectrum.power.real
     k = _shifted(spectrum, marking.shift)
     for negative in (False, True):
@@ -168,7 +186,7 @@ def _draw_series(axes: Axes, spectrum: SphericalSpectrum, name: str) -> None:
             markerfacecolor="white" if negative else marking.colour,
             ecolor=(marking.colour, 0.55),
             elinewidth=0.7,
-            zorder=2 + list(MARKINGS).index(name),
+            zorder=zorder,
             label=f"{name}, {'negative' if negative else 'positive'}",
         )
 

@@ -18,7 +18,7 @@ from calstudy.base.errors import InputError
 from calstudy.experiment.files import read_mapping
 from calstudy.experiment.model import FIGURES
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json
+from calstudy.verdicts.tables import CLAIMS_FILES, CLAIMS_JSON, from_json
 from calstudy.verdicts.tolerances import Rules
 
 EXPERIMENT, MANIFEST = "experiment.yaml", "manifest.json"
@@ -134,12 +134,12 @@ def accept(run: Path, reference: Path) -> None:
         If the folder cannot be written.
     """
     sources = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
-    sources |= {name: run / name for name in (CLAIMS_JSON, CLAIMS_MARKDOWN, MANIFEST) if (run / name).is_file()}
+    sources |= {name: run / name for name in (*CLAIMS_FILES, MANIFEST) if (run / name).is_file()}
     description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
     try:
         reference.mkdir(parents=True, exist_ok=True)
         kept = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
-        for old in [*kept, reference / CLAIMS_JSON, reference / CLAIMS_MARKDOWN]:
+        for old in [*kept, *(reference / name for name in CLAIMS_FILES)]:
             if old.name not in sources:
                 old.unlink(missing_ok=True)
         for name, source in sources.items():

@@ -17,6 +17,7 @@ from calstudy.base.identity import digest_json
 from calstudy.run.provenance import git_commit, machine, package_versions
 from calstudy.run.store import Product
 from calstudy.run.task import Task
+from calstudy.verdicts.tables import CLAIMS_FILES
 
 MANIFEST, EXPERIMENT, LOG = "manifest.json", "experiment.yaml", "run.log"
 POINTS = "points"
@@ -42,8 +43,8 @@ def run_folder(runs: Path, name: str, content: Any) -> Path:
 
 def open_folder(folder: Path) -> None:
     """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
-    results = {"report.html", "figures", "tables", POINTS, "claims.json", "claims.md", "regression.json"}
-    known = results | {MANIFEST, EXPERIMENT, LOG}
+    results = {"report.html", "figures", "tables", POINTS, "regression.json"}
+    known = results | {MANIFEST, EXPERIMENT, LOG, *CLAIMS_FILES}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in folder.iterdir() if path.name not in known and path.name[0] != ".")

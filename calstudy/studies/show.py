@@ -16,7 +16,7 @@ from calstudy.run.store import Store
 from calstudy.run.task import Task
 from calstudy.studies.folder import MANIFEST
 from calstudy.studies.study import Budget, Run, Study
-from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
+from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
 
 
 def _by_stage(tasks: Sequence[Task]) -> dict[str, list[Task]]:
@@ -141,3 +141,5 @@ def _show_claims(folder: Path, console: Console) -> None:
     elif path.is_file():
         text = "claims: none, for the run plays no role in the papers that it names; for the reasons see"
         console.print(f"{text} {folder / CLAIMS_MARKDOWN}", markup=False)
+    if (folder / BY_SOLVER_MARKDOWN).is_file():
+        console.print(f"claims by solver: {folder / BY_SOLVER_MARKDOWN}", markup=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ COLOURS = {
 }
 """Of verdicts, and of comparisons with a reference, on the terminal."""
 CLAIMS_JSON, CLAIMS_MARKDOWN = "claims.json", "claims.md"
+BY_SOLVER_JSON, BY_SOLVER_MARKDOWN = "claims-by-solver.json", "claims-by-solver.md"
+CLAIMS_FILES = (CLAIMS_JSON, CLAIMS_MARKDOWN, BY_SOLVER_JSON, BY_SOLVER_MARKDOWN)
 SUFFIXES = (".csv", ".md")
 LARGE = 1e5
 """Numbers beyond this have an exponent."""
@@ -227,3 +229,56 @@ def write_claims(
     summary = None if verdicts else "No claims."
     text = to_markdown(verdicts, f"Claims of the paper: {title}", ("claim", "the paper"), summary, notes)
     (folder / CLAIMS_MARKDOWN).write_text("\n".join([text, *without_role]).rstrip() + "\n", encoding="utf-8")
+
+
+STATEMENT = ("name", "section", "sentence", "quantity", "threshold", "why")
+RESULT = ("measured", "uncertainty", "verdict", "runs", "reason")
+
+
+def write_claims_by_solver(
+    columns: Mapping[str, Sequence[Verdict]], folder: Path, title: str, notes: Sequence[str] = ()
+) -> None:
+    """Write the verdicts on the same statements with several solvers side by side.
+
+    A statement that could be evaluated with none of them is left out.
+
+    Parameters
+    ----------
+    columns
+        Verdicts by solver, on the same statements in the same order.
+    folder
+        Must exist; gets claims-by-solver.json and claims-by-solver.md.
+    title
+        Name of the study.
+    notes
+        What stands in for the paper's own ingredients.
+    """
+    rows = [row for row in zip(*columns.values(), strict=True) if any(item.measured is not None for item in row)]
+    found = []
+    for row in rows:
+        statement = {name: getattr(row[0], name) for name in STATEMENT}
+        results = (({name: getattr(item, name) for name in RESULT}) for item in row)
+        found.append({**statement, "solvers": dict(zip(columns, results, strict=True))})
+    text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
+    (folder / BY_SOLVER_JSON).write_text(text + "\n", encoding="utf-8")
+    lines = [f"# Claims of the paper, by solver: {title}", ""]
+    lines += [f"- {name}: {tally([row[place] for row in rows])}" for place, name in enumerate(columns)]
+    lines += ["", f"The verdict differs: {', '.join(_differing(rows)) or 'nowhere'}.", ""]
+    lines += [f"Stand-in: {note}." for note in notes] + ([""] if notes else [])
+    headings = ("claim", "the paper", "measured is", "must be", *(cell for name in columns for cell in (name, "")))
+    for section in dict.fromkeys(row[0].section for row in rows):
+        cells = [_cells_by_solver(row) for row in rows if row[0].section == section]
+        lines += ([f"## {section}", ""] if section else []) + [Table(headings, cells).markdown(numbers=False)]
+    (folder / BY_SOLVER_MARKDOWN).write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def _differing(rows: Iterable[Sequence[Verdict]]) -> list[str]:
+    """Return the names of the statements that were evaluated with every solver and do not have the same verdict."""
+    evaluated = (row for row in rows if all(item.measured is not None for item in row))
+    return [row[0].name for row in evaluated if len({item.verdict for item in row}) > 1]
+
+
+def _cells_by_solver(row: Sequence[Verdict]) -> tuple[str, ...]:
+    first = row[0]
+    found = (("-", item.verdict) if item.measured is None else (f"**{measured(item)}**", item.verdict) for item in row)
+    return first.name, first.sentence, first.quantity, first.threshold, *(cell for pair in found for cell in pair)

@@ -16,10 +16,11 @@ from calstudy.calibrate.solvers.interface import solve
 SMALL = Case(antennas=5, channels=96, extent=40.0)
 
 
-def test_the_papers_step_and_ours_descend_alike():
+@pytest.mark.parametrize("mode", ["step", "eager_step"])
+def test_the_papers_step_and_ours_descend_alike(mode):
     simulation = Simulation(SMALL)
     problem = simulation.problem(0, simulation.structure())
-    step = PaperStep(problem).step
+    step = getattr(PaperStep(problem), mode)
     paper = [float(step()) for _ in range(41)]
     ours = solve(problem, FirstOrder(Optimizer(max_steps=50), tolerance=0.0)).loss_history
     ours = ours[:41] / np.mean(np.abs(problem.visibilities) ** 2)
@@ -48,6 +49,8 @@ def test_the_table_has_every_ratio():
     assert rows["that over the default solver, to 0.2 %"].value.startswith("at least")
     assert rows["2 integrations"].note.endswith("converged")
     assert rows["default solver, cold"].value.endswith("CPU s")
+    for mode in ("graph", "without a graph"):
+        assert rows[f"Adamax step, paper-style {mode}"].note.endswith("x ours")
 
 
 def test_steps_run_in_the_context_of_a_gpu(monkeypatch):

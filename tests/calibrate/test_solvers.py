@@ -105,6 +105,37 @@ def test_best_parameters_are_kept(toy):
     assert np.sum(problem.weights * np.abs(residual) ** 2) == pytest.approx(solution.loss_history.min(), rel=1e-9)
 
 
+def test_the_published_rule_stops_at_the_first_two_equal_losses(toy):
+    # The rate falls until a step changes the loss by less than single precision resolves.
+    problem, optimizer = toy.problem(), Optimizer("adamax", 0.01, "exponential", 1e-6, 1000)
+    fixed = solve(problem, FirstOrder(optimizer, tolerance=0.0))
+    published = solve(problem, FirstOrder(optimizer, stop="published", keep="last"))
+    # The loss before the first step does not count; one more step is made from the second of the equal losses.
+    equal = 1 + np.flatnonzero(np.diff(fixed.loss_history[1:]) == 0)
+    assert equal.size > 0
+    assert published.n_steps == equal[0] + 2
+    np.testing.assert_array_equal(published.loss_history, fixed.loss_history[: published.n_steps + 1])
+    # Single precision happens to round two losses to the same value, far from the minimum.
+    assert published.status == "stalled"
+    assert "two consecutive losses" in published.message
+
+
+def test_a_fixed_number_of_steps_is_neither_converged_nor_called_too_few(toy):
+    solution = solve(toy.problem(), FirstOrder(Optimizer(max_steps=120), tolerance=0.0))
+    assert (solution.status, solution.n_steps) == ("max-steps", 120)
+    assert "fixed number" in solution.message
+    assert solution.usable
+
+
+def test_the_last_parameters_are_returned_where_asked_for(toy):
+    problem = toy.problem(prior="none")
+    optimizer = Optimizer(learning_rate=0.3, max_steps=6)
+    solution = solve(problem, FirstOrder(optimizer, precision="double", keep="last"))
+    assert solution.loss_history.min() < solution.loss_history[-1]
+    residual = problem.visibilities - gain_products(solution.gains, toy.antennas) * solution.model
+    assert np.sum(problem.weights * np.abs(residual) ** 2) == pytest.approx(solution.loss_history[-1], rel=1e-9)
+
+
 def test_warm_start_needs_fewer_steps_for_the_same_minimum(toy):
     problem, solver = toy.problem(), GaussNewton()
     _, warm = solve_warm(problem, solver)

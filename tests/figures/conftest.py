@@ -16,6 +16,7 @@ from calstudy.figures.layout import LayoutPanel, draw_layouts
 from calstudy.figures.model import draw_model
 from calstudy.figures.reflections import draw_reflections
 from calstudy.figures.runtime import draw_runtime
+from calstudy.figures.solver_comparison import draw_solver_comparison
 from calstudy.figures.spherical import SphericalColumn, draw_spherical
 from calstudy.figures.spherical_comparison import draw_spherical_comparison
 from calstudy.figures.wedge import WedgePanels, draw_wedge
@@ -149,6 +150,9 @@ def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra)
             "spherical": lambda: draw_spherical([make_column(1), excised], **note),
             "spherical one column": lambda: draw_spherical([excised], **note),
             "spherical comparison": lambda: draw_spherical_comparison(excised, make_column(3, empty=1), **note),
+            "solver comparison": lambda: draw_solver_comparison(
+                {"one": (make_column(4), excised), "two": (excised, make_column(3, empty=1))}, **note
+            ),
             "gains": lambda: draw_gains(compare_gains((0, 1), FREQUENCY, *gains), **note),
             "model": lambda: draw_model(visibility_comparison, **note),
             "data": lambda: draw_data(visibility_comparison, **note),

@@ -16,6 +16,8 @@ from calstudy.base.errors import InputError
 from calstudy.verdicts.criterion import AtLeast, AtMost, Criterion, Equal, Finding, Within
 from calstudy.verdicts.statement import Source, Unevaluated
 from calstudy.verdicts.tables import (
+    BY_SOLVER_JSON,
+    BY_SOLVER_MARKDOWN,
     CLAIMS_JSON,
     CLAIMS_MARKDOWN,
     Table,
@@ -28,6 +30,7 @@ from calstudy.verdicts.tables import (
     to_json,
     to_markdown,
     write_claims,
+    write_claims_by_solver,
 )
 
 SECTION = Source("Results", ("ours", "theirs"))
@@ -116,6 +119,30 @@ def test_json_reads_back_and_markdown_and_terminal_have_everything(tmp_path: Pat
     write_claims(verdicts, tmp_path, "run")
     assert from_json((tmp_path / CLAIMS_JSON).read_text()) == verdicts
     assert (tmp_path / CLAIMS_MARKDOWN).read_text().startswith("# Claims of the paper: run\n")
+
+
+def test_verdicts_with_several_solvers_are_side_by_side(tmp_path):
+    columns = {
+        "paper's": [evaluate(1.0, 4.0), evaluate(1.0, 0.0), evaluate(1.0, 0.0)],
+        "ours": [evaluate(1.0, 1.0), evaluate(1.0, 1.0), evaluate(1.0, 0.0)],
+    }
+    write_claims_by_solver(columns, tmp_path, "both", ["a small sky"])
+    # What neither could be evaluated on is left out.
+    first, second = json.loads((tmp_path / BY_SOLVER_JSON).read_text())
+    assert (first["name"], first["threshold"], first["quantity"]) == ("ratio-near-one", "from 0.5 to 2", "ratio")
+    assert {name: (item["measured"], item["verdict"]) for name, item in first["solvers"].items()} == {
+        "paper's": (0.25, "FAIL"),
+        "ours": (1.0, "PASS"),
+    }
+    assert second["solvers"]["paper's"]["reason"] == "theirs is zero"
+    lines = (tmp_path / BY_SOLVER_MARKDOWN).read_text().splitlines()
+    assert "- paper's: 0 PASS, 1 FAIL, 1 not evaluated" in lines
+    assert "The verdict differs: ratio-near-one." in lines
+    assert "Stand-in: a small sky." in lines
+    headings, _, row, other = (line.replace("\\|", "").split(" | ") for line in lines if line.startswith("| "))
+    assert headings[2:] == ["measured is", "must be", "paper's", "", "ours", " |"]
+    assert row[3:] == ["from 0.5 to 2", "**0.25 ± 0.1**", "FAIL", "**1.00 ± 0.1**", "PASS |"]
+    assert other[4:6] == ["-", "not evaluated"]
 
 
 def test_published_verdicts_can_be_read():

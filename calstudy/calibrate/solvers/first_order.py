@@ -27,6 +27,7 @@ from calstudy.calibrate.tensors import FitTensors
 Method = Literal["adamax", "adam", "sgd"]
 Schedule = Literal["constant", "cosine", "exponential"]
 Precision = Literal["single", "double"]
+Stop = Literal["best-loss", "published"]
 
 # Decay of the first and second moment and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-7
@@ -267,22 +268,30 @@ class FirstOrderState:
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """Adamax, Adam or gradient descent, keeping the best parameters seen.
+    """Adamax, Adam or gradient descent.
 
     Parameters
     ----------
     optimizer
         The method, its learning rate and how many steps it takes at most.
     tolerance
-        Converged when the best loss, in units of the data's mean square, falls by less than this over
-        `STEPS_PER_CALL` steps.
+        In units of the data's mean square. Nothing is below zero: the number of steps is then fixed.
     precision
         Float32 or float64 throughout.
+    stop
+        ``best-loss``: when the best loss falls by less than the tolerance over `STEPS_PER_CALL` steps. ``published``:
+        the rule of the paper's authors, one step after a loss that differs from the loss before it by less than the
+        tolerance. In single precision with a tolerance of 1e-14 that is when two consecutive losses are equal, which
+        happens by chance once the loss falls slowly.
+    keep
+        The ``best`` parameters seen, or the ``last``, as the authors do.
     """
 
     optimizer: Optimizer = Optimizer()
     tolerance: float = 1e-14
     precision: Precision = "single"
+    stop: Stop = "best-loss"
+    keep: Literal["best", "last"] = "best"
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> FirstOrderState:
         """Start from the foregrounds that fit best, in weighted least squares, with the first gains."""
@@ -298,6 +307,13 @@ class FirstOrder:
         """Take up to `STEPS_PER_CALL` steps."""
         done = len(state.history) - 1
         n_steps = min(STEPS_PER_CALL, self.optimizer.max_steps - done)
+        after = self._steps(state, n_steps)
+        if self.stop == "published" and (last := self._last_step(after.history, done)) is not None:
+            return self._steps(state, last - done) if last - done < n_steps else after
+        return after
+
+    def _steps(self, state: FirstOrderState, n_steps: int) -> FirstOrderState:
+        done = len(state.history) - 1
         descent, losses, final = state.kernels.descend(
             tf.constant(n_steps), tf.constant(done), state.descent, state.data
         )
@@ -306,18 +322,34 @@ class FirstOrder:
         history = (*state.history, *losses.numpy()[1:n_steps].astype(float), float(final))
         return replace(state, descent=descent, history=history)
 
+    def _last_step(self, history: Sequence[float], done: int) -> int | None:
+        """Return the number of the step after `done` at which the published rule stops, or None if it does not.
+
+        The authors compare the losses before two consecutive steps, and take the second of these. They do not record
+        the loss at the start.
+        """
+        for step in range(max(done + 1, 3), len(history)):
+            if abs(history[step - 1] - history[step - 2]) < self.tolerance:
+                return step
+        return None
+
     def terminate(self, state: FirstOrderState) -> Verdict | None:
-        """Judge by the change of the best loss over the last call."""
+        """Judge by the change of the loss, by the rule asked for."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
             return Verdict("failed", f"the loss is not finite after {n_steps} steps; lower the learning rate")
-        if n_steps >= STEPS_PER_CALL:
+        if self.stop == "published":
+            if self._last_step(state.history, n_steps - 1) is not None:
+                return Verdict("converged", f"two consecutive losses differ by less than {self.tolerance:g}")
+        elif n_steps >= STEPS_PER_CALL:
             before = min(state.history[:-STEPS_PER_CALL])
             if abs(before - float(state.descent.best_loss)) < self.tolerance:
                 return Verdict(
                     "converged", f"the best loss fell by less than {self.tolerance:g} over {STEPS_PER_CALL} steps"
                 )
         if n_steps >= self.optimizer.max_steps:
+            if self.tolerance == 0:
+                return Verdict("max-steps", f"stopped after {n_steps} steps, a fixed number (tolerance: 0)")
             return Verdict("max-steps", f"not converged after {n_steps} steps")
         return None
 
@@ -326,8 +358,9 @@ class FirstOrder:
         return [loss * state.scale**2 for loss in state.history]
 
     def estimate(self, state: FirstOrderState) -> Estimate:
-        """Return the best gains and foregrounds seen."""
-        return state.kernels.estimate(state.descent.best, state.data, state.scale)
+        """Return the best gains and foregrounds seen, or the last."""
+        chosen = state.descent.best if self.keep == "best" else state.descent.parameters
+        return state.kernels.estimate(chosen, state.data, state.scale)
 
     def newton_decrement(self, state: FirstOrderState, problem: CalibrationProblem) -> float:
         """Return the relative Newton decrement at the estimate."""

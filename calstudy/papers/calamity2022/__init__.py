@@ -44,6 +44,8 @@ class Calamity2022(Paper):
         "redundant_modelling": "a run of the redundant array with one model per group (calibrator: calamity-redundant)",
         "low_snr": "a run with reflection gains alone",
         "paper_solver": "a run of the minimally redundant array with the paper's solver (solver: adamax)",
+        "redundant_paper_solver": "a run of the redundant array with the paper's solver",
+        "low_snr_paper_solver": "a run with reflection gains alone and the paper's solver",
         "run_time": "a run of experiments/runtime.yaml",
     }
     usual_members: ClassVar[Mapping[str, str]] = {
@@ -51,15 +53,22 @@ class Calamity2022(Paper):
         "redundant": "redundant",
         "redundant_modelling": "redundant-modelling",
         "low_snr": "lowsnr",
-        "paper_solver": "paper-solver",
+        "paper_solver": "minredundant-adamax",
+        "redundant_paper_solver": "redundant-adamax",
+        "low_snr_paper_solver": "lowsnr-adamax",
+    }
+    own_solver_roles: ClassVar[Mapping[str, str]] = {
+        "minimally_redundant": "paper_solver",
+        "redundant": "redundant_paper_solver",
+        "low_snr": "low_snr_paper_solver",
     }
 
     def statements(self) -> Sequence[Statement]:
         """Return the statements, in the order of the paper's sections."""
-        from calstudy.papers.calamity2022 import calibration, computation, low_snr, redundant, window
+        from calstudy.papers.calamity2022 import calibration, computation, low_snr, positive_bias, redundant, window
         from calstudy.verdicts.statement import Statement
 
-        modules = (calibration, window, redundant, low_snr, computation)
+        modules = (calibration, window, positive_bias, redundant, low_snr, computation)
         return [item for module in modules for item in vars(module).values() if isinstance(item, Statement)]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
@@ -71,18 +80,19 @@ class Calamity2022(Paper):
         if role == "run_time":
             return "an experiment measures no run times"
         checks = (_other_calibrator, _other_gains, _other_noise, _other_data, _too_few_steps)
-        found = next((refusal for check in checks if (refusal := check(role, experiment)) is not None), None)
-        return _other_solver(experiment) if found is None and role == "paper_solver" else found
+        study = _study(role)
+        found = next((refusal for check in checks if (refusal := check(study, experiment)) is not None), None)
+        return _other_solver(experiment) if found is None and role != study else found
 
     def refusal_of_run(self, role: str, results: RunResults) -> str | None:
         """Return which setting of a run, or which property of its array, is not that of the role, or None."""
-        refusal = self.refusal(role, results.experiment)
-        if refusal is not None or role == "low_snr":
+        refusal, study = self.refusal(role, results.experiment), _study(role)
+        if refusal is not None or study == "low_snr":
             return refusal
         fraction = results.redundant_fraction
         if fraction is None:
             return "the run has no calibrated variant 'residual' of foregrounds and noise, or no variant 'noise'"
-        wanted = role in ("redundant", "redundant_modelling")
+        wanted = study in ("redundant", "redundant_modelling")
         if (fraction >= REDUNDANT_FROM) == wanted:
             return None
         verdict = "few" if wanted else "many"
@@ -91,6 +101,11 @@ class Calamity2022(Paper):
     def substitutions(self, experiment: Experiment) -> tuple[str, ...]:
         """Return one short sentence for each ingredient that an experiment uses in place of the paper's own."""
         return substitutions(experiment)
+
+
+def _study(role: str) -> str:
+    """Return the role of the same study with any solver."""
+    return {own: of_any for of_any, own in Calamity2022.own_solver_roles.items()}.get(role, role)
 
 
 def _changed(section: BaseModel, path: str, free: tuple[str, ...] = ()) -> str | None:

@@ -1,0 +1,136 @@
+"""Spherical power spectra of the residual with the paper's solver and at the minimum of the same likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, StrMethodFormatter
+
+from calstudy.base.errors import InputError
+from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures.spherical import SIGMAS_95, Marking, SphericalColumn, draw_band, draw_points, read_column
+from calstudy.plotting import style
+from calstudy.run.task import Job
+from calstudy.verdicts.tolerances import SPHERICAL_RULES
+
+if TYPE_CHECKING:
+    from calstudy.power.spectra import SphericalSpectrum
+
+ROWS = {"residual": r"$|P^{R}|$", "residual_without_eor": r"$|P^{R}|$, no EoR"}
+SOLVERS = (
+    Marking("the paper's solver", "D", style.BLUE, 2.5, -0.12),
+    Marking("the minimum", "s", style.ORANGE, 2.6, 0.12),
+)
+ARRAYS = {
+    "Minimally redundant": ("paper_solver", "minimally_redundant"),
+    "Redundant": ("redundant_paper_solver", "redundant"),
+}
+"""The roles of the members with either solver, in the order of `SOLVERS`."""
+
+
+@style.journal_style()
+def draw_solver_comparison(
+    arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]], last_k: float = 1.0, stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw P^R, and below it P^R without EoR, of two solvers: a column for each array.
+
+    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ; the dotted line
+    is 1.96 σ of the thermal noise.
+
+    Parameters
+    ----------
+    arrays
+        By the title of the array its spectra with the paper's solver, and at the minimum; power in mK² h⁻³ Mpc³, k in
+        h/Mpc.
+    last_k
+        Upper end of the k axis, h/Mpc.
+    stand_ins
+        See `calstudy.plotting.style.note_stand_ins`.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 5.6)
+    figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
+    grid = figure.subplots(2, len(arrays), sharex=True, sharey="row", squeeze=False)
+    for column, (title, solvers) in zip(grid.T, arrays.items(), strict=True):
+        for axes, name in zip(column, ROWS, strict=True):
+            _draw_panel(axes, solvers, name)
+        column[0].set_title(title)
+        column[-1].set_xlabel(style.WAVENUMBER)
+    shown = [column for solvers in arrays.values() for column in solvers]
+    first = min(_first_k(column.eor) for column in shown)
+    for row, name in zip(grid, ROWS, strict=True):
+        row[0].set(xscale="log", yscale="log", xlim=(0.9 * first, last_k), ylim=_limits(shown, name, last_k))
+        row[0].set_ylabel(rf"{ROWS[name]} ({style.POWER_UNIT})")
+        row[0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        row[0].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    _add_legend(figure)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_panel(axes: Axes, solvers: Sequence[SphericalColumn], name: str) -> None:
+    draw_band(axes, solvers[0].eor)
+    noise: SphericalSpectrum = getattr(solvers[0], name)
+    axes.plot(noise.k, SIGMAS_95 * noise.noise_error, ":", color=style.GREY, linewidth=0.9, zorder=1, label="noise")
+    for place, (column, marking) in enumerate(zip(solvers, SOLVERS, strict=True)):
+        draw_points(axes, getattr(column, name), marking, f"{name}, {marking.label}", 2 + place)
+
+
+def _first_k(spectrum: SphericalSpectrum) -> float:
+    """Return where the leftmost point is drawn."""
+    left = spectrum.k + min(marking.shift for marking in SOLVERS) * np.diff(spectrum.bin_edges)
+    return float(left[np.isfinite(spectrum.power.real)].min())
+
+
+def _limits(shown: Sequence[SphericalColumn], name: str, last_k: float) -> tuple[float, float]:
+    """Return limits from below the noise to above EoR and residuals."""
+    used = [getattr(column, name) for column in shown]
+    low = min(np.nanmedian(SIGMAS_95 * spectrum.noise_error) for spectrum in used)
+    tops = [np.abs(spectrum.power.real) + SIGMAS_95 * spectrum.error for spectrum in used]
+    highest = max(float(np.nanmax(top[spectrum.k <= last_k])) for top, spectrum in zip(tops, used, strict=True))
+    bands = [column.eor.power.real + SIGMAS_95 * column.eor.error for column in shown]
+    return 0.1 * float(low), 2 * max(highest, *(float(np.nanmax(band)) for band in bands))
+
+
+def _add_legend(figure: Figure) -> None:
+    handles: list[Any] = []
+    for marking in SOLVERS:
+        shape: dict[str, Any] = {"marker": marking.marker, "color": marking.colour, "markersize": marking.size + 0.8}
+        handles.append(Line2D([], [], linestyle="none", **shape))
+    handles.append((Patch(color=style.BAND), Line2D([], [], color=style.GREY, linewidth=0.7)))
+    handles.append(Line2D([], [], linestyle=":", color=style.GREY, linewidth=0.9))
+    open_marker: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
+    handles.append(Line2D([], [], linestyle="none", **open_marker))
+    labels = [*(marking.label for marking in SOLVERS), r"$P^{S}$, 95% sample variance"]
+    labels += [r"thermal noise, 95%", r"open: $P < 0$"]
+    figure.legend(handles, labels, loc="outside upper center", ncols=5, columnspacing=1.0, handletextpad=0.3)
+
+
+class SolverComparison(ComparisonFigure):
+    """P^R outside the wedge with the paper's solver and at the minimum, with EoR and without, of both arrays.
+
+    The members in the roles `paper_solver` and `redundant_paper_solver` have the paper's solver, those in the roles
+    `minimally_redundant` and `redundant` the default one.
+    """
+
+    caption = "Residual power outside the wedge with the paper's solver and at the minimum: with EoR, and without."
+    titles: ClassVar[Mapping[str, str]] = {role: title for title, roles in ARRAYS.items() for role in roles}
+    tolerances = SPHERICAL_RULES
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a column for each array."""
+        columns = {role: self._read(job, role) for role in self.titles}
+        arrays = {title: (columns[own], columns[minimum]) for title, (own, minimum) in ARRAYS.items()}
+        return Drawing(draw_solver_comparison(arrays, stand_ins=job.settings["notes"]), columns)
+
+    def _read(self, job: Job, role: str) -> SphericalColumn:
+        found = read_column(job.inputs[f"spectra:{role}"], self.titles[role], "outside-wedge")
+        missing = [name for name in ROWS if getattr(found, name) is None]
+        if missing:
+            raise InputError(f"figure {self.label!r}: the member in the role {role} has no variant {missing[0]}")
+        return SphericalColumn(found.title, found.eor, **{name: getattr(found, name) for name in ROWS})

@@ -1,0 +1,75 @@
+"""Claims on the positive bias of the residual without EoR: at which k, and how large (paper §Simulation Results)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calstudy.claims.bins import used_bins
+from calstudy.claims.results import RunResults
+from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS
+from calstudy.papers.calamity2022.window import K_AGREEMENT, K_SMALL, POSITIVE
+from calstudy.verdicts.criterion import AtMost, Equal, Finding, Within
+
+SLIGHT = "a slight bias is lower than the EoR"
+
+
+def _above(k: float) -> float:
+    """Return the lowest wavenumber above this one: a bin belongs to one band only."""
+    return float(np.nextafter(k, np.inf))
+
+
+def _over_noise(run: RunResults, k_min: float, k_max: float) -> Finding:
+    """Return the mean over bins of P^R without EoR in units of its noise error."""
+    residual = run.spherical("residual_without_eor", "outside-wedge")
+    used = used_bins(residual, k_min=k_min, k_max=k_max)
+    pulls = residual.power.real[used] / residual.noise_error[used]
+    return Finding(float(np.mean(pulls)), float(used.sum() ** -0.5))
+
+
+def _over_eor(run: RunResults, k_min: float, k_max: float) -> Finding:
+    """Return the mean over bins of P^R without EoR over that of P^S."""
+    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
+    used = used_bins(residual, signal, k_min=k_min, k_max=k_max)
+    level = np.mean(signal.power.real[used])
+    error = np.sqrt(np.sum(residual.noise_error[used] ** 2)) / used.sum()
+    return Finding(float(np.mean(residual.power.real[used]) / level), float(error / level))
+
+
+@RESULTS.states(
+    POSITIVE,
+    "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k <= 0.2",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+)
+def bias_at_level_of_noise_below_0p2(run: RunResults) -> Finding:
+    return _over_noise(run, 0.0, K_AGREEMENT)
+
+
+@RESULTS.states(
+    POSITIVE,
+    "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k from 0.2 to 0.5",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+)
+def bias_at_level_of_noise_from_0p2_to_0p5(run: RunResults) -> Finding:
+    return _over_noise(run, _above(K_AGREEMENT), K_SMALL)
+
+
+@RESULTS.states(POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k <= 0.2", AtMost(1), SLIGHT)
+def bias_slight_below_0p2(run: RunResults) -> Finding:
+    return _over_eor(run, 0.0, K_AGREEMENT)
+
+
+@RESULTS.states(POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k from 0.2 to 0.5", AtMost(1), SLIGHT)
+def bias_slight_from_0p2_to_0p5(run: RunResults) -> Finding:
+    return _over_eor(run, _above(K_AGREEMENT), K_SMALL)
+
+
+@RESULTS.states(
+    POSITIVE,
+    "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k > 0.5",
+    Equal(0),
+    "a bias at small k is not at larger k",
+)
+def no_bias_beyond_small_k(run: RunResults) -> Finding:
+    return _over_noise(run, _above(K_SMALL), np.inf)
