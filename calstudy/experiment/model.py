@@ -142,13 +142,15 @@ def _as_list(blocks: Any) -> Any:
 class RealizationBlock(Section):
     """Realizations of an experiment, which differ in the seeds of what is drawn; the first is the experiment itself."""
 
-    draw: Annotated[tuple[Literal["eor", "gains", "noise"], ...], Field(strict=False, min_length=1)] = Field(
+    draw: Annotated[tuple[Literal["eor", "gains", "noise"], ...], Field(strict=False)] = Field(
         ("eor", "gains", "noise"), description="What is drawn again in every realization; the rest is common to all."
     )
     count: int = Field(10, ge=2, le=1000, description="Number of realizations, with the experiment itself.")
 
     @model_validator(mode="after")
     def _draws_are_unique(self) -> RealizationBlock:
+        if not self.draw:
+            raise fault("draw", "names nothing: all realizations would be the same")
         if len(set(self.draw)) != len(self.draw):
             raise fault("draw", f"names something twice: {', '.join(self.draw)}")
         return self

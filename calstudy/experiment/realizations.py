@@ -121,7 +121,7 @@ def _faults(experiment: Experiment) -> list[str]:
 
 def _coinciding_seeds(experiment: Experiment) -> list[str]:
     """Return a sentence if gains or noise of two realizations would have the same random numbers."""
-    counts = {part: block.count for block in experiment.realizations for part in block.draw}
+    counts: dict[str, int] = {part: block.count for block in experiment.realizations for part in block.draw}
     noise = experiment.corruption.noise
     bases: list[tuple[str, int]] = [
         ("gains", seed) for effect in experiment.corruption.effects if (seed := _gain_seed(effect)) is not None

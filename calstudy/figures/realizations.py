@@ -17,6 +17,7 @@ from calstudy.plotting import style
 from calstudy.products import realizations
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Arrays, Drawn, Fixed, Measured
 
 if TYPE_CHECKING:
     from calstudy.products.realization_results import RegionResults
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"
 CORRELATION_COLOURS = "RdBu_r"
 COVERED = 0.95
+CORRECTED_PULL = r"mean of $(P^R/T - P^S)/\sigma$"
 SERIES = {"eor": ("o", style.BLUE, r"$P^S$"), "input": ("s", style.ORANGE, "input")}
 
 
@@ -109,7 +111,7 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
         axes.plot(pooled.k, pulls.mean(axis=0), "x", color=style.GREEN, label=r"$(P^R/T - P^S)/\sigma$, mean", zorder=3)
     axes.axhspan(-1, 1, color=style.BAND, alpha=0.5, linewidth=0, zorder=0)
     axes.set_ylabel("pull, outside the wedge")
-    axes.legend(loc="lower right")
+    _legend_above(axes, 3)
 
 
 def _draw_coverage(axes: Axes, results: RegionResults) -> None:
@@ -118,9 +120,7 @@ def _draw_coverage(axes: Axes, results: RegionResults) -> None:
     for shift, (kind, (marker, colour, label)) in zip((-0.15, 0.15), SERIES.items(), strict=True):
         k = pooled.k + shift * np.diff(pooled.bin_edges)
         for prefix, filled, name in (("", "none", "P^R"), ("corrected_", colour, "P^R/T")):
-            inside = results.covered.get(prefix + kind)
-            if inside is None:
-                continue
+            inside = results.covered.get(prefix + kind, np.full((1, pooled.k.size), np.nan))
             known = np.isfinite(inside).all(axis=0)
             axes.plot(
                 k[known], inside[:, known].mean(axis=0), marker, color=colour, markerfacecolor=filled,
@@ -128,7 +128,17 @@ def _draw_coverage(axes: Axes, results: RegionResults) -> None:
             )  # fmt: skip
     axes.axhline(COVERED, color=style.GREY, linewidth=0.7, zorder=0)
     axes.set(ylim=(-0.04, 1.04), ylabel="part of 95 % bars that cover")
-    axes.legend(loc="lower right", ncols=2)
+    _legend_above(axes, 4)
+
+
+def _legend_above(axes: Axes, columns: int) -> None:
+    """Add the legend of a panel that is full of points."""
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, columnspacing=1.0, handletextpad=0.3)
+
+
+def _quoted(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the quoted errors of the values of a quantity."""
+    return arrays[name.replace(".values.", ".quoted.")]
 
 
 class Realizations(StudyFigure):
@@ -140,6 +150,11 @@ class Realizations(StudyFigure):
         "input. Outside the wedge where nothing else is said."
     )
     needs_signal_loss = True
+    tolerances = (
+        (r".*\.values\..*", Drawn(_quoted, "its quoted error")),
+        (r".*\.(k|bin_edges|input)", Fixed("follows from the settings and the level of the EoR")),
+        (".*", Measured("follows from the values of the realizations")),
+    )
 
     def refusal(self, experiment: Experiment) -> str:
         """Refuse: a single experiment has nothing to pool."""

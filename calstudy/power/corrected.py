@@ -117,4 +117,4 @@ def _reason(known: np.ndarray, mean: np.ndarray, largest: np.ndarray, error: np.
         return "no modes"
     if np.isnan(error).all():
         return "too few realizations for an error of T"
-    return f"T = {np.nanmean(mean):.2g} is not above {LEAST_SIGNIFICANCE:g} times its error, {np.nanmean(largest):.2g}"
+    return f"T = {np.nanmean(mean):.2f} is not above {LEAST_SIGNIFICANCE:g} times its error, {np.nanmean(largest):.2g}"

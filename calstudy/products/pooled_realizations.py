@@ -93,22 +93,21 @@ def _mean_of_known(values: np.ndarray) -> float:
 
 def _markdown(results: Mapping[str, RegionResults], verdicts: Sequence[Verdict], settings: Mapping[str, Any]) -> str:
     blocks = settings["blocks"]
-    text = [to_markdown(verdicts, f"Realizations: {settings['title']}", ("criterion", "wanted")), ""]
-    text += [f"- {described(block['draw'], len(block['members']))}" for block in blocks]
-    text += [
-        "",
-        "The first realization, the experiment itself, is in every block. A number with ± has its standard error over "
-        "all that was drawn. Scatter is the standard deviation of one bin of one realization. σ is one standard "
-        "deviation. Coverage is that of the block that draws the noise (for P^S) or the EoR (for the input).",
-        "",
-    ]
+    drawn = "; ".join(described(block["draw"], len(block["members"])) for block in blocks)
+    summary = (
+        f"{drawn}. The first realization, the experiment itself, is in every block. {tally(verdicts)}.\n\n"
+        "Numbers with ± have their standard error over all that was drawn. Scatter is the standard deviation of one "
+        "bin of one realization. Coverage is that of the block that draws the noise (for P^S) or the EoR (for the "
+        "input). P^R0 is P^R of data without the EoR."
+    )
+    text = [to_markdown(verdicts, f"Realizations: {settings['title']}", ("criterion", "wanted"), summary)]
     for region, found in results.items():
         text += [f"## {region.replace('-', ' ').capitalize()}", ""]
         if found.corrected is not None:
-            text += [_loss_table(found, blocks).markdown(), ""]
-        text += [_power_table(found).markdown(), ""]
+            text += [_loss_table(found, blocks).markdown()]
+        text += [_power_table(found).markdown()]
         if found.corrected is not None:
-            text += [_of_other_realizations(found.corrected), "", _corrected_table(found).markdown(), ""]
+            text += [_of_other_realizations(found.corrected), "", _corrected_table(found).markdown()]
     return "\n".join(text).rstrip() + "\n"
 
 

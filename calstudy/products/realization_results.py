@@ -35,7 +35,7 @@ CRITERIA = {
         "the 95 % bars of P^R cover P^S in 95 % of bins",
         f"part of bins with |P^R - P^S| within 1.96 sigma of noise; {WHERE}",
         Within(0.93, 0.97),
-        "95 +- 2 %",
+        "95 ± 2 %, as of a 95 % bar",
     ),
     "bars-cover-input": Criterion(
         "bars-cover-input",
@@ -43,7 +43,7 @@ CRITERIA = {
         "the 95 % bars of P^R cover the input power in 95 % of bins",
         f"part of bins with |P^R - input| within 1.96 (sigma_N + sigma_S); {WHERE}",
         Within(0.93, 0.97),
-        "95 +- 2 %",
+        "95 ± 2 %, as of a 95 % bar",
     ),
     "corrected-mean": Criterion(
         "corrected-mean",
@@ -51,7 +51,7 @@ CRITERIA = {
         "P^R / T is the input on average",
         f"mean of P^R / T over the input; {WHERE}",
         Within(0.99, 1.01),
-        "1 +- 1 %",
+        "to 1 %",
     ),
     "corrected-covers-eor": Criterion(
         "corrected-covers-eor",
@@ -59,7 +59,7 @@ CRITERIA = {
         "the 95 % intervals of P^R / T cover P^S in 95 % of bins",
         f"part of bins with |P^R / T - P^S| within 1.96 sigma; {WHERE}",
         Within(0.92, 0.98),
-        "95 +- 3 %",
+        "95 ± 3 %, as of a 95 % interval",
     ),
     "corrected-covers-input": Criterion(
         "corrected-covers-input",
@@ -67,7 +67,7 @@ CRITERIA = {
         "the 95 % intervals of P^R / T cover the input power in 95 % of bins",
         f"part of bins with |P^R / T - input| within 1.96 sigma, sample variance included; {WHERE}",
         Within(0.92, 0.98),
-        "95 +- 3 %",
+        "95 ± 3 %, as of a 95 % interval",
     ),
 }
 COVERED = {
@@ -163,6 +163,8 @@ def judge(results: RegionResults) -> list[Verdict]:
         else:
             found = results.corrected_over(results.put_in, bins)
             reason = "there is no bin in which P^R / T is known in all realizations"
-        known = found is not None and np.isfinite(found.value)
-        verdicts.append(criterion.judge(found) if known else criterion.unevaluated(reason))
+        if found is None or not np.isfinite(found.value):
+            verdicts.append(criterion.unevaluated(reason))
+        else:
+            verdicts.append(criterion.judge(found))
     return verdicts

@@ -129,13 +129,15 @@ def read_samples(folders: Mapping[str, Path], count: int, region: str) -> Sequen
     samples = []
     for number in range(count):
         folder = folders[f"spectra:{number}"]
-        measured = [load_spectrum(folder / spectrum_file(name, region), SphericalSpectrum) for name in
-                    SIGNAL_LOSS_VARIANTS]  # fmt: skip
+        residual, without, eor = (
+            load_spectrum(folder / spectrum_file(name, region), SphericalSpectrum) for name in SIGNAL_LOSS_VARIANTS
+        )
         loss = None
         if region in signal_loss.REGIONS:
             file = folders[f"transfer:{number}"] / spectrum_file(signal_loss.TRANSFER, region)
             loss = load_spectrum(file, TransferFunction)
-        samples.append(Sample(*measured, np.array(read_json(folder / INPUT)["power_mk2_h3_mpc3"]), loss))
+        put_in = np.array(read_json(folder / INPUT)["power_mk2_h3_mpc3"])
+        samples.append(Sample(residual, without, eor, put_in, loss))
     return samples
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from calstudy.base.resources import LIBRARIES_MEMORY, free_memory
+from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
 from calstudy.run.execution import largest_disk, schedule
 from calstudy.run.progress import duration
 from calstudy.run.store import Store
@@ -98,6 +99,8 @@ def show_run(run: Run, console: Console) -> None:
     if run.parts:
         console.print("")
     _show_products(run, console)
+    for folder in (run.folder, *(part.folder for part in run.parts.values())):
+        _show_criteria(folder, console)
     _show_claims(run.folder, console)
 
 
@@ -127,6 +130,17 @@ def _show_products(run: Run, console: Console) -> None:
     if (run.folder / "tables").is_dir():
         console.print(f"tables: {run.folder / 'tables'}", markup=False)
     console.print(f"manifest: {run.folder / MANIFEST}", markup=False)
+
+
+def _show_criteria(folder: Path, console: Console) -> None:
+    """Print which criteria on the realizations of an experiment hold; nothing for other runs."""
+    path = folder / "tables" / VERDICTS
+    if path.is_file():
+        verdicts = from_json(path.read_text(encoding="utf-8"))
+        for verdict in verdicts:
+            text = f"{verdict.name}: {verdict.verdict}: {measured(verdict)}, must be {verdict.threshold}"
+            console.print(text, markup=False)
+        console.print(f"criteria: {tally(verdicts)}: {path.with_name(MARKDOWN)}", markup=False)
 
 
 def _show_claims(folder: Path, console: Console) -> None:

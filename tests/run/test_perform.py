@@ -99,7 +99,7 @@ def chain(*, temporary: bool) -> tuple[Task, Task, Task, Task]:
 
 
 def test_a_temporary_product_is_dropped_after_the_last_task_that_needs_it_and_not_before(store):
-    data, first, second, total = chain(temporary=True)
+    *_, total = chain(temporary=True)
     todo = schedule([total], store).todo
     lifetimes = Lifetimes([total], todo)
     assert lifetimes.unused() == []
