@@ -140,6 +140,7 @@ def _coinciding_seeds(experiment: Experiment) -> list[str]:
     return []
 
 
-def described(draw: Sequence[str], count: int) -> str:
-    """Write what a block draws: ``10 realizations of gains and noise``."""
-    return f"{count} realizations of {' and '.join(('EoR' if part == 'eor' else part) for part in draw)}"
+def described(draw: Sequence[str]) -> str:
+    """Write what a block draws: ``EoR, gains and noise``."""
+    *others, last = ["EoR" if part == "eor" else part for part in draw]
+    return f"{', '.join(others)} and {last}" if others else last

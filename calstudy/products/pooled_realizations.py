@@ -58,7 +58,7 @@ def _csv_rows(
     """Yield a row for each bin and block, and for all blocks together if there are several."""
     found = results.pooled
     everyone = list(range(len(found.design.draws)))
-    parts = [(" and ".join(block["draw"]), block["members"], place) for place, block in enumerate(blocks)]
+    parts = [(described(block["draw"]), block["members"], place) for place, block in enumerate(blocks)]
     for draw, places, place in [*parts, *([("all blocks", everyone, -1)] if len(blocks) > 1 else [])]:
         for column, k in enumerate(found.k):
             row: dict[str, str | float] = {
@@ -93,7 +93,7 @@ def _mean_of_known(values: np.ndarray) -> float:
 
 def _markdown(results: Mapping[str, RegionResults], verdicts: Sequence[Verdict], settings: Mapping[str, Any]) -> str:
     blocks = settings["blocks"]
-    drawn = "; ".join(described(block["draw"], len(block["members"])) for block in blocks)
+    drawn = "; ".join(f"{len(block['members'])} realizations of {described(block['draw'])}" for block in blocks)
     summary = (
         f"{drawn}. The first realization, the experiment itself, is in every block. {tally(verdicts)}.\n\n"
         "Numbers with ± have their standard error over all that was drawn. Scatter is the standard deviation of one "
@@ -137,7 +137,7 @@ def _rms(values: np.ndarray) -> float:
 def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> Table:
     """Return T, its scatter by what is drawn, and that scatter over the quoted error."""
     found = results.pooled
-    names = [" and ".join(block["draw"]) for block in blocks]
+    names = [described(block["draw"]) for block in blocks]
     rows = []
     for name, bins in _bands(found):
         scatters = [f"{_rms(block.scatter[bins]):.4f}" for block in found.blocks["transfer"]]

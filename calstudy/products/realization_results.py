@@ -132,12 +132,13 @@ def read_results(settings: Mapping[str, Any], folders: Mapping[str, Path]) -> di
     """
     design = Design(settings["draws"], [(block["draw"], block["members"]) for block in settings["blocks"]])
     return {
-        region: _results(realizations.read_samples(folders, len(settings["draws"]), region), design)
+        region: results_of(realizations.read_samples(folders, len(settings["draws"]), region), design)
         for region in REGIONS
     }
 
 
-def _results(samples: Sequence[Sample], design: Design) -> RegionResults:
+def results_of(samples: Sequence[Sample], design: Design) -> RegionResults:
+    """Pool what all realizations measured in one region, and correct it where T is known."""
     residual, eor = (np.stack([getattr(sample, name).power.real for sample in samples]) for name in ("residual", "eor"))
     put_in = np.stack([sample.put_in for sample in samples])
     covered = {

@@ -200,7 +200,7 @@ def test_a_run_leaves_tables_a_figure_and_verdicts(finished):
         "corrected-covers-input",
     ]
     text = (finished.folder / "tables" / "realizations.md").read_text()
-    assert "3 realizations of EoR and gains and noise" in text
+    assert "3 realizations of EoR, gains and noise" in text
     assert "## Inside wedge" in text
     manifest = json.loads((finished.folder / "manifest.json").read_text())
     assert [item["sky.eor.seed"] for item in manifest["realizations"]] == [2, 12, 22]
