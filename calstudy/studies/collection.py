@@ -130,9 +130,14 @@ class Collection(Study):
 
     @cached_property
     def claims(self) -> Task | None:
-        """The statements of the members' papers, each evaluated on the members whose roles it is about, or None."""
+        """The statements of the members' papers, each evaluated on the members whose roles it is about, or None.
+
+        Members with realizations have no claims: these are about single runs.
+        """
         graphs = {name: part.graph for name, part in self.parts.items()}
-        papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
+        papers = distinct_papers(
+            paper for experiment in self.members.values() if not experiment.realizations for paper in experiment.papers
+        )
         return combined_claims(self.name, graphs, papers, self.roles, self.stand_ins)
 
     @property

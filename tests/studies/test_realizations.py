@@ -12,6 +12,7 @@ from rich.console import Console
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.claims.folders import evaluate_folder
 from calstudy.experiment.files import dump, load, override, validate
 from calstudy.experiment.realizations import expand_realizations, members
 from calstudy.power.spectra import SphericalSpectrum
@@ -210,6 +211,12 @@ def test_a_run_leaves_tables_a_figure_and_verdicts(finished):
     assert "criteria: " in console.export_text()
 
 
+def test_claims_are_about_single_runs(finished):
+    with pytest.raises(InputError, match="pools realizations, and claims are about single runs"):
+        evaluate_folder(finished.folder, ["calamity2022"])
+    assert not (finished.folder / "claims.json").exists()
+
+
 def test_the_plan_counts_the_disk_that_is_held_at_one_time(folder, tmp_path):
     few, many = (validate(small(tmp_path, realizations={**EVERYTHING, "count": count}), folder) for count in (3, 12))
     disks = []
@@ -285,6 +292,7 @@ def test_a_file_with_realizations_is_a_study_of_its_own_also_in_a_collection(fol
     assert [type(part) for part in study.parts.values()] == [Realizations, ExperimentStudy]
     fitted, _ = study.fitted(Budget(workers=1))
     assert [type(part) for part in fitted.parts.values()] == [Realizations, ExperimentStudy]
+    assert fitted.claims is None
 
 
 @pytest.mark.parametrize("scale", [None, "small"])
@@ -292,6 +300,8 @@ def test_the_shipped_file_draws_what_the_docs_say(scale):
     study = load_study(Path(__file__).parents[2] / "experiments" / "realizations.yaml", scale)
     assert isinstance(study, Collection)
     assert len(study.parts) == 2
+    assert [task.label for task in study.figures] == ["realizations-comparison"]
+    assert study.claims is None
     for part in study.parts.values():
         assert isinstance(part, Realizations)
         draws = {part_: block.count for block in part.experiment.realizations for part_ in block.draw}
