@@ -112,8 +112,10 @@ QUANTITIES = {
 
 
 def _of_transfer(name: str) -> tuple[Callable[[Sample], np.ndarray], Callable[[Sample], np.ndarray]]:
-    def read(field_name: str) -> Callable[[Sample], np.ndarray]:
-        return lambda sample: np.broadcast_to(getattr(sample.transfer, field_name), sample.eor.k.shape)
+    """Return value and quoted error of a field of the transfer function; NaN where it has no error."""
+
+    def read(field: str) -> Callable[[Sample], np.ndarray]:
+        return lambda sample: np.broadcast_to(getattr(sample.transfer, field, np.nan), sample.eor.k.shape)
 
     return read(name), read(f"{name}_error")
 
@@ -123,7 +125,7 @@ TRANSFER_QUANTITIES = {
     "cross_transfer": Quantity("C", *_of_transfer("cross_transfer")),
     "squared_coherence": Quantity("C^2 / T", *_of_transfer("squared_coherence")),
 }
-"""Of the transfer function: fields of `TransferFunction` that have an error; a scalar counts for all bins."""
+"""Of the transfer function: fields of `TransferFunction`; a single number counts for all bins."""
 
 
 @dataclass(frozen=True)
