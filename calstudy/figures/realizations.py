@@ -91,7 +91,7 @@ def _draw_errors(axes: Axes, results: RegionResults, names: Sequence[str]) -> No
     if len(names) > 1:
         axes.plot(pooled.k, pooled.total["transfer"].scatter, "o", color=style.BLUE, label="scatter: all together")
     axes.set(yscale="log", ylabel=r"error of $T$")
-    axes.legend(loc="lower right", handletextpad=0.2)
+    _legend_above(axes, 2)
 
 
 def _draw_correlation(figure: Figure, axes: Axes, results: RegionResults, limits: tuple[float, float]) -> None:
@@ -123,8 +123,9 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
     axes.axhspan(-1, 1, color=style.BAND, alpha=0.5, linewidth=0, zorder=0)
     # Linear where pulls should be; where most of the EoR is lost they are far below.
     axes.set_yscale("symlog", linthresh=3)
+    bottom = min(-3.0, axes.get_ylim()[0])
     axes.set_yticks([-10, -3, -2, -1, 0, 1, 2, 3], ["−10", "−3", "−2", "−1", "0", "1", "2", "3"])
-    axes.set(ylabel="pull: mean and scatter", ylim=(min(-3.0, axes.get_ylim()[0]), 3.0))
+    axes.set(ylabel="pull: mean and scatter", ylim=(bottom, 3.0))
     _legend_above(axes, 1)
 
 
