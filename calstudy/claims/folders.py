@@ -126,4 +126,7 @@ def _tables(folder: Path) -> Path:
 
 
 def _results(folder: Path) -> RunResults:
-    return RunResults(validate(read_mapping(folder / EXPERIMENT), folder), (_tables(folder),))
+    experiment = validate(read_mapping(folder / EXPERIMENT), folder)
+    if experiment.realizations:
+        raise InputError(f"{folder}: pools realizations, and claims are about single runs; give the folder of one")
+    return RunResults(experiment, (_tables(folder),))

@@ -139,6 +139,23 @@ def _as_list(blocks: Any) -> Any:
     return [blocks] if isinstance(blocks, dict) else blocks
 
 
+class RealizationBlock(Section):
+    """Realizations of an experiment, which differ in the seeds of what is drawn; the first is the experiment itself."""
+
+    draw: Annotated[tuple[Literal["eor", "gains", "noise"], ...], Field(strict=False)] = Field(
+        ("eor", "gains", "noise"), description="What is drawn again in every realization; the rest is common to all."
+    )
+    count: int = Field(10, ge=2, le=1000, description="Number of realizations, with the experiment itself.")
+
+    @model_validator(mode="after")
+    def _draws_are_unique(self) -> RealizationBlock:
+        if not self.draw:
+            raise fault("draw", "names nothing: all realizations would be the same")
+        if len(set(self.draw)) != len(self.draw):
+            raise fault("draw", f"names something twice: {', '.join(self.draw)}")
+        return self
+
+
 class Experiment(Section):
     """One study: an instrument, a sky, what corrupts the data, the calibration under test, and what is measured."""
 
@@ -163,6 +180,11 @@ class Experiment(Section):
         (),
         description="Fields to vary (dotted path: list of values; several fields: all combinations), or a list of such "
         "blocks; a run makes every point and compares their signal loss.",
+    )
+    realizations: Annotated[tuple[RealizationBlock, ...], Field(strict=False), BeforeValidator(_as_list)] = Field(
+        (),
+        description="Draw the EoR, the gains or the noise several times, and pool what is measured: a block, or a list "
+        "of blocks that draw different things.",
     )
     scales: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."

@@ -136,6 +136,11 @@ class ComparisonFigure(StudyFigure):
 
         return {"spectra": spectra(graph)}
 
+    def member_settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return what `draw` finds of one member in ``job.settings["members"]``, by role; by default nothing."""
+        del graph
+        return {}
+
 
 def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:
     """Return the figures that an experiment asks for; their registry lets no other plug-ins in."""
@@ -182,8 +187,11 @@ def comparison_task(graphs: Mapping[str, Graph], figure: ComparisonFigure, stand
     stand_ins
         To be printed on it, if it shows the sky.
     """
-    settings = {"layouts": {role: graphs[role].experiment.instrument.layout for role in figure.titles}}
+    settings: dict[str, Any] = {"layouts": {role: graphs[role].experiment.instrument.layout for role in figure.titles}}
     with guarded(figure):
+        members = {role: figure.member_settings(graphs[role]) for role in figure.titles}
+        if any(members.values()):
+            settings["members"] = members
         inputs = {
             f"{name}:{role}": task for role in figure.titles for name, task in figure.inputs(graphs[role]).items()
         }

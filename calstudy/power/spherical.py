@@ -15,7 +15,9 @@ def make_bin_edges(bins: KBins) -> np.ndarray:
     return bins.min + bins.width * np.arange(count + 1)
 
 
-def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool) -> SphericalSpectrum:
+def spherical_average(
+    spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
+) -> SphericalSpectrum:
     """Average over all modes in bins of |k|, with equal weights for all pairs of baselines.
 
     Parameters
@@ -26,6 +28,8 @@ def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_we
         Bins and wedge buffer.
     exclude_wedge
         Leave out modes with |tau| <= |b|/c + buffer.
+    only_wedge
+        Leave out all other modes instead.
 
     Returns
     -------
@@ -38,6 +42,8 @@ def spherical_average(spectra: DelaySpectra, settings: PowerSettings, exclude_we
     bins[(bins < 0) | (bins >= n_bins)] = -1
     if exclude_wedge:
         bins[~outside_wedge(spectra, settings.wedge_buffer)] = -1
+    if only_wedge:
+        bins[outside_wedge(spectra, settings.wedge_buffer)] = -1
     used = bins >= 0
     weights = np.broadcast_to(spectra.n_pairs[:, None], bins.shape)[used]
     total = np.bincount(bins[used], weights, minlength=n_bins)

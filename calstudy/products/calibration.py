@@ -59,7 +59,7 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
         )
         for index in range(count)
     }
-    return Task(CALIBRATE, data.label, {}, chunks)
+    return Task(CALIBRATE, data.label, {}, chunks, temporary=not graph.keep_visibilities)
 
 
 def _integrations(data: UVData, index: int, count: int, together: int) -> UVData:

@@ -106,7 +106,7 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         settings["effects"] = list(experiment.corruption.effects)
         inputs |= _numbered(truths(graph))
         label = f"effects on ({label})"
-    return Task(CORRUPT, label, settings, inputs)
+    return Task(CORRUPT, label, settings, inputs, temporary=not graph.keep_visibilities)
 
 
 def draw_effect(job: Job) -> Mapping[str, Any]:

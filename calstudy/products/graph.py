@@ -22,10 +22,14 @@ class Graph:
     ----------
     experiment
         Validated.
+    keep_visibilities
+        Whether measurements and calibrated visibilities stay in the store; if not, they are removed once all that needs
+        them is made. Simulated components and averages over the run always stay.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, keep_visibilities: bool = True) -> None:
         self.experiment = experiment
+        self.keep_visibilities = keep_visibilities
         self.size = Size.of(experiment.instrument)
         self._made: dict[Hashable, Any] = {}
 

@@ -13,6 +13,7 @@ from calstudy.base.errors import InputError
 from calstudy.run.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
+REALIZATIONS = "realizations.json"
 CLAIMS_TITLE = "Claims of the paper"
 REGIONS = {"outside-wedge": "outside the wedge", "inside-wedge": "inside the wedge"}
 
@@ -102,6 +103,7 @@ def read_contents(folder: Path) -> Contents:
     tables = [
         _claims(folder, products),
         _summary(folder),
+        _realizations(folder),
         _signal_loss(folder),
         _convergence(products),
         _simulation(products),
@@ -257,6 +259,26 @@ def _summary(folder: Path) -> Table | None:
     return Table(
         "Signal loss of every point", columns, cells, "T = P^R / P^S outside the wedge, one standard deviation."
     )
+
+
+def _realizations(folder: Path) -> Table | None:
+    """Return the verdicts on the realizations of an experiment."""
+    path = folder / "tables" / REALIZATIONS
+    if not path.is_file():
+        return None
+    rows = [
+        (
+            item["sentence"],
+            item["quantity"],
+            item["reason"] or with_error(item["measured"], item["uncertainty"]),
+            item["threshold"],
+            item["verdict"],
+        )
+        for item in json.loads(path.read_text(encoding="utf-8"))
+    ]
+    columns = ("wanted", "measured is", "measured", "must be", "verdict")
+    note = "All numbers are in realizations.md and realizations.csv."
+    return Table("Realizations", columns, rows, note, verdicts=4)
 
 
 def _convergence(products: Sequence[Mapping[str, Any]]) -> Table | None:

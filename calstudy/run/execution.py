@@ -243,14 +243,52 @@ def _execute_here(tasks: Sequence[Task], store: Store, done: Callable[[Task, Pro
     return products
 
 
-def drop_temporary(tasks: Iterable[Task], store: Store) -> None:
-    """Remove the temporary products whose consumers have all been made; a store that can only be read keeps them."""
-    tasks = unique(tasks)
-    consumers: dict[str, list[Task]] = {}
+class Lifetimes:
+    """How long each temporary product of a run is needed: until the last task that needs it is made.
+
+    Parameters
+    ----------
+    targets
+        What the run is for. A product is temporary if the first task in their order that makes it says so.
+    todo
+        The tasks that the run makes, from `schedule`.
+    """
+
+    def __init__(self, targets: Iterable[Task], todo: Sequence[Task]) -> None:
+        self._temporary = {task.key: task for task in unique(targets) if task.temporary}
+        self._users = dict.fromkeys(self._temporary, 0)
+        for task in todo:
+            for key in self._needed_by(task):
+                self._users[key] += 1
+
+    def _needed_by(self, task: Task) -> set[str]:
+        return {needed.key for needed in task.needs.values()} & self._temporary.keys()
+
+    def unused(self) -> list[Task]:
+        """Return the temporary products that no task needs that is still to be made."""
+        return [self._temporary[key] for key, count in self._users.items() if count == 0]
+
+    def after(self, task: Task) -> list[Task]:
+        """Count a task as made; return the temporary products that it was the last to need."""
+        needed = self._needed_by(task)
+        for key in needed:
+            self._users[key] -= 1
+        return [self._temporary[key] for key in needed if self._users[key] == 0]
+
+
+def drop(tasks: Iterable[Task], store: Store) -> None:
+    """Remove the products of tasks, as far as they are there; a store that can only be read keeps them."""
     for task in tasks:
-        for needed in task.needs.values():
-            consumers.setdefault(needed.key, []).append(task)
-    for task in tasks:
-        if task.temporary and all(store.find(user.stage.name, user.key) for user in consumers.get(task.key, [])):
-            with suppress(OSError):
-                store.discard(task.stage.name, task.key)
+        with suppress(OSError):
+            store.discard(task.stage.name, task.key)
+
+
+def largest_disk(targets: Iterable[Task], todo: Sequence[Task]) -> float:
+    """Return the most bytes that the products of a run are estimated to hold at once, if it goes in its order."""
+    lifetimes, sizes = Lifetimes(targets, todo), {task.key: task.cost.disk for task in todo}
+    held = largest = 0.0
+    for task in todo:
+        held += sizes[task.key]
+        largest = max(largest, held)
+        held -= sum(sizes.get(dropped.key, 0.0) for dropped in lifetimes.after(task))
+    return largest

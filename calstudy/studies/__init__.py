@@ -1,1 +1,1 @@
-"""What a file can ask for: an experiment, a sweep, a collection, a run-time study."""
+"""What a file can ask for: an experiment, a sweep, realizations, a collection, a run-time study."""

@@ -19,10 +19,12 @@ from calstudy.claims.product import combined_claims
 from calstudy.experiment.files import apply_scale, override, parse_override, read_mapping, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import FIGURES, Experiment, Outputs
+from calstudy.experiment.realizations import expand_realizations
 from calstudy.figures import ComparisonFigure, comparison_task
 from calstudy.run.task import Task
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.folder import publish, run_folder, write_manifest
+from calstudy.studies.realizations import Realizations
 from calstudy.studies.study import Budget, Made, Study, fitted_parts
 
 KEY = "experiments"
@@ -88,9 +90,12 @@ class Collection(Study):
         return next(iter(self.members.values())).outputs
 
     @cached_property
-    def parts(self) -> Mapping[str, ExperimentStudy]:
+    def parts(self) -> Mapping[str, ExperimentStudy | Realizations]:
         """The members."""
-        return {name: ExperimentStudy(experiment) for name, experiment in self.members.items()}
+        return {
+            name: Realizations(experiment) if experiment.realizations else ExperimentStudy(experiment)
+            for name, experiment in self.members.items()
+        }
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the collection with every member fitted, and the smallest number of workers of all."""
@@ -125,9 +130,14 @@ class Collection(Study):
 
     @cached_property
     def claims(self) -> Task | None:
-        """The statements of the members' papers, each evaluated on the members whose roles it is about, or None."""
+        """The statements of the members' papers, each evaluated on the members whose roles it is about, or None.
+
+        Members with realizations have no claims: these are about single runs.
+        """
         graphs = {name: part.graph for name, part in self.parts.items()}
-        papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
+        papers = distinct_papers(
+            paper for experiment in self.members.values() if not experiment.realizations for paper in experiment.papers
+        )
         return combined_claims(self.name, graphs, papers, self.roles, self.stand_ins)
 
     @property
@@ -229,6 +239,8 @@ def _load_member(member: Member, path: Path, scale: str | None, overrides: Seque
     experiment = validate(data, path.resolve().parent)
     if experiment.sweep:
         raise InputError("has a sweep; run it by itself, or leave the sweep out with overrides: {sweep: []}")
+    if experiment.realizations:
+        expand_realizations(experiment)
     return experiment
 
 

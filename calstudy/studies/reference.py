@@ -13,7 +13,7 @@ from pydantic_core import PydanticUndefined
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
-from calstudy.experiment.model import Experiment, Variant
+from calstudy.experiment.model import Experiment, RealizationBlock, Variant
 from calstudy.instrument.settings import AntennaBeam
 from calstudy.studies.collection import CollectionFile, Member
 from calstudy.studies.runtime import RuntimeFile
@@ -183,6 +183,9 @@ def field_reference() -> str:
         "## `variants`: each",
         "",
         *_section(Variant, "variants", listed),
+        "## `realizations`: each",
+        "",
+        *_section(RealizationBlock, "realizations", listed),
         "## `instrument.antenna_beams`: each",
         "",
         *_plain_section(AntennaBeam),

@@ -9,8 +9,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from calstudy.base.resources import LIBRARIES_MEMORY, Cost, free_memory
-from calstudy.run.execution import schedule
+from calstudy.base.resources import LIBRARIES_MEMORY, free_memory
+from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
+from calstudy.run.execution import largest_disk, schedule
 from calstudy.run.progress import duration
 from calstudy.run.store import Store
 from calstudy.run.task import Task
@@ -68,7 +69,7 @@ def show_plan(study: Study, budget: Budget, console: Console) -> None:
     console.print(table)
     for task in plan.damaged:
         console.print(f"damaged, will be made again: {task.stage.name} ({task.label})", markup=False)
-    _total([task.cost for task in plan.todo], plan.todo, workers, console)
+    _total(plan.todo, largest_disk(study.targets, plan.todo), workers, console)
     for note in study.stand_ins:
         console.print(f"stand-in: {note}", markup=False)
     console.print(f"store: {store.root}", markup=False, soft_wrap=True)
@@ -76,16 +77,17 @@ def show_plan(study: Study, budget: Budget, console: Console) -> None:
         console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
 
 
-def _total(costs: list[Cost], tasks: Sequence[Task], workers: int, console: Console) -> None:
-    if not costs:
+def _total(tasks: Sequence[Task], disk: float, workers: int, console: Console) -> None:
+    if not tasks:
         console.print("everything is in the store: a run only writes its folder")
         return
+    costs = [task.cost for task in tasks]
     kept = sum(cost.disk for cost, task in zip(costs, tasks, strict=True) if not task.temporary)
     memory = LIBRARIES_MEMORY + workers * max(cost.memory for cost in costs)
     console.print(
         f"in all: about {duration(sum(cost.seconds for cost in costs) / workers)}, "
         f"up to {_gigabytes(memory)} of memory ({_gigabytes(free_memory())} free), "
-        f"{_gigabytes(sum(cost.disk for cost in costs))} of disk while running, {_gigabytes(kept)} kept"
+        f"{_gigabytes(disk)} of disk while running, {_gigabytes(kept)} kept"
     )
 
 
@@ -97,6 +99,8 @@ def show_run(run: Run, console: Console) -> None:
     if run.parts:
         console.print("")
     _show_products(run, console)
+    for folder in (run.folder, *(part.folder for part in run.parts.values())):
+        _show_criteria(folder, console)
     _show_claims(run.folder, console)
 
 
@@ -126,6 +130,17 @@ def _show_products(run: Run, console: Console) -> None:
     if (run.folder / "tables").is_dir():
         console.print(f"tables: {run.folder / 'tables'}", markup=False)
     console.print(f"manifest: {run.folder / MANIFEST}", markup=False)
+
+
+def _show_criteria(folder: Path, console: Console) -> None:
+    """Print which criteria on the realizations of an experiment hold; nothing for other runs."""
+    path = folder / "tables" / VERDICTS
+    if path.is_file():
+        verdicts = from_json(path.read_text(encoding="utf-8"))
+        for verdict in verdicts:
+            text = f"{verdict.name}: {verdict.verdict}: {measured(verdict)}, must be {verdict.threshold}"
+            console.print(text, markup=False)
+        console.print(f"criteria: {tally(verdicts)}: {path.with_name(MARKDOWN)}", markup=False)
 
 
 def _show_claims(folder: Path, console: Console) -> None:

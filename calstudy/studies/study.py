@@ -15,7 +15,7 @@ from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.report.page import write_report
-from calstudy.run.execution import Workers, drop_temporary, execute, schedule
+from calstudy.run.execution import Lifetimes, Workers, drop, execute, schedule
 from calstudy.run.progress import report
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
@@ -110,7 +110,7 @@ class Folders(Protocol):
 
 
 class Study(ABC):
-    """What a file asks for: an experiment, a sweep, a collection, a run-time study.
+    """What a file asks for: an experiment, a sweep, realizations, a collection, a run-time study.
 
     A new kind is a subclass, with the key of its files in `calstudy.studies.load`.
     """
@@ -204,16 +204,18 @@ def make(targets: Sequence[Task], store: Store, workers: Workers, console: Conso
         message = f"{task.stage.name} ({task.label}): the product in the store is damaged, and is made again"
         logger.warning(message)
         console.print(message, markup=False)
+    lifetimes = Lifetimes(targets, plan.todo)
+    drop(lifetimes.unused(), store)
     costs = {task.key: task.cost.seconds for task in plan.todo}
     with report(plan.todo, costs, console) as show:
 
         def done(task: Task, product: Product) -> None:
             logger.info("%s (%s): %.1f s", task.stage.name, task.label, product.record["seconds"])
             show(task, product)
+            drop(lifetimes.after(task), store)
 
         products = execute(plan.todo, store, workers, done)
     products |= plan.ready
-    drop_temporary(targets, store)
     for task in unique(targets):
         if task.key not in products and (found := store.find(task.stage.name, task.key)) is not None:
             products[task.key] = found

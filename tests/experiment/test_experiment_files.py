@@ -21,6 +21,7 @@ from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.preflight import require_calibration
+from calstudy.studies.realizations import Realizations
 from calstudy.studies.runtime import RuntimeStudy
 from calstudy.studies.study import Study
 from calstudy.studies.sweep import Sweep
@@ -46,7 +47,7 @@ def scales_of(study: Study) -> set[str]:
         return set(study.file.scales)
     if isinstance(study, Sweep):
         return set(study.base.scales)
-    assert isinstance(study, ExperimentStudy)
+    assert isinstance(study, ExperimentStudy | Realizations)
     return set(study.experiment.scales)
 
 

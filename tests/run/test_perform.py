@@ -11,7 +11,8 @@ import pytest
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import UserCodeError
-from calstudy.run.execution import Workers, drop_temporary, execute, schedule
+from calstudy.base.resources import Cost
+from calstudy.run.execution import Lifetimes, Workers, drop, execute, largest_disk, schedule
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Store
 from calstudy.run.task import Job, Stage, Task
@@ -83,11 +84,54 @@ def test_a_store_that_can_only_be_read_keeps_its_temporary_products(store, monke
 
     with monkeypatch.context() as patched:
         patched.setattr(Store, "discard", refuse)
-        drop_temporary([total], store)
+        drop(Lifetimes([total], ()).unused(), store)
     assert store.find("number", piece.key) is not None
-    drop_temporary([total], store)
+    drop(Lifetimes([total], ()).unused(), store)
     assert store.find("number", piece.key) is None
     assert store.find("number", total.key) is not None
+
+
+def chain(*, temporary: bool) -> tuple[Task, Task, Task, Task]:
+    """Return a product, two that are made from it, and one that is made from these two."""
+    data = Task(NUMBER, "data", {"number": 1}, temporary=temporary)
+    halves = [Task(NUMBER, f"half {value}", {"number": value}, {"data": data}, temporary=temporary) for value in (2, 3)]
+    return data, halves[0], halves[1], Task(NUMBER, "total", {"number": 0}, {"a": halves[0], "b": halves[1]})
+
+
+def test_a_temporary_product_is_dropped_after_the_last_task_that_needs_it_and_not_before(store):
+    *_, total = chain(temporary=True)
+    todo = schedule([total], store).todo
+    lifetimes = Lifetimes([total], todo)
+    assert lifetimes.unused() == []
+    dropped = {task.label: {item.label for item in lifetimes.after(task)} for task in todo}
+    assert dropped == {"data": set(), "half 2": set(), "half 3": {"data"}, "total": {"half 2", "half 3"}}
+
+
+def test_a_run_that_was_interrupted_drops_nothing_that_it_still_needs(store):
+    """With the first half made, the data stay for the second; with the total made, nothing is needed any more."""
+    data, first, second, total = chain(temporary=True)
+    run(first, store)
+    todo = schedule([total], store).todo
+    assert todo == (second, total)
+    assert Lifetimes([total], todo).unused() == []
+    run(total, store)
+    drop(Lifetimes([total], schedule([total], store).todo).unused(), store)
+    assert all(store.find("number", task.key) is None for task in (data, first, second))
+    assert schedule([total], store).todo == ()
+
+
+def test_a_product_that_another_part_of_the_run_keeps_is_not_temporary(store):
+    kept, fleeting = chain(temporary=False), chain(temporary=True)
+    run(kept[-1], store)
+    assert Lifetimes([kept[-1], fleeting[-1]], ()).unused() == []
+
+
+def test_the_disk_of_a_plan_counts_what_is_there_at_one_time(store):
+    sized = replace(NUMBER, cost=lambda task: Cost(1, disk=100.0))
+    pieces = [Task(sized, f"piece {index}", {"number": index}, temporary=True) for index in range(5)]
+    reduced = [Task(sized, f"reduced {index}", {"number": 1}, {"piece": piece}) for index, piece in enumerate(pieces)]
+    # One piece at a time, beside what was reduced before and is being reduced.
+    assert largest_disk(reduced, schedule(reduced, store).todo) == 100 * 6
 
 
 @pytest.mark.parametrize("error", [ValueError("index 3 is wrong"), KeyError("gains"), TypeError("no"), LookupError()])

@@ -1,0 +1,146 @@
+"""Realizations of an experiment: the same experiment with other seeds of the EoR, the gains or the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.corrupt.interface import GainEffect
+from calstudy.corrupt.settings import NoNoise
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
+
+PARTS = ("eor", "gains", "noise")
+"""What can be drawn again."""
+SEED_STEP = 10
+"""Draw number n, counted from 0, of a part has n times this added to its seeds in the experiment."""
+
+
+@dataclass(frozen=True)
+class Realization:
+    """One realization.
+
+    Attributes
+    ----------
+    draws
+        Number of the draw of each of `PARTS`, counted from 0; 0 has the seeds of the experiment.
+    experiment
+        With the seeds of these draws and without `realizations`.
+    """
+
+    draws: Mapping[str, int]
+    experiment: Experiment
+
+    @property
+    def label(self) -> str:
+        """What is drawn anew, such as ``gains 3, noise 3``, counted from 1; ``base`` for the experiment itself."""
+        return ", ".join(f"{part} {number + 1}" for part, number in self.draws.items() if number) or "base"
+
+
+def expand_realizations(experiment: Experiment) -> list[Realization]:
+    """Return the realizations of all blocks, each once: first the experiment itself, then those of block after block.
+
+    Raises
+    ------
+    InputError
+        If the experiment has no realizations.
+    ExperimentError
+        With one sentence per fault: a sweep besides, variants without signal loss, parts that cannot be drawn, are
+        drawn in two blocks, or whose seeds would coincide.
+    """
+    blocks = experiment.realizations
+    if not blocks:
+        raise InputError(f"{experiment.name}: has no realizations")
+    faults = _faults(experiment)
+    if faults:
+        raise ExperimentError(faults)
+    base = experiment.reset("realizations", "scales")
+    found = [Realization(dict.fromkeys(PARTS, 0), base)]
+    # Besides the experiment itself, only what the pooled quantities are made of is needed.
+    lean = base.model_copy(update={"variants": {name: base.variants[name] for name in SIGNAL_LOSS_VARIANTS}})
+    for block in blocks:
+        for number in range(1, block.count):
+            draws = {part: number if part in block.draw else 0 for part in PARTS}
+            found.append(Realization(draws, _drawn(lean, draws)))
+    return found
+
+
+def members(experiment: Experiment) -> list[list[int]]:
+    """Return, for each block, which of the realizations of `expand_realizations` belong to it; the first is in all."""
+    found, first = [], 1
+    for block in experiment.realizations:
+        found.append([0, *range(first, first + block.count - 1)])
+        first += block.count - 1
+    return found
+
+
+def _drawn(experiment: Experiment, draws: Mapping[str, int]) -> Experiment:
+    """Return the experiment with the seeds of some draws."""
+    sky, corruption = experiment.sky, experiment.corruption
+    eor = sky.eor.model_copy(update={"seed": sky.eor.seed + SEED_STEP * draws["eor"]})
+    changes: dict[str, Any] = {
+        "effects": tuple(
+            effect.model_copy(update={"seed": seed + SEED_STEP * draws["gains"]})
+            if (seed := _gain_seed(effect)) is not None
+            else effect
+            for effect in corruption.effects
+        )
+    }
+    if not isinstance(corruption.noise, NoNoise):
+        seeds = tuple(seed + SEED_STEP * draws["noise"] for seed in corruption.noise.seeds)
+        changes["noise"] = corruption.noise.model_copy(update={"seeds": seeds})
+    update = {"sky": sky.model_copy(update={"eor": eor}), "corruption": corruption.model_copy(update=changes)}
+    return experiment.model_copy(update=update)
+
+
+def _gain_seed(effect: Any) -> int | None:
+    """Return the seed of an effect on the gains; None if it has none, or is an effect of another kind."""
+    return getattr(effect, "seed", None) if isinstance(effect, GainEffect) else None
+
+
+def _faults(experiment: Experiment) -> list[str]:
+    faults = []
+    drawn = [part for block in experiment.realizations for part in block.draw]
+    if experiment.sweep:
+        faults.append("realizations: cannot be asked for together with a sweep; use two files")
+    if not experiment.measures_signal_loss:
+        names = ", ".join(SIGNAL_LOSS_VARIANTS)
+        faults.append(f"realizations: pool the signal loss, which needs the variants {names}")
+    faults += [
+        f"realizations: draw {part!r} in {drawn.count(part)} blocks; each part can be drawn in one block only"
+        for part in dict.fromkeys(drawn)
+        if drawn.count(part) > 1
+    ]
+    if "noise" in drawn and isinstance(experiment.corruption.noise, NoNoise):
+        faults.append("realizations: draw 'noise', but corruption.noise is 'none'")
+    if "gains" in drawn and all(_gain_seed(effect) is None for effect in experiment.corruption.effects):
+        faults.append("realizations: draw 'gains', but no effect on the gains in corruption.effects has a seed")
+    return faults or _coinciding_seeds(experiment)
+
+
+def _coinciding_seeds(experiment: Experiment) -> list[str]:
+    """Return a sentence if gains or noise of two realizations would have the same random numbers."""
+    counts: dict[str, int] = {part: block.count for block in experiment.realizations for part in block.draw}
+    noise = experiment.corruption.noise
+    bases: list[tuple[str, int]] = [
+        ("gains", seed) for effect in experiment.corruption.effects if (seed := _gain_seed(effect)) is not None
+    ]
+    bases += [("noise", seed) for seed in (() if isinstance(noise, NoNoise) else noise.seeds)]
+    seen: dict[int, str] = {}
+    for part, base in bases:
+        for number in range(counts.get(part, 1)):
+            seed = base + SEED_STEP * number
+            if seed in seen:
+                return [
+                    f"realizations: the seed {seed} would be used for {seen[seed]} and for {part} (seeds grow by "
+                    f"{SEED_STEP} from one realization to the next); choose other seeds in corruption"
+                ]
+            seen[seed] = part
+    return []
+
+
+def described(draw: Sequence[str]) -> str:
+    """Write what a block draws: ``EoR, gains and noise``."""
+    *others, last = ["EoR" if part == "eor" else part for part in draw]
+    return f"{', '.join(others)} and {last}" if others else last

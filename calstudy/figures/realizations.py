@@ -1,0 +1,230 @@
+"""Realizations of an experiment: transfer function, pulls and coverage per k, and covariance between bins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from pydantic import Field
+
+from calstudy.base.units import Wavenumber
+from calstudy.experiment.model import Experiment
+from calstudy.experiment.realizations import described
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
+from calstudy.plotting import style
+from calstudy.power.realizations import mean_over_bins
+from calstudy.products import realizations
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Arrays, Drawn, Fixed, Measured
+
+if TYPE_CHECKING:
+    from calstudy.products.realization_results import RegionResults
+
+OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"
+CORRELATION_COLOURS = "RdBu_r"
+LEVEL = 0.95
+CORRECTED_PULL = r"$(P^R/T - P^S)/\sigma$, mean"
+KINDS = {"eor": ("o", style.BLUE, r"P^S", -0.15), "input": ("s", style.ORANGE, r"\mathrm{input}", 0.15)}
+"""Marker, colour and name of what P^R is compared with, and how far its points are shifted, in widths of a bin."""
+BLOCKS = (style.ORANGE, style.GREEN, style.MAGENTA)
+
+
+@style.journal_style()
+def draw_realizations(
+    results: Mapping[str, RegionResults],
+    names: Sequence[str],
+    max_k: float = 1.0,
+    stand_ins: Sequence[str] = (),
+) -> Figure:
+    """Draw what realizations have in common: T, its errors and their correlation, pulls, coverage, corrected power.
+
+    Parameters
+    ----------
+    results
+        By region; outside and inside the wedge are shown.
+    names
+        What each block draws, such as ``gains and noise``.
+    max_k
+        Upper end of the axes of k, h/Mpc.
+    stand_ins
+        See `calstudy.plotting.style.note_stand_ins`.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 4.9)
+    ((transfer, errors, correlation), (pulls, covered, corrected)) = figure.subplots(2, 3)
+    outside = results[OUTSIDE]
+    _draw_transfer(transfer, results)
+    _draw_errors(errors, outside, names)
+    _draw_pulls(pulls, outside)
+    _draw_coverage(covered, outside)
+    _draw_corrected(corrected, outside)
+    limits = (0.0, min(max_k, float(outside.pooled.bin_edges[-1])))
+    for panel in (transfer, errors, pulls, covered, corrected):
+        panel.set(xlim=limits, xlabel=style.WAVENUMBER)
+    _draw_correlation(figure, correlation, outside, limits)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_transfer(axes: Axes, results: Mapping[str, RegionResults]) -> None:
+    """Draw mean T with the scatter of one realization as bars."""
+    for region, marker, colour in ((OUTSIDE, "o", style.BLUE), (INSIDE, "s", style.ORANGE)):
+        pooled = results[region].pooled
+        total = pooled.total["transfer"]
+        label = region.replace("-", " the ")
+        axes.errorbar(pooled.k, total.mean, total.scatter, fmt=marker, color=colour, elinewidth=0.7, label=label)
+    axes.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
+    axes.set_ylabel(TRANSFER)
+    axes.legend(loc="lower right", title="bars: scatter", title_fontsize=style.SMALL_SIZE)
+
+
+def _draw_errors(axes: Axes, results: RegionResults, names: Sequence[str]) -> None:
+    """Draw the quoted error of T, and its scatter by what is drawn."""
+    pooled = results.pooled
+    axes.plot(pooled.k, pooled.total["transfer"].quoted, color=style.BLACK, label="quoted error")
+    for name, block, colour in zip(names, pooled.blocks["transfer"], BLOCKS, strict=False):
+        axes.plot(pooled.k, block.scatter, ".", color=colour, label=f"scatter: {name}")
+    if len(names) > 1:
+        axes.plot(pooled.k, pooled.total["transfer"].scatter, "o", color=style.BLUE, label="scatter: all together")
+    axes.set(yscale="log", ylabel=r"error of $T$")
+    _legend_above(axes, 2)
+
+
+def _draw_correlation(figure: Figure, axes: Axes, results: RegionResults, limits: tuple[float, float]) -> None:
+    """Draw the correlation of T between bins outside the wedge."""
+    pooled = results.pooled
+    correlation = pooled.total["transfer"].correlation
+    edges = pooled.bin_edges
+    image = axes.pcolormesh(edges, edges, correlation, cmap=CORRELATION_COLOURS, vmin=-1, vmax=1, rasterized=True)
+    axes.set_facecolor("0.85")
+    freedom = sum(len(places) - 1 for _, places in pooled.design.blocks)
+    axes.set(aspect="equal", xlim=limits, ylim=limits, xlabel=style.WAVENUMBER, ylabel=style.WAVENUMBER)
+    axes.set_title(rf"correlation of $T$ ($\pm{freedom**-0.5:.2f}$ by chance)", fontsize=style.SMALL_SIZE + 0.5)
+    figure.colorbar(image, ax=axes, shrink=0.8)
+
+
+def _draw_pulls(axes: Axes, results: RegionResults) -> None:
+    """Draw the mean and the scatter of the pulls of P^R, and the mean of those of P^R / T."""
+    pooled = results.pooled
+    for kind, (marker, colour, name, shift) in KINDS.items():
+        total = pooled.total[f"pull_{kind}"]
+        k = pooled.k + shift * np.diff(pooled.bin_edges)
+        label = rf"$(P^R - {name})/\sigma$"
+        axes.errorbar(k, total.mean, total.scatter, fmt=marker, color=colour, elinewidth=0.7, label=label)
+    if results.corrected is not None:
+        known = np.isfinite(results.corrected.power).all(axis=0)
+        deviations = (results.corrected.power - results.eor)[:, known]
+        mean = (deviations / results.corrected.error[:, known]).mean(axis=0)
+        axes.plot(pooled.k[known], mean, "x", color=style.GREEN, label=CORRECTED_PULL, zorder=3)
+    axes.axhspan(-1, 1, color=style.BAND, alpha=0.5, linewidth=0, zorder=0)
+    # Linear where pulls should be; where most of the EoR is lost they are far below.
+    axes.set_yscale("symlog", linthresh=3)
+    bottom = min(-3.0, axes.get_ylim()[0])
+    axes.set_yticks([-10, -3, -2, -1, 0, 1, 2, 3], ["−10", "−3", "−2", "−1", "0", "1", "2", "3"])
+    axes.set(ylabel="pull: mean and scatter", ylim=(bottom, 3.0))
+    _legend_above(axes, 1)
+
+
+def _draw_coverage(axes: Axes, results: RegionResults) -> None:
+    """Draw the part of the realizations whose 95 % bars cover, per bin; filled: of P^R / T."""
+    pooled = results.pooled
+    for kind, (marker, colour, name, shift) in KINDS.items():
+        k = pooled.k + shift * np.diff(pooled.bin_edges)
+        for prefix, filled, power in (("", "none", "P^R"), ("corrected_", colour, "P^R/T")):
+            inside = results.covered.get(prefix + kind, np.full((1, pooled.k.size), np.nan))
+            known = np.isfinite(inside).all(axis=0)
+            part, label = inside[:, known].mean(axis=0), rf"${power}$ of ${name}$"
+            axes.plot(k[known], part, marker, color=colour, markerfacecolor=filled, label=label)
+    axes.axhline(LEVEL, color=style.GREY, linewidth=0.7, zorder=0)
+    axes.set(ylim=(-0.04, 1.04), ylabel="part of 95 % bars that cover")
+    _legend_above(axes, 2)
+
+
+def _draw_corrected(axes: Axes, results: RegionResults) -> None:
+    """Draw P^R and P^R / T over the input: the mean, with the 95 % error of it by what was drawn."""
+    pooled = results.pooled
+    powers = {"P^R": (pooled.values["ratio"] * results.eor, style.GREY, "o", -0.15)}
+    if results.corrected is not None:
+        powers["P^R/T"] = (results.corrected.power, style.BLUE, "s", 0.15)
+    for name, (power, colour, marker, shift) in powers.items():
+        found = [mean_over_bins(column[:, None], pooled.design) for column in (power / results.put_in).T]
+        mean, error = np.transpose([(item.value, item.uncertainty) for item in found])
+        k = pooled.k + shift * np.diff(pooled.bin_edges)
+        label = f"${name}$ over input"
+        axes.errorbar(k, mean, SIGMAS_95 * error, fmt=marker, color=colour, elinewidth=0.7, label=label)
+    axes.axhline(1, color=style.BLACK, linewidth=0.7, zorder=0)
+    axes.set(ylabel="mean over the input, 95 %", ylim=(0, 1.35))
+    _legend_above(axes, 1)
+
+
+def _legend_above(axes: Axes, columns: int) -> None:
+    """Add the legend of a panel that is full of points."""
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, columnspacing=0.8, handletextpad=0.2)
+
+
+def _quoted(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the quoted errors of the values of a quantity."""
+    return arrays[name.replace(".values.", ".quoted.")]
+
+
+class Realizations(StudyFigure):
+    """What realizations of an experiment have in common: T, pulls, coverage, and the correlation between bins."""
+
+    caption = (
+        "Realizations: transfer function T with the scatter of one realization; its quoted error and its scatter; the "
+        "correlation of T between bins; pulls, mean and scatter; part of the 95 % bars that cover; P^R and P^R / T "
+        "over the input. Outside the wedge where nothing else is said."
+    )
+    needs_signal_loss = True
+    tolerances = (
+        (r".*\.values\..*", Drawn(_quoted, "its quoted error")),
+        (r".*\.(k|bin_edges|input)", Fixed("follows from the settings and the level of the EoR")),
+        (".*", Measured("follows from the values of the realizations")),
+    )
+
+    max_k: Wavenumber = Field(1.0, gt=0, description="Upper end of the axes of k; the arrays have all bins.")
+
+    def refusal(self, experiment: Experiment) -> str:
+        """Refuse: a single experiment has nothing to pool."""
+        return "pools the realizations of an experiment, and cannot be drawn of a single one"
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return what is measured on every realization."""
+        return realizations.inputs(graph)
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return which realization has which draws."""
+        return realizations.settings(graph)
+
+    def draw(self, job: Job) -> Drawing:
+        """Pool all realizations, and draw them."""
+        from calstudy.products.realization_results import read_results
+
+        results = read_results(job.settings, job.inputs)
+        blocks = job.settings["blocks"]
+        names = [f"{described(block['draw'])} ({len(block['members'])})" for block in blocks]
+        return Drawing(draw_realizations(results, names, self.max_k, job.settings["notes"]), _arrays(results))
+
+
+def _arrays(results: Mapping[str, RegionResults]) -> dict[str, Any]:
+    """Return all pooled arrays, and the values of every realization, by region."""
+    shown: dict[str, Any] = {}
+    for region, found in results.items():
+        pooled = found.pooled
+        shown[region] = {
+            "k": pooled.k,
+            "bin_edges": pooled.bin_edges,
+            "values": dict(pooled.values),
+            "quoted": dict(pooled.quoted),
+            "blocks": {name: list(blocks) for name, blocks in pooled.blocks.items()},
+            "total": dict(pooled.total),
+            "covered": dict(found.covered),
+            "corrected": found.corrected,
+            "eor": found.eor,
+            "input": found.put_in,
+        }
+    return shown

@@ -1,0 +1,120 @@
+r"""P^R corrected for signal loss: divided by the transfer function T of other realizations than the one it corrects.
+
+P^R / T estimates the EoR without loss. T of the same data would not do: it knows the EoR and the noise that are to be
+measured. T of realization r is the mean over those other realizations that share the fewest draws with r: none, if the
+blocks draw the EoR, gains and noise between them. T_r differs from that mean by
+
+    sigma_T^2 = sum_b s_b^2 sum_g w_g^2
+
+(`calstudy.power.realizations` has the blocks b of what is drawn), where g are the draws of block b, w = 1 for the draw
+of r, less the share that each draw has in the mean. s_b^2 is the scatter of the other realizations. Noise and EoR pass
+through the same projection, which reduces the noise in P^R by about T as well; dividing by T restores it to that of the
+data. So with P = P^R / T,
+
+    sigma^2 (P - P^S) = sigma_{R-S}^2 + (P sigma_T / T)^2,
+
+where sigma_{R-S} is the error of P^R - P^S, of noise and its product with the EoR (`difference_error`); P less the
+input power has the sample variance sigma_S^2 besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calstudy.power.realizations import TRANSFER_QUANTITIES, Design, Sample, difference_error
+
+LEAST_SIGNIFICANCE = 5.0
+"""P^R is divided by T where T is above so many times its error, as in `calstudy.power.transfer.correct`."""
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """P^R / T of K realizations in Nk bins, T of other realizations; NaN where T is too small to divide by.
+
+    Attributes
+    ----------
+    transfer, transfer_error
+        Mean T of the other realizations, and by how much T of this one is expected to differ from it, (K, Nk).
+    power
+        P^R / T, (K, Nk), mK^2 h^-3 Mpc^3.
+    error, error_with_sample
+        Standard deviations of its difference from P^S, and from the input power, (K, Nk).
+    shared
+        How many parts (of EoR, gains and noise) are the same in the realizations that T is from, (K,) int.
+    reasons
+        Why a bin is not corrected in any realization, (Nk,) str; empty where it is.
+    """
+
+    transfer: np.ndarray = field(metadata={"unit": ""})
+    transfer_error: np.ndarray = field(metadata={"unit": ""})
+    power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    error_with_sample: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    shared: np.ndarray = field(metadata={"unit": ""})
+    reasons: np.ndarray = field(metadata={"unit": ""})
+
+
+def transfer_of_others(values: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean T of other realizations, and the expected deviation of each one's own T from it, (K, Nk) each.
+
+    Parameters
+    ----------
+    values
+        T of all realizations, (K, Nk).
+    design
+        Which draws they have. A block with fewer than two other realizations leaves the deviation unknown: NaN.
+    """
+    mean, variance = np.empty(values.shape), np.zeros(values.shape)
+    for own in range(len(values)):
+        used = design.independent(own)
+        mean[own] = values[used].mean(axis=0)
+        for parts, places in design.blocks:
+            weights: dict[tuple[int, ...], float] = {}
+            for number, weight in [(own, 1.0), *((other, -1 / len(used)) for other in used)]:
+                draw = tuple(design.draws[number][part] for part in parts)
+                weights[draw] = weights.get(draw, 0.0) + weight
+            others = values[[place for place in places if place != own]]
+            scatter = others.var(axis=0, ddof=1) if len(others) > 1 else np.full(values.shape[1], np.nan)
+            variance[own] += scatter * sum(weight**2 for weight in weights.values())
+    return mean, np.sqrt(variance)
+
+
+def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected:
+    """Divide P^R of every realization by T of others; every sample must have a transfer function.
+
+    Where T is not above `LEAST_SIGNIFICANCE` times its error, by scatter or as quoted, whichever is larger, there is no
+    result.
+    """
+    transfer = TRANSFER_QUANTITIES["transfer"]
+    values = np.stack([transfer.value(sample) for sample in samples])
+    quoted = np.stack([transfer.error(sample) for sample in samples])
+    mean, error = transfer_of_others(values, design)
+    largest = np.fmax(error, np.sqrt(np.mean(quoted**2, axis=0)))
+    known = np.isfinite(error) & (mean > LEAST_SIGNIFICANCE * largest)
+    factor = np.where(known, mean, np.nan)
+    power = np.stack([sample.residual.power.real for sample in samples]) / factor
+    own = np.stack([difference_error(sample.residual) for sample in samples])
+    with_noise = np.hypot(own, power * error / factor)
+    with_sample = np.hypot(with_noise, np.stack([sample.residual.sample_error for sample in samples]))
+    return Corrected(
+        transfer=mean,
+        transfer_error=error,
+        power=power,
+        error=np.where(known, with_noise, np.nan),
+        error_with_sample=np.where(known, with_sample, np.nan),
+        shared=np.array([design.shared(item, design.independent(item)[0]) for item in range(len(samples))]),
+        reasons=np.array([_reason(*column) for column in zip(known.T, mean.T, largest.T, error.T, strict=True)]),
+    )
+
+
+def _reason(known: np.ndarray, mean: np.ndarray, largest: np.ndarray, error: np.ndarray) -> str:
+    if known.any():
+        return ""
+    if np.isnan(mean).all():
+        return "no modes"
+    if np.isnan(error).all():
+        return "too few realizations for an error of T"
+    return f"T = {np.nanmean(mean):.2f} is not above {LEAST_SIGNIFICANCE:g} times its error, {np.nanmean(largest):.2g}"

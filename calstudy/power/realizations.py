@@ -1,0 +1,353 @@
+r"""Pool what many realizations measured: mean, scatter and covariance between bins, and coverage of error bars.
+
+A study draws its parts (EoR, gains, noise) again in blocks, each block its own parts, and the first realization is in
+every block. To first order a measured quantity is then
+
+    x = mu + sum_b d_b,
+
+where d_b depends on the draw of block b alone. The variance of d_b is the scatter s_b^2 within block b of K_b
+realizations, and for several blocks
+
+    mu = sum_b mean_b - (B - 1) x_0,   scatter^2 = sum_b s_b^2,   error of mu^2 = sum_b s_b^2 / K_b,
+
+with x_0 of the realization that all B blocks have in common, whose d_b cancels. This scatter and this error include
+everything that was drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calstudy.power.spectra import SphericalSpectrum
+from calstudy.power.transfer import TransferFunction
+from calstudy.verdicts.criterion import Finding
+
+SIGMAS_95 = 1.96
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one realization measured in Nk bins of |k|.
+
+    Attributes
+    ----------
+    residual, without_eor, eor
+        P^R of data with and without the EoR, and P^S, with their errors.
+    put_in
+        Power of the EoR from which the sky was drawn, (Nk,), mK^2 h^-3 Mpc^3.
+    transfer
+        T in the same bins, or None where it is not known.
+    """
+
+    residual: SphericalSpectrum
+    without_eor: SphericalSpectrum
+    eor: SphericalSpectrum
+    put_in: np.ndarray
+    transfer: TransferFunction | None = None
+
+
+def difference_error(residual: SphericalSpectrum) -> np.ndarray:
+    """Return the standard deviation of P^R - P^S, (Nk,), where both hold the same EoR.
+
+    Of the variance P_S^2 + P_S P_N + P_N^2 / 2 of a mode (`calstudy.power.errors`) the first term is common to both.
+    """
+    noise, sample = residual.noise_error, residual.sample_error
+    return np.sqrt(noise**2 + np.sqrt(2) * noise * sample)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number per bin of k that is pooled.
+
+    Attributes
+    ----------
+    symbol
+        For tables.
+    value, error
+        From a sample to the value and its quoted standard deviation, (Nk,) each.
+    """
+
+    symbol: str
+    value: Callable[[Sample], np.ndarray]
+    error: Callable[[Sample], np.ndarray]
+
+
+def _over_eor(values: np.ndarray, sample: Sample) -> np.ndarray:
+    return values / sample.eor.power.real
+
+
+def _pull(values: np.ndarray, error: np.ndarray) -> np.ndarray:
+    return np.divide(values, error, out=np.full(values.shape, np.nan), where=error > 0)
+
+
+def _one(sample: Sample) -> np.ndarray:
+    return np.ones(sample.eor.k.size)
+
+
+QUANTITIES = {
+    "ratio": Quantity(
+        "P^R / P^S",
+        lambda s: _over_eor(s.residual.power.real, s),
+        lambda s: _over_eor(difference_error(s.residual), s),
+    ),
+    "bias": Quantity(
+        "P^R0 / P^S", lambda s: _over_eor(s.without_eor.power.real, s), lambda s: _over_eor(s.without_eor.error, s)
+    ),
+    "pull_eor": Quantity(
+        "(P^R - P^S) / sigma",
+        lambda s: _pull(s.residual.power.real - s.eor.power.real, difference_error(s.residual)),
+        _one,
+    ),
+    "pull_input": Quantity(
+        "(P^R - input) / sigma", lambda s: _pull(s.residual.power.real - s.put_in, s.residual.error), _one
+    ),
+    "pull_without_eor": Quantity(
+        "P^R0 / sigma_N", lambda s: _pull(s.without_eor.power.real, s.without_eor.error), _one
+    ),
+}
+"""Of power spectra, known in every region."""
+
+
+def _of_transfer(name: str) -> tuple[Callable[[Sample], np.ndarray], Callable[[Sample], np.ndarray]]:
+    """Return value and quoted error of a field of the transfer function; NaN where it has no error."""
+
+    def read(field: str) -> Callable[[Sample], np.ndarray]:
+        return lambda sample: np.broadcast_to(getattr(sample.transfer, field, np.nan), sample.eor.k.shape)
+
+    return read(name), read(f"{name}_error")
+
+
+TRANSFER_QUANTITIES = {
+    "transfer": Quantity("T", *_of_transfer("transfer")),
+    "cross_transfer": Quantity("C", *_of_transfer("cross_transfer")),
+    "squared_coherence": Quantity("C^2 / T", *_of_transfer("squared_coherence")),
+}
+"""Of the transfer function: fields of `TransferFunction`; a single number counts for all bins."""
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """One quantity over the realizations of one block, or of all blocks, in Nk bins.
+
+    Attributes
+    ----------
+    mean, scatter, error
+        Mean, standard deviation of one realization, and standard error of the mean, (Nk,).
+    quoted
+        rms of the errors that the realizations quote, (Nk,).
+    covariance
+        Of one realization, between bins, (Nk, Nk). Its rank is below the number of realizations.
+    """
+
+    mean: np.ndarray
+    scatter: np.ndarray
+    error: np.ndarray
+    quoted: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Covariance over the product of the standard deviations, (Nk, Nk); NaN without scatter."""
+        return _pull(self.covariance, np.outer(self.scatter, self.scatter))
+
+
+def pool(values: np.ndarray, quoted: np.ndarray) -> Pooled:
+    """Pool one quantity over K realizations.
+
+    Parameters
+    ----------
+    values, quoted
+        Of each realization and its quoted error, (K, Nk).
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two realizations.
+    """
+    if len(values) < 2:
+        raise ValueError(f"{len(values)} realization to pool, expected at least two")
+    deviations = values - values.mean(axis=0)
+    covariance = deviations.T @ deviations / (len(values) - 1)
+    scatter = np.sqrt(np.diagonal(covariance))
+    rms = np.sqrt(np.mean(quoted**2, axis=0))
+    return Pooled(values.mean(axis=0), scatter, scatter / np.sqrt(len(values)), rms, covariance)
+
+
+def together(blocks: Sequence[Pooled], common: np.ndarray) -> Pooled:
+    """Return what blocks that draw different parts say together.
+
+    Parameters
+    ----------
+    blocks
+        The quantity, pooled over each block.
+    common
+        Its value in the realization that all blocks have in common, (Nk,).
+    """
+    return Pooled(
+        mean=np.sum([block.mean for block in blocks], axis=0) - (len(blocks) - 1) * common,
+        scatter=np.sqrt(np.sum([block.scatter**2 for block in blocks], axis=0)),
+        error=np.sqrt(np.sum([block.error**2 for block in blocks], axis=0)),
+        quoted=np.sqrt(np.mean([block.quoted**2 for block in blocks], axis=0)),
+        covariance=np.sum([block.covariance for block in blocks], axis=0),
+    )
+
+
+@dataclass(frozen=True)
+class Design:
+    """Which realization has which draws.
+
+    Attributes
+    ----------
+    draws
+        Number of the draw of each part, for each of K realizations.
+    blocks
+        Parts that each block draws, and which realizations belong to it; the first belongs to all.
+    """
+
+    draws: Sequence[Mapping[str, int]]
+    blocks: Sequence[tuple[Sequence[str], Sequence[int]]]
+
+    def shared(self, first: int, second: int) -> int:
+        """Return how many parts two realizations have in common."""
+        return sum(self.draws[second][part] == number for part, number in self.draws[first].items())
+
+    def independent(self, realization: int) -> list[int]:
+        """Return the other realizations that share the fewest parts with one."""
+        others = [number for number in range(len(self.draws)) if number != realization]
+        fewest = min(self.shared(realization, number) for number in others)
+        return [number for number in others if self.shared(realization, number) == fewest]
+
+    def block_of(self, part: str) -> int | None:
+        """Return the block that draws a part, or None."""
+        return next((place for place, (parts, _) in enumerate(self.blocks) if part in parts), None)
+
+
+@dataclass(frozen=True)
+class PooledRegion:
+    """All quantities in one part of Fourier space.
+
+    Attributes
+    ----------
+    k, bin_edges
+        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
+    design
+        Which realization has which draws.
+    values, quoted
+        Of all K realizations, (K, Nk), by the name of the quantity.
+    blocks
+        Pooled over each block, by the name of the quantity.
+    total
+        Of all blocks together.
+    """
+
+    k: np.ndarray
+    bin_edges: np.ndarray
+    design: Design
+    values: Mapping[str, np.ndarray]
+    quoted: Mapping[str, np.ndarray]
+    blocks: Mapping[str, Sequence[Pooled]]
+    total: Mapping[str, Pooled]
+
+
+def quantities_of(sample: Sample) -> dict[str, Quantity]:
+    """Return the quantities that are known of a sample, those of the transfer function first."""
+    return (TRANSFER_QUANTITIES if sample.transfer is not None else {}) | QUANTITIES
+
+
+def pool_region(samples: Sequence[Sample], design: Design) -> PooledRegion:
+    """Pool all quantities; all samples must have the same bins.
+
+    Raises
+    ------
+    ValueError
+        If they have not.
+    """
+    first = samples[0].eor
+    if any(not np.array_equal(sample.eor.bin_edges, first.bin_edges) for sample in samples):
+        raise ValueError("the realizations have different bins of k, expected the same")
+    values, quoted, blocks, total = {}, {}, {}, {}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for name, quantity in quantities_of(samples[0]).items():
+            values[name] = np.stack([quantity.value(sample) for sample in samples])
+            quoted[name] = np.stack([quantity.error(sample) for sample in samples])
+            rows = [list(places) for _, places in design.blocks]
+            blocks[name] = tuple(pool(values[name][row], quoted[name][row]) for row in rows)
+            total[name] = together(blocks[name], values[name][0])
+    return PooledRegion(first.k, first.bin_edges, design, values, quoted, blocks, total)
+
+
+def inside_bars(deviations: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return 1 where a deviation is within its 95 % bar, 0 where it is not, NaN where either is not known."""
+    known = np.isfinite(deviations) & np.isfinite(errors)
+    return np.where(known, np.abs(deviations) <= SIGMAS_95 * errors, np.nan)
+
+
+def coverage(inside: np.ndarray, independent: bool) -> Finding:
+    """Return the part of 95 % bars that cover, and its uncertainty.
+
+    The uncertainty is the larger of that by the scatter over realizations, which knows of correlated bins, and the
+    binomial one for 95 % of independent bins.
+
+    Parameters
+    ----------
+    inside
+        From `inside_bars`, (K, Nk).
+    independent
+        Whether what the bars are for is drawn in every realization; if not, the realizations repeat the same trials,
+        and one realization's number of bins decides.
+    """
+    known = np.isfinite(inside)
+    if not known.any():
+        return Finding(np.nan, np.nan)
+    each = np.array([row[used].mean() for row, used in zip(inside, known, strict=True) if used.any()])
+    trials = known.sum() if independent else known.sum(axis=1).max()
+    binomial = float(np.sqrt(0.95 * 0.05 / trials))
+    by_scatter = float(each.std(ddof=1) / np.sqrt(each.size)) if independent and each.size > 1 else 0.0
+    return Finding(float(inside[known].mean()), max(binomial, by_scatter))
+
+
+def mean_over_bins(values: np.ndarray, design: Design) -> Finding:
+    """Return the mean of a quantity over bins, and its error by the scatter over all that was drawn.
+
+    Bins that are not known in all realizations are left out.
+
+    Parameters
+    ----------
+    values
+        Of all realizations, (K, Nbins).
+    design
+        Which draws they have.
+    """
+    known = np.isfinite(values).all(axis=0)
+    if not known.any():
+        return Finding(np.nan, np.nan)
+    each = values[:, known].mean(axis=1, keepdims=True)
+    pooled = [pool(each[list(places)], np.zeros((len(places), 1))) for _, places in design.blocks]
+    found = together(pooled, each[0])
+    return Finding(float(found.mean[0]), float(found.error[0]))
+
+
+def error_ratio(values: np.ndarray, quoted: np.ndarray) -> Finding:
+    """Return the scatter over realizations over the quoted error, rms over bins, with its jackknife error.
+
+    Parameters
+    ----------
+    values, quoted
+        Of the realizations of one block and their quoted errors, (K, Nbins). One: the quoted errors are right for what
+        the block draws.
+    """
+    known = np.isfinite(values).all(axis=0) & np.isfinite(quoted).all(axis=0)
+    count = len(values)
+    if not known.any() or count < 3:
+        return Finding(np.nan, np.nan)
+
+    def ratio(rows: np.ndarray) -> float:
+        errors = np.mean(quoted[rows][:, known] ** 2)
+        return float(np.sqrt(values[rows][:, known].var(axis=0, ddof=1).mean() / errors))
+
+    left_out = np.array([ratio(np.delete(np.arange(count), number)) for number in range(count)])
+    error = np.sqrt((count - 1) * np.mean((left_out - left_out.mean()) ** 2))
+    return Finding(ratio(np.arange(count)), float(error))
