@@ -13,8 +13,8 @@ data. So with P = P^R / T,
 
     sigma^2 (P - P^S) = sigma_{R-S}^2 + (P sigma_T / T)^2,
 
-where sigma_{R-S} is the error of P^R - P^S, of noise and its product with the EoR (`difference_error`); P less the
-input power has the sample variance sigma_S^2 besides.
+where sigma_{R-S} is the error of P^R - P^S, of noise and its product with the EoR
+(`SphericalSpectrum.difference_error`); P less the input power has the sample variance sigma_S^2 besides.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calstudy.power.realizations import TRANSFER_QUANTITIES, Design, Sample, difference_error
+from calstudy.power.realizations import TRANSFER_QUANTITIES, Design, Sample
 
 LEAST_SIGNIFICANCE = 5.0
 """P^R is divided by T where T is above so many times its error, as in `calstudy.power.transfer.correct`."""
@@ -96,7 +96,7 @@ def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected
     known = np.isfinite(error) & (mean > LEAST_SIGNIFICANCE * largest)
     factor = np.where(known, mean, np.nan)
     power = np.stack([sample.residual.power.real for sample in samples]) / factor
-    own = np.stack([difference_error(sample.residual) for sample in samples])
+    own = np.stack([sample.residual.difference_error for sample in samples])
     with_noise = np.hypot(own, power * error / factor)
     with_sample = np.hypot(with_noise, np.stack([sample.residual.sample_error for sample in samples]))
     return Corrected(

@@ -49,15 +49,6 @@ class Sample:
     transfer: TransferFunction | None = None
 
 
-def difference_error(residual: SphericalSpectrum) -> np.ndarray:
-    """Return the standard deviation of P^R - P^S, (Nk,), where both hold the same EoR.
-
-    Of the variance P_S^2 + P_S P_N + P_N^2 / 2 of a mode (`calstudy.power.errors`) the first term is common to both.
-    """
-    noise, sample = residual.noise_error, residual.sample_error
-    return np.sqrt(noise**2 + np.sqrt(2) * noise * sample)
-
-
 @dataclass(frozen=True)
 class Quantity:
     """A number per bin of k that is pooled.
@@ -91,14 +82,14 @@ QUANTITIES = {
     "ratio": Quantity(
         "P^R / P^S",
         lambda s: _over_eor(s.residual.power.real, s),
-        lambda s: _over_eor(difference_error(s.residual), s),
+        lambda s: _over_eor(s.residual.difference_error, s),
     ),
     "bias": Quantity(
         "P^R0 / P^S", lambda s: _over_eor(s.without_eor.power.real, s), lambda s: _over_eor(s.without_eor.error, s)
     ),
     "pull_eor": Quantity(
         "(P^R - P^S) / sigma",
-        lambda s: _pull(s.residual.power.real - s.eor.power.real, difference_error(s.residual)),
+        lambda s: _pull(s.residual.power.real - s.eor.power.real, s.residual.difference_error),
         _one,
     ),
     "pull_input": Quantity(
@@ -122,6 +113,8 @@ def _of_transfer(name: str) -> tuple[Callable[[Sample], np.ndarray], Callable[[S
 
 TRANSFER_QUANTITIES = {
     "transfer": Quantity("T", *_of_transfer("transfer")),
+    "scale_free_transfer": Quantity("T s^2", *_of_transfer("scale_free_transfer")),
+    "flux_scale": Quantity("s", *_of_transfer("flux_scale")),
     "cross_transfer": Quantity("C", *_of_transfer("cross_transfer")),
     "squared_coherence": Quantity("C^2 / T", *_of_transfer("squared_coherence")),
 }

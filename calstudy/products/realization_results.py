@@ -14,7 +14,6 @@ from calstudy.power.realizations import (
     Design,
     PooledRegion,
     coverage,
-    difference_error,
     inside_bars,
     mean_over_bins,
     pool_region,
@@ -142,7 +141,7 @@ def results_of(samples: Sequence[Sample], design: Design) -> RegionResults:
     residual, eor = (np.stack([getattr(sample, name).power.real for sample in samples]) for name in ("residual", "eor"))
     put_in = np.stack([sample.put_in for sample in samples])
     covered = {
-        "eor": inside_bars(residual - eor, np.stack([difference_error(sample.residual) for sample in samples])),
+        "eor": inside_bars(residual - eor, np.stack([sample.residual.difference_error for sample in samples])),
         "input": inside_bars(residual - put_in, np.stack([sample.residual.error for sample in samples])),
     }
     corrected = None
