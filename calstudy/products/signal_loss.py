@@ -10,7 +10,7 @@ from calstudy.base.resources import Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.products import calibration, corruption, spectra
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import AVERAGE, read_visibilities, spectrum_file, write_visibilities
+from calstudy.products.files import AVERAGE, read_json, read_visibilities, spectrum_file, write_json, write_visibilities
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
 
@@ -18,6 +18,7 @@ REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Names of the parts of Fourier space, and whether each is inside the wedge."""
 TRANSFER = "transfer"
 BAND = "transfer-bands"
+SCALE = "scale.json"
 
 
 @once
@@ -44,11 +45,21 @@ def transfer(graph: Graph) -> Task | None:
         "response": spectra.crossed(graph, "response to the EoR", responses),
         "cross": spectra.crossed(graph, "EoR x response", {"even": signal, "odd": responses["odd"]}),
         "spectra": spectra.spectra(graph),
-        **{f"calibration {parity}": calibration.calibration(graph, residual, parity) for parity in PARITIES},
+        "scale": _flux_scale(graph),
     }
+    return Task(TRANSFER_STAGE, "signal loss", {"power": graph.experiment.power}, inputs)
+
+
+def _flux_scale(graph: Graph) -> Task:
+    """Return the task of the flux scale of the calibration of data with the EoR.
+
+    It is a product of its own, so that T can be made again without calibrating where calibrations are not kept.
+    """
+    residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
+    inputs = {parity: calibration.calibration(graph, residual, parity) for parity in PARITIES}
     if residual.effects:
         inputs["gains"] = corruption.gains(graph)
-    return Task(TRANSFER_STAGE, "signal loss", {"power": graph.experiment.power}, inputs)
+    return Task(FLUX_SCALE, "flux scale", {"taper": graph.experiment.power.taper}, inputs)
 
 
 def difference(job: Job) -> Mapping[str, Any]:
@@ -70,7 +81,8 @@ def measure(job: Job) -> Mapping[str, Any]:
     delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
     injection = Injection(**delays)
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
-    scale = _flux_scale(job, injection.signal.taper)
+    known = read_json(job.inputs["scale"] / SCALE)["flux_scale"]
+    scale = math.nan if known is None else known
     summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
         for name, edges in ((TRANSFER, fine), (BAND, BANDS)):
@@ -86,8 +98,8 @@ def measure(job: Job) -> Mapping[str, Any]:
     return {"transfer": summary, "flux_scale": _json(scale)}
 
 
-def _flux_scale(job: Job, taper: str) -> float:
-    """Return the flux scale of the calibration of data with the EoR, first polarization."""
+def measure_flux_scale(job: Job) -> Mapping[str, Any]:
+    """Write the flux scale of the first polarization, null if it is not known, to scale.json."""
     import numpy as np
 
     from calstudy.power.delay import make_taper
@@ -96,12 +108,14 @@ def _flux_scale(job: Job, taper: str) -> float:
 
     ratios = []
     for parity in PARITIES:
-        fitted = read_gains(job.inputs[f"calibration {parity}"])
+        fitted = read_gains(job.inputs[parity])
         true = np.ones(fitted.values.shape[1:])
         if "gains" in job.inputs:
             true = read_gains(job.inputs["gains"]).of(fitted.numbers)[0]
         ratios.append(gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values)))
-    return flux_scale(ratios[0], ratios[1], make_taper(taper, fitted.frequency.size) ** 2)
+    scale = flux_scale(ratios[0], ratios[1], make_taper(job.settings["taper"], fitted.frequency.size) ** 2)
+    write_json(job.output / SCALE, {"flux_scale": scale if math.isfinite(scale) else None})
+    return {}
 
 
 def _json(value: float) -> float | None:
@@ -140,4 +154,5 @@ def _cost_of_difference(task: Task) -> Cost:
 
 
 DIFFERENCE = Stage(name="difference", version=2, make=difference, cost=_cost_of_difference)
-TRANSFER_STAGE = Stage(name="transfer", version=3, make=measure, cost=lambda task: Cost(8, disk=1e6))
+FLUX_SCALE = Stage(name="flux-scale", version=1, make=measure_flux_scale, cost=lambda task: Cost(4, disk=1e3))
+TRANSFER_STAGE = Stage(name="transfer", version=3, make=measure, cost=lambda task: Cost(4, disk=1e6))

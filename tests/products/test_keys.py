@@ -34,7 +34,16 @@ def changed_stages(path: str, value: object) -> set[str]:
 
 
 AVERAGED = {"power", "spectra", "figure", "claims", "transfer"}
-DOWNSTREAM = {"levels", "corrupt", "calibrate-chunk", "calibrate", "average", "difference", "agreement"} | AVERAGED
+DOWNSTREAM = {
+    "levels",
+    "corrupt",
+    "calibrate-chunk",
+    "calibrate",
+    "average",
+    "difference",
+    "agreement",
+    "flux-scale",
+} | AVERAGED
 
 
 @pytest.mark.parametrize(
@@ -46,7 +55,7 @@ DOWNSTREAM = {"levels", "corrupt", "calibrate-chunk", "calibrate", "average", "d
         ("outputs.figures", ["layout"], set()),
         ("power.wedge_buffer", "200 ns", {"spectra", "figure", "agreement", "claims", "transfer"}),
         ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure", "claims", "transfer"}),
-        ("power.taper", "hann", AVERAGED),
+        ("power.taper", "hann", AVERAGED | {"flux-scale"}),
         ("calibration.basis.buffer", "80 ns", DOWNSTREAM - {"levels", "corrupt"}),
         ("corruption.effects.0.seed", 99, {"effect", "gains"} | DOWNSTREAM - {"levels"}),
         ("corruption.noise.seeds", [8, 9], DOWNSTREAM - {"levels"}),
