@@ -62,30 +62,18 @@ def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndar
     -------
     (n_bins,) float, zero for empty bins.
     """
-    units = np.arange(len(spectra.n_pairs))
-    products = spectra.n_pairs * spectra.n_polarizations
-    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / products))
+    return _modes_of_noise(spectra, bins, n_bins, spectra.n_pairs)
 
 
 def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return how many independent products of signal and noise each bin averages.
+    """Return how many independent products of signal and noise each bin averages; parameters as in `noise_modes`."""
+    return _modes_of_noise(spectra, bins, n_bins, spectra.n_baselines)
 
-    Parameters
-    ----------
-    spectra
-        The averaged spectra.
-    bins
-        Bin of each mode, (Nu, Nd) int, -1 for those left out.
-    n_bins
-        Number of bins.
 
-    Returns
-    -------
-    (n_bins,) float, zero for empty bins.
-    """
+def _modes_of_noise(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
+    """Return the effective modes where a unit averages so many independent samples of each polarization, (Nu,)."""
     units = np.arange(len(spectra.n_pairs))
-    baselines = spectra.n_baselines * spectra.n_polarizations
-    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / baselines))
+    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / (independent * spectra.n_polarizations)))
 
 
 def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
