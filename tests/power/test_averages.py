@@ -265,6 +265,7 @@ def test_the_error_of_the_difference_is_the_scatter_where_the_signal_is_common(n
     predicted = errors.with_errors(both[0][0], noise=np.sqrt(0.5), signal=expected).difference_error
     # 2000 trials give each standard deviation to 1.6 %; limits are four times that.
     np.testing.assert_allclose(scatter / predicted, 1.0, atol=0.065)
+    assert np.mean(scatter / predicted) == pytest.approx(1.0, abs=0.04)
 
 
 def test_polarizations_share_the_signal_not_the_noise():
