@@ -17,7 +17,7 @@ from calstudy.base.identity import digest_json
 from calstudy.base.resources import cores
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Product, Store
-from calstudy.run.task import Task, unique
+from calstudy.run.task import Task
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -160,25 +160,47 @@ def _client(workers: Workers) -> Iterator[Client]:
         yield client
 
 
-def _submit(tasks: Sequence[Task], store: Store, client: Client) -> dict[Future, Task]:
-    futures: dict[str, Future] = {}
-    for priority, task in enumerate(tasks):
-        needed = [futures[item.key] for item in task.needs.values() if item.key in futures]
-        futures[task.key] = client.submit(
-            _perform_after,
-            WorkOrder.of(task, store),
-            needed,
-            key=f"{task.stage.name}-{task.key}-{digest_json(str(store.root))[:8]}",
-            priority=-priority,
+class _Queue:
+    """Hands tasks to the workers, each once all that it needs is made.
+
+    The scheduler knows of no dependencies. If a worker dies, what it was making is made again, but not what it had made
+    before: products are files, and temporary ones may have been dropped.
+    """
+
+    def __init__(self, tasks: Sequence[Task], store: Store, client: Client) -> None:
+        self._store, self._client = store, client
+        self._priority = {task.key: -place for place, task in enumerate(tasks)}
+        self._tasks = {task.key: task for task in tasks}
+        self._missing = {
+            task.key: {needed.key for needed in task.needs.values()} & self._tasks.keys() for task in tasks
+        }
+        self._users: dict[str, list[str]] = {task.key: [] for task in tasks}
+        for key, missing in self._missing.items():
+            for needed in missing:
+                self._users[needed].append(key)
+
+    def first(self) -> dict[Future, Task]:
+        """Submit the tasks that need nothing."""
+        return self._submit(key for key, missing in self._missing.items() if not missing)
+
+    def after(self, task: Task) -> dict[Future, Task]:
+        """Submit the tasks that needed nothing but this one any more."""
+        users = self._users[task.key]
+        for key in users:
+            self._missing[key].discard(task.key)
+        return self._submit(key for key in users if not self._missing[key])
+
+    def _submit(self, keys: Iterable[str]) -> dict[Future, Task]:
+        return {self._future(self._tasks[key]): self._tasks[key] for key in keys}
+
+    def _future(self, task: Task) -> Future:
+        return self._client.submit(
+            perform,
+            WorkOrder.of(task, self._store),
+            key=f"{task.stage.name}-{task.key}-{digest_json(str(self._store.root))[:8]}",
+            priority=self._priority[task.key],
             pure=False,
         )
-    return {futures[task.key]: task for task in tasks}
-
-
-def _perform_after(order: WorkOrder, needed: list[Product]) -> Product:
-    """Make a product once those it needs (which dask passes, and so waits for) are made."""
-    del needed
-    return perform(order)
 
 
 def execute(
@@ -218,9 +240,11 @@ def execute(
     from distributed import KilledWorker, as_completed
 
     with _client(workers) as client:
-        futures = _submit(tasks, store, client)
-        for future in as_completed(futures):
-            task = futures[future]
+        queue = _Queue(tasks, store, client)
+        futures = queue.first()
+        completed = as_completed(futures)
+        for future in completed:
+            task = futures.pop(future)
             try:
                 product = future.result()
             except KilledWorker:
@@ -228,7 +252,12 @@ def execute(
                     f"{task.stage.name} ({task.label}): its worker process died repeatedly, most likely for want of "
                     "memory; use fewer --workers, or smaller chunks, and run again: finished products are kept"
                 ) from None
+            # The client would have a result that it holds computed again if its worker dies.
+            future.release()
             products[task.key] = product
+            started = queue.after(task)
+            futures |= started
+            completed.update(started)
             done(task, product)
     return products
 
@@ -249,13 +278,15 @@ class Lifetimes:
     Parameters
     ----------
     targets
-        What the run is for. A product is temporary if the first task in their order that makes it says so.
+        What the run is for. A product is temporary if all tasks that make it say so.
     todo
         The tasks that the run makes, from `schedule`.
     """
 
     def __init__(self, targets: Iterable[Task], todo: Sequence[Task]) -> None:
-        self._temporary = {task.key: task for task in unique(targets) if task.temporary}
+        tasks = _all_tasks(targets)
+        kept = {task.key for task in tasks if not task.temporary}
+        self._temporary = {task.key: task for task in tasks if task.key not in kept}
         self._users = dict.fromkeys(self._temporary, 0)
         for task in todo:
             for key in self._needed_by(task):
@@ -276,11 +307,28 @@ class Lifetimes:
         return [self._temporary[key] for key in needed if self._users[key] == 0]
 
 
+def _all_tasks(targets: Iterable[Task]) -> list[Task]:
+    """Return targets and all that they need; tasks that make the same product are all among them."""
+    found: dict[int, Task] = {}
+    waiting = list(targets)
+    while waiting:
+        task = waiting.pop()
+        if id(task) not in found:
+            found[id(task)] = task
+            waiting += task.needs.values()
+    return list(found.values())
+
+
 def drop(tasks: Iterable[Task], store: Store) -> None:
-    """Remove the products of tasks, as far as they are there; a store that can only be read keeps them."""
+    """Remove the products of tasks, as far as they are there and were made as temporary ones.
+
+    What another run made to be kept stays, and so does everything in a store that can only be read.
+    """
     for task in tasks:
-        with suppress(OSError):
-            store.discard(task.stage.name, task.key)
+        product = store.find(task.stage.name, task.key)
+        if product is not None and product.record.get("temporary"):
+            with suppress(OSError):
+                store.discard(task.stage.name, task.key)
 
 
 def largest_disk(targets: Iterable[Task], todo: Sequence[Task]) -> float:

@@ -32,6 +32,7 @@ class WorkOrder:
     settings: Mapping[str, Any]
     inputs: Mapping[str, tuple[str, str]]
     store: Path
+    temporary: bool
 
     @classmethod
     def of(cls, task: Task, store: Store) -> WorkOrder:
@@ -43,6 +44,7 @@ class WorkOrder:
             settings=task.settings,
             inputs={name: (needed.stage.name, needed.key) for name, needed in task.needs.items()},
             store=store.root,
+            temporary=task.temporary,
         )
 
 
@@ -117,6 +119,7 @@ def _make(order: WorkOrder, store: Store) -> Product:
             "settings": plain(order.settings),
             "inputs": order.inputs,
             "notes": notes,
+            "temporary": order.temporary,
             "calstudy": __version__,
             "started": started.isoformat(timespec="seconds"),
             "seconds": round(usage.seconds, 3),

@@ -123,7 +123,18 @@ def test_a_run_that_was_interrupted_drops_nothing_that_it_still_needs(store):
 def test_a_product_that_another_part_of_the_run_keeps_is_not_temporary(store):
     kept, fleeting = chain(temporary=False), chain(temporary=True)
     run(kept[-1], store)
-    assert Lifetimes([kept[-1], fleeting[-1]], ()).unused() == []
+    for targets in ([kept[-1], fleeting[-1]], [fleeting[-1], kept[-1]]):
+        assert Lifetimes(targets, ()).unused() == []
+
+
+def test_a_product_that_another_run_made_to_be_kept_is_not_dropped(store):
+    kept, fleeting = chain(temporary=False), chain(temporary=True)
+    run(kept[1], store)
+    run(fleeting[-1], store)
+    drop(Lifetimes([fleeting[-1]], ()).unused(), store)
+    found = [store.find("number", task.key) is not None for task in fleeting]
+    # Data and first half were made to be kept, the second half was not; the total is not temporary.
+    assert found == [True, True, False, True]
 
 
 def test_the_disk_of_a_plan_counts_what_is_there_at_one_time(store):
@@ -225,6 +236,46 @@ def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, workers):
     assert result.returncode == 1
     assert "RuntimeError: stage (label): the process was told to exit" in result.stderr
     assert "in leave" in result.stderr
+
+
+DYING = """
+import os, signal, time
+from pathlib import Path
+from calstudy.run.execution import Lifetimes, Workers, drop, execute, schedule
+from calstudy.run.store import Store
+from calstudy.run.task import Stage, Task
+
+def make(job):
+    with open("made", "a") as log:
+        log.write(job.settings["name"] + " ")
+    if job.settings["name"] == "last" and not Path("died").exists():
+        Path("died").touch()
+        time.sleep(1)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {}
+
+STAGE = Stage(name="stage", version=1, make=make)
+
+if __name__ == "__main__":
+    store = Store(Path("store"))
+    store.prepare()
+    data = Task(STAGE, "data", {"name": "data"}, temporary=True)
+    result = Task(STAGE, "result", {"name": "result"}, {"data": data})
+    last = Task(STAGE, "last", {"name": "last"}, {"result": result})
+    todo = schedule([last], store).todo
+    lifetimes = Lifetimes([last], todo)
+    execute(todo, store, Workers(2, Path("run.log")), lambda task, product: drop(lifetimes.after(task), store))
+    print(store.find("stage", last.key) is not None, store.find("stage", data.key) is None)
+"""
+
+
+def test_what_a_dead_worker_had_made_is_not_made_again(tmp_path):
+    """A worker is killed once while it makes the last product; the temporary data were dropped before."""
+    (tmp_path / "program.py").write_text(DYING)
+    command = [sys.executable, "program.py"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, timeout=120)
+    assert result.stdout.split() == ["True", "True"], result.stderr
+    assert (tmp_path / "made").read_text().split() == ["data", "result", "last", "last"]
 
 
 @pytest.mark.parametrize("make", ["write_much", "write_hdf5"])
