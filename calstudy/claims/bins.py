@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
@@ -90,47 +92,72 @@ def ratio(above: Finding, below: Finding) -> Finding:
     return Finding(value, abs(value) * np.hypot(above.uncertainty / above.value, below.uncertainty / below.value))
 
 
-def difference_of_ratios(
-    first: tuple[SphericalSpectrum, SphericalSpectrum],
-    second: tuple[SphericalSpectrum, SphericalSpectrum],
-    k_min: float,
-    k_max: float = np.inf,
-) -> Finding:
+@dataclass(frozen=True)
+class RecoveredPower:
+    """What two runs are compared by, in the same bins.
+
+    Attributes
+    ----------
+    residual, eor
+        P^R and P^S.
+    loss_error
+        Standard deviation of the transfer function, (Nk,): the runs lose different amounts by chance.
+    """
+
+    residual: SphericalSpectrum
+    eor: SphericalSpectrum
+    loss_error: np.ndarray
+
+
+def difference_of_ratios(first: RecoveredPower, second: RecoveredPower, used: np.ndarray) -> Finding:
     """Return P^R / P^S of one run minus that of another: the mean of the differences of single bins.
 
     Each bin has the same weight in both runs, the inverse variance of its difference, so that a difference between the
-    runs cannot come from how bins of unlike ratios are averaged.
+    runs cannot come from how bins of unlike ratios are averaged. Noise is independent from bin to bin. What the gains
+    absorb by chance is taken as common to all bins, because they share the gains.
 
     Parameters
     ----------
     first, second
-        P^R and P^S of each run, in the same bins.
-    k_min, k_max
-        Bins that are used, h/Mpc.
+        The runs.
+    used
+        Bins, (Nk,) bool, in which all of it is known.
     """
-    used = used_bins(*first, *second, k_min=k_min, k_max=k_max)
-    ratios, variances = [], []
-    for residual, eor in (first, second):
-        signal = eor.power.real[used]
-        ratios.append(residual.power.real[used] / signal)
-        variances.append((residual.difference_error[used] / signal) ** 2)
+    ratios, variances, common = [], [], []
+    for run in (first, second):
+        signal = run.eor.power.real[used]
+        ratios.append(run.residual.power.real[used] / signal)
+        variances.append((run.residual.difference_error[used] / signal) ** 2)
+        common.append(run.loss_error[used])
     weights = 1 / sum(variances)
-    return Finding(float(np.sum(weights * (ratios[0] - ratios[1])) / weights.sum()), float(weights.sum() ** -0.5))
+    weights /= weights.sum()
+    error = np.sqrt(np.sum(weights**2 * sum(variances)) + sum(np.sum(weights * part) ** 2 for part in common))
+    return Finding(float(np.sum(weights * (ratios[0] - ratios[1]))), float(error))
 
 
 def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
     """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error.
 
-    That is the upper edge of the first run of such bins, from small k up. Before it there may be bins in which P^R is
-    below P^S by less than their errors, because few modes are in them. If there is no such run before the first bin in
-    which P^R is not below P^S, it is the lower edge of the first bin. The uncertainty is half a bin.
+    That is the upper edge of the last such bin before two in succession are not. The lowest bin may be one that is not,
+    if the next is: few modes are in it. Without any bias it is the lower edge of the first bin. The uncertainty is half
+    a bin, or what a deviation by 3 sigma instead of 95 % makes of it if that is more.
     """
     used = np.flatnonzero(used_bins(residual, eor))
     pull = ((eor.power.real - residual.power.real) / residual.difference_error)[used]
-    biased = pull > SIGMAS_95
-    # Each search ends at the end of the bins at the latest.
-    start = int(np.argmax(np.append(biased | ~(pull > 0), True)))
-    end = start + int(np.argmax(np.append(~biased[start:], True)))
     edges = residual.bin_edges
-    edge = edges[used[end - 1] + 1] if end > start else edges[used[0]]
-    return Finding(float(edge), float(np.diff(edges)[0] / 2))
+    ends = [
+        edges[used[0]] if last is None else edges[used[last] + 1]
+        for last in map(_last_biased, (pull > SIGMAS_95, pull > 3))
+    ]
+    return Finding(float(ends[0]), max(float(np.diff(edges)[0] / 2), float(abs(ends[0] - ends[1]))))
+
+
+def _last_biased(biased: np.ndarray) -> int | None:
+    """Return the last bin that is biased before two that are not, or None if none of the first two is."""
+    last = None
+    for place, is_biased in enumerate(biased):
+        if is_biased:
+            last = place
+        elif place - (-1 if last is None else last) > 1:
+            break
+    return last

@@ -1,8 +1,9 @@
 r"""P^R corrected for signal loss: divided by the transfer function T of other realizations than the one it corrects.
 
 P^R / T estimates the EoR without loss. T of the same data would not do: it knows the EoR and the noise that are to be
-measured. T of realization r is the mean over those other realizations that share the fewest draws with r: none, if the
-blocks draw the EoR, gains and noise between them. T_r differs from that mean by
+measured. T of realization r is the mean over realizations of other gains and other noise, which cause most of the
+scatter of T (through the flux scale); each draw of them has the same weight. The EoR may be the same: T is a ratio to
+its power, and hardly depends on it. T_r differs from that mean by
 
     sigma_T^2 = sum_b s_b^2 sum_g w_g^2
 
@@ -42,8 +43,10 @@ class Corrected:
         P^R / T, (K, Nk), mK^2 h^-3 Mpc^3.
     error, error_with_sample
         Standard deviations of its difference from P^S, and from the input power, (K, Nk).
+    power_known_scale
+        P^R s^2 / (T s^2), (K, Nk): P^R on the true flux scale, by s of the realization itself, over T s^2 of others.
     shared
-        How many parts (of EoR, gains and noise) are the same in the realizations that T is from, (K,) int.
+        How many parts (of EoR, gains and noise) at most are the same in the realizations that T is from, (K,) int.
     reasons
         Why a bin is not corrected in any realization, (Nk,) str; empty where it is.
     """
@@ -53,6 +56,7 @@ class Corrected:
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     error: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     error_with_sample: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
+    power_known_scale: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     shared: np.ndarray = field(metadata={"unit": ""})
     reasons: np.ndarray = field(metadata={"unit": ""})
 
@@ -69,11 +73,11 @@ def transfer_of_others(values: np.ndarray, design: Design) -> tuple[np.ndarray, 
     """
     mean, variance = np.empty(values.shape), np.zeros(values.shape)
     for own in range(len(values)):
-        used = design.independent(own)
-        mean[own] = values[used].mean(axis=0)
+        used = design.others(own)
+        mean[own] = np.sum([weight * values[other] for other, weight in used.items()], axis=0)
         for parts, places in design.blocks:
             weights: dict[tuple[int, ...], float] = {}
-            for number, weight in [(own, 1.0), *((other, -1 / len(used)) for other in used)]:
+            for number, weight in [(own, 1.0), *((other, -weight) for other, weight in used.items())]:
                 draw = tuple(design.draws[number][part] for part in parts)
                 weights[draw] = weights.get(draw, 0.0) + weight
             others = values[[place for place in places if place != own]]
@@ -96,6 +100,11 @@ def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected
     known = np.isfinite(error) & (mean > LEAST_SIGNIFICANCE * largest)
     factor = np.where(known, mean, np.nan)
     power = np.stack([sample.residual.power.real for sample in samples]) / factor
+    scale, scale_free = (
+        np.stack([TRANSFER_QUANTITIES[name].value(sample) for sample in samples])
+        for name in ("flux_scale", "scale_free_transfer")
+    )
+    known_scale = power * factor * scale**2 / transfer_of_others(scale_free, design)[0]
     own = np.stack([sample.residual.difference_error for sample in samples])
     with_noise = np.hypot(own, power * error / factor)
     with_sample = np.hypot(with_noise, np.stack([sample.residual.sample_error for sample in samples]))
@@ -105,7 +114,10 @@ def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected
         power=power,
         error=np.where(known, with_noise, np.nan),
         error_with_sample=np.where(known, with_sample, np.nan),
-        shared=np.array([design.shared(item, design.independent(item)[0]) for item in range(len(samples))]),
+        power_known_scale=known_scale,
+        shared=np.array(
+            [max(design.shared(item, other) for other in design.others(item)) for item in range(len(samples))]
+        ),
         reasons=np.array([_reason(*column) for column in zip(known.T, mean.T, largest.T, error.T, strict=True)]),
     )
 

@@ -207,11 +207,23 @@ class Design:
         """Return how many parts two realizations have in common."""
         return sum(self.draws[second][part] == number for part, number in self.draws[first].items())
 
-    def independent(self, realization: int) -> list[int]:
-        """Return the other realizations that share the fewest parts with one."""
-        others = [number for number in range(len(self.draws)) if number != realization]
-        fewest = min(self.shared(realization, number) for number in others)
-        return [number for number in others if self.shared(realization, number) == fewest]
+    def others(self, realization: int) -> dict[int, float]:
+        """Return which other realizations T of one is taken from, and their weights, which add up to one.
+
+        These are the realizations with other gains and other noise, on which T depends most, whatever their EoR. Each
+        draw of gains and noise has the same weight, shared by its realizations. Where no other gains and noise are
+        drawn, they are the realizations that share the fewest parts, with equal weights.
+        """
+        rest = [number for number in range(len(self.draws)) if number != realization]
+        groups: dict[tuple[int, ...], list[int]] = {}
+        for number in rest:
+            if all(self.draws[number][part] != self.draws[realization][part] for part in ("gains", "noise")):
+                groups.setdefault((self.draws[number]["gains"], self.draws[number]["noise"]), []).append(number)
+        if groups:
+            return {number: 1 / len(groups) / len(members) for members in groups.values() for number in members}
+        fewest = min(self.shared(realization, number) for number in rest)
+        used = [number for number in rest if self.shared(realization, number) == fewest]
+        return dict.fromkeys(used, 1 / len(used))
 
     def block_of(self, part: str) -> int | None:
         """Return the block that draws a part, or None."""

@@ -212,7 +212,7 @@ def _corrected_table(results: RegionResults) -> Table:
 def _of_other_realizations(corrected: Corrected) -> str:
     """Say in one sentence which realizations T is taken from."""
     shared = corrected.shared
-    same = f"; {np.sum(shared > 0)} have T of realizations that share a part of what is drawn with them"
+    same = "; the others by T of realizations some of which share a part, the EoR where gains and noise are drawn"
     return (
         f"P^R / T, T of other realizations: {np.sum(shared == 0)} of {shared.size} realizations are corrected by T of "
         f"other EoR, gains and noise{same if (shared > 0).any() else ''}. Where T is not above five times its error, "
@@ -220,4 +220,4 @@ def _of_other_realizations(corrected: Corrected) -> str:
     )
 
 
-POOL = Stage(name="pooled-realizations", version=1, make=make_tables, cost=lambda task: Cost(5, disk=1e6))
+POOL = Stage(name="pooled-realizations", version=2, make=make_tables, cost=lambda task: Cost(5, disk=1e6))

@@ -52,6 +52,14 @@ CRITERIA = {
         Within(0.99, 1.01),
         "to 1 %",
     ),
+    "corrected-mean-known-scale": Criterion(
+        "corrected-mean-known-scale",
+        "P^R corrected by T of other realizations",
+        "P^R / T is the input on average where the flux scale is known",
+        f"mean of P^R s^2 / (T s^2) over the input, s of the same realization; {WHERE}",
+        Within(0.99, 1.01),
+        "to 1 %",
+    ),
     "corrected-covers-eor": Criterion(
         "corrected-covers-eor",
         "P^R corrected by T of other realizations",
@@ -112,11 +120,15 @@ class RegionResults:
             return None
         return coverage(self.covered[kind][list(self.pooled.design.blocks[place][1])][:, bins], independent=True)
 
-    def corrected_over(self, power: np.ndarray, bins: np.ndarray) -> Finding | None:
-        """Return the mean of P^R / T over another power, (K, Nk), in some bins; None where T is not known."""
+    def corrected_over(self, power: np.ndarray, bins: np.ndarray, known_scale: bool = False) -> Finding | None:
+        """Return the mean of P^R / T over another power, (K, Nk), in some bins; None where T is not known.
+
+        With `known_scale`, of P^R s^2 / (T s^2).
+        """
         if self.corrected is None:
             return None
-        return mean_over_bins((self.corrected.power / power)[:, bins], self.pooled.design)
+        corrected = self.corrected.power_known_scale if known_scale else self.corrected.power
+        return mean_over_bins((corrected / power)[:, bins], self.pooled.design)
 
 
 def read_results(settings: Mapping[str, Any], folders: Mapping[str, Path]) -> dict[str, RegionResults]:
@@ -161,7 +173,7 @@ def judge(results: RegionResults) -> list[Verdict]:
             found = results.coverage(COVERED[name], bins)
             reason = f"no block of the realizations draws the {DRAWN_FOR[COVERED[name].removeprefix('corrected_')]}"
         else:
-            found = results.corrected_over(results.put_in, bins)
+            found = results.corrected_over(results.put_in, bins, known_scale=name == "corrected-mean-known-scale")
             reason = "there is no bin in which P^R / T is known in all realizations"
         if found is None or not np.isfinite(found.value):
             verdicts.append(criterion.unevaluated(reason))

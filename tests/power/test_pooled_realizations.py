@@ -97,14 +97,17 @@ def test_errors_that_are_too_small_are_found_out(random):
     assert np.isnan(error_ratio(values[:2], np.ones((2, BINS))).value)
 
 
-def test_realizations_are_corrected_by_those_that_share_nothing_with_them():
-    assert EVERYTHING.independent(3) == [0, 1, 2, 4, 5, 6, 7]
+def test_realizations_are_corrected_by_those_of_other_gains_and_noise():
+    assert EVERYTHING.others(3) == dict.fromkeys([0, 1, 2, 4, 5, 6, 7], 1 / 7)
     assert [EVERYTHING.shared(3, other) for other in (0, 1)] == [0, 0]
-    # Other gains and noise (1 to 6) go with other skies (7 to 11), and the first, which is in both, with its own sky.
-    assert TWO_BLOCKS.independent(2) == [7, 8, 9, 10, 11]
-    assert TWO_BLOCKS.independent(9) == [1, 2, 3, 4, 5, 6]
-    assert TWO_BLOCKS.independent(0) == [1, 2, 3, 4, 5, 6]
+    # Gains and noise 1 to 6 are in one realization each, and those of the first in all of other skies (7 to 11).
+    sixth = {number: pytest.approx(1 / 6) for number in (1, 2, 3, 4, 5, 6)}
+    assert TWO_BLOCKS.others(9) == TWO_BLOCKS.others(0) == sixth
+    first = dict.fromkeys((0, 7, 8, 9, 10, 11), pytest.approx(1 / 36))
+    assert TWO_BLOCKS.others(2) == {number: share for number, share in sixth.items() if number != 2} | first
     assert TWO_BLOCKS.shared(0, 1) == 1
+    skies = design_of((("eor",), 3))
+    assert skies.others(1) == {0: 0.5, 2: 0.5}
 
 
 @pytest.mark.parametrize("design", [EVERYTHING, TWO_BLOCKS], ids=["one block", "two blocks"])

@@ -197,6 +197,7 @@ def test_a_run_leaves_tables_a_figure_and_verdicts(finished):
         "bars-cover-eor",
         "bars-cover-input",
         "corrected-mean",
+        "corrected-mean-known-scale",
         "corrected-covers-eor",
         "corrected-covers-input",
     ]

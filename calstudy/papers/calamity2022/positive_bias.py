@@ -8,9 +8,9 @@ from calstudy.claims.bins import used_bins
 from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS
 from calstudy.papers.calamity2022.window import K_AGREEMENT, K_SMALL, POSITIVE
-from calstudy.verdicts.criterion import AtMost, Equal, Finding, Within
+from calstudy.verdicts.criterion import Equal, Finding, Within
 
-SLIGHT = "a slight bias is lower than the EoR"
+SLIGHT = "a slight bias is lower than the EoR; so is none"
 
 
 def _above(k: float) -> float:
@@ -55,13 +55,15 @@ def bias_at_level_of_noise_from_0p2_to_0p5(run: RunResults) -> Finding:
     return _over_noise(run, _above(K_AGREEMENT), K_SMALL)
 
 
-@RESULTS.states(POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k <= 0.2", AtMost(1), SLIGHT)
-def bias_slight_below_0p2(run: RunResults) -> Finding:
+@RESULTS.states(POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k <= 0.2", Within(-1, 1), SLIGHT)
+def bias_lower_than_eor_below_0p2(run: RunResults) -> Finding:
     return _over_eor(run, 0.0, K_AGREEMENT)
 
 
-@RESULTS.states(POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k from 0.2 to 0.5", AtMost(1), SLIGHT)
-def bias_slight_from_0p2_to_0p5(run: RunResults) -> Finding:
+@RESULTS.states(
+    POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k from 0.2 to 0.5", Within(-1, 1), SLIGHT
+)
+def bias_lower_than_eor_from_0p2_to_0p5(run: RunResults) -> Finding:
     return _over_eor(run, _above(K_AGREEMENT), K_SMALL)
 
 
