@@ -19,9 +19,9 @@ for n samples. For samples of one baseline and many antennas this is the sum of 
 an antenna in common, the variance of dyadic data (Fafchamps & Gubert 2007, J. Dev. Econ. 83, 326). What the antennas
 add may come out negative by chance, and is then taken as zero.
 
-Two cases are conservative. Deviations of single baselines within redundant groups have no term of their own: errors are
-then 1.2 to 1.6 times too large. And where gains are fitted to all baselines, the loss of all baselines together is fixed
-by counting unknowns, which no scatter knows.
+Two cases are conservative. Deviations of single baselines within redundant groups have no term of their own: errors
+are then 1.2 to 1.6 times too large. And where gains are fitted to all baselines, the loss of all baselines together is
+fixed by counting unknowns, which no scatter knows.
 """
 
 from __future__ import annotations
