@@ -9,6 +9,7 @@ import numpy as np
 from calstudy.base.errors import InputError
 from calstudy.base.gains import read_gains
 from calstudy.base.observation import Observation
+from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, fitted_baselines
 from calstudy.calibrate.settings import ForegroundFit, GainFit
@@ -77,6 +78,8 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
         gains = read_gains(settings.initial_gains.path, "calibration.initial_gains.path")
     if gains is None and settings.initial_gains.kind == "redundant":
         start = redundant_start(data, weights, settings.initial_gains, settings.redundancy_tolerance)
+    elif gains is None and settings.initial_gains.kind == "delays":
+        start = delay_start(data, weights, sky)
     else:
         start = starting_gains(data, gains)
     return PreparedFit(data, fitted, structure, weights, start, sky)

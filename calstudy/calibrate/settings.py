@@ -139,7 +139,15 @@ class RedundantStart(Section):
     )
 
 
-InitialGains = Annotated[UnityStart | FileStart | RedundantStart, Field(discriminator="kind"), choice("kind", "unity")]
+class DelayStart(Section):
+    """Start from one delay per antenna, and with a sky model one complex gain: for long cables on any array."""
+
+    kind: Literal["delays"]
+
+
+InitialGains = Annotated[
+    UnityStart | FileStart | RedundantStart | DelayStart, Field(discriminator="kind"), choice("kind", "unity")
+]
 
 
 class JointBasisSettings(Section):

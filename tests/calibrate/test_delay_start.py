@@ -1,0 +1,240 @@
+"""One delay and one gain per antenna as a start: what was put in comes out, and whatever is wrong with the data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+from test_calamity import SETTINGS, make_uvdata
+from toy import FREQUENCIES, complex_normal, make_toy, scattered
+
+from calstudy.base.errors import InputError
+from calstudy.base.gains import make_uvcal
+from calstudy.base.observation import Observation
+from calstudy.base.visibilities import from_cube
+from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.delay_start import delay_start
+from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.interface import Assumed
+from calstudy.calibrate.preparation import prepare
+from calstudy.calibrate.problem import gain_products
+from calstudy.calibrate.settings import DelayStart
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+
+ANTENNAS = 10
+CABLES = 500e-9
+TURNS = 2j * np.pi * (FREQUENCIES - FREQUENCIES.mean())
+WITH_DELAYS = SETTINGS.model_copy(update={"initial_gains": DelayStart(kind="delays")})
+
+
+@pytest.fixture(scope="module")
+def cables():
+    """Ten antennas at random, no two baselines alike, with cables of up to 500 ns either way, and their delays."""
+    toy = make_toy(scattered(ANTENNAS))
+    delays = np.random.default_rng(8).uniform(-CABLES, CABLES, ANTENNAS)
+    return replace(toy, gains=toy.gains * np.exp(delays[:, None] * TURNS)), delays
+
+
+def start_of(toy, sky=None, change=None, select=None):
+    """Return the starting gains, (Nants, Nfreqs), after a change to the data, or to data and sky model alike."""
+    data = make_uvdata(toy, 1)
+    if change is not None:
+        change(data)
+    model = None if sky is None else from_cube(data, sky[None, :, :, None])
+    for uvd in (data, model):
+        if select is not None and uvd is not None:
+            select(uvd)
+    observed = Observation(data)
+    weights = (~observed.flags).astype(float)
+    return delay_start(observed, weights, None if sky is None else Observation(model).visibilities)[:, :, 0, 0]
+
+
+def delays_of(gains, frequencies=FREQUENCIES):
+    """Return the delay of each antenna of smooth gains, s."""
+    steps = np.angle(np.mean(gains[:, 1:] * gains[:, :-1].conj(), axis=1))
+    return steps / (2 * np.pi * np.diff(frequencies)[0])
+
+
+def errors(toy, found, delays, kept=None):
+    """Return how far differences of delays are off, s, for each baseline, apart from a gradient over the array."""
+    first, second = toy.antennas.T
+    used = np.isin(toy.antennas, np.arange(ANTENNAS) if kept is None else kept).all(axis=1)
+    difference = ((found - delays)[first] - (found - delays)[second])[used]
+    vectors = toy.vectors[used, :2]
+    return difference - vectors @ np.linalg.lstsq(vectors, difference, rcond=None)[0]
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.abs(values) ** 2)))
+
+
+def test_with_the_sky_one_delay_and_one_gain_per_antenna_are_found_exactly():
+    """Amplitudes from 0.3 to 3 and any phase; what is left is the interpolation between delays of the grid."""
+    rng = np.random.default_rng(2)
+    toy = make_toy(scattered(ANTENNAS), noise=0.0)
+    delays = rng.uniform(-CABLES, CABLES, ANTENNAS)
+    constant = np.exp(rng.uniform(-1, 1, ANTENNAS) + 2j * np.pi * rng.random(ANTENNAS))
+    toy = replace(toy, gains=constant[:, None] * np.exp(delays[:, None] * TURNS))
+    start = start_of(toy, toy.foregrounds)
+    ratio = gain_products(start / toy.gains, toy.antennas)
+    assert rms(ratio - 1) < 0.02
+
+
+@pytest.mark.parametrize("known", [1.0, 0.8])
+def test_noise_in_frequency_and_a_wrong_sky_leave_phases_within_reach(cables, known):
+    """A fifth of the sky model is another sky."""
+    toy, _ = cables
+    other = make_toy(scattered(ANTENNAS), seed=33).foregrounds
+    start = start_of(toy, known * toy.foregrounds + (1 - known) * other)
+    ratio = gain_products(start / toy.gains, toy.antennas)
+    left = np.angle(np.mean(ratio, axis=1))
+    assert rms(left) < (0.05 if known == 1 else 0.5)
+    assert rms(np.angle(ratio)) < (0.25 if known == 1 else 0.6)
+
+
+def test_without_the_sky_delays_are_right_but_for_a_gradient(cables):
+    """To within a twentieth of the delays over which the foregrounds of the longest baseline may spread."""
+    toy, delays = cables
+    start = start_of(toy)
+    horizon = np.linalg.norm(toy.vectors, axis=1).max() / speed_of_light
+    assert rms(errors(toy, delays_of(start), delays)) < 0.05 * horizon
+    assert rms(errors(toy, np.zeros(ANTENNAS), delays)) > horizon
+    assert np.allclose(np.abs(start), 1)
+
+
+def test_channels_in_descending_order(cables):
+    toy, _ = cables
+    down = start_of(toy, toy.foregrounds, select=lambda uvd: uvd.reorder_freqs(channel_order="-freq", run_check=False))
+    assert np.allclose(down[:, ::-1], start_of(toy, toy.foregrounds))
+
+
+@pytest.mark.parametrize("with_sky", [True, False])
+def test_a_gap_in_the_band(cables, with_sky):
+    toy, delays = cables
+    gap = np.r_[0:25, 36:64]
+    sky = toy.foregrounds if with_sky else None
+    start = start_of(toy, sky, select=lambda uvd: uvd.select(freq_chans=gap, run_check=False))
+    assert rms(errors(toy, delays_of(start[:, :25]), delays)) < 5e-9
+
+
+def flag_many(data):
+    data.flag_array[np.random.default_rng(3).random(data.flag_array.shape) < 0.3] = True
+
+
+def interfere(data):
+    data.data_array[:, 17] = 1e3 * np.abs(data.data_array).max() * complex_normal(np.random.default_rng(4), (45, 1))
+
+
+def baselines_of_the_third(data):
+    return (data.ant_1_array == 14) | (data.ant_2_array == 14)
+
+
+def silence(data):
+    data.data_array[baselines_of_the_third(data)] = 0
+
+
+def only_noise(data):
+    rows = baselines_of_the_third(data)
+    data.data_array[rows] = 1e-3 * complex_normal(np.random.default_rng(5), data.data_array[rows].shape)
+
+
+def flag_antenna(data):
+    data.flag_array[baselines_of_the_third(data)] = True
+
+
+FAULTS = {
+    "30 % flags": flag_many,
+    "interference": interfere,
+    "no signal": silence,
+    "noise alone": only_noise,
+    "flagged": flag_antenna,
+}
+
+
+@pytest.mark.parametrize("with_sky", [True, False])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_of_the_data_do_not_touch_the_delays_of_sound_antennas(cables, fault, with_sky):
+    toy, delays = cables
+    start = start_of(toy, toy.foregrounds if with_sky else None, FAULTS[fault])
+    assert np.isfinite(start).all()
+    assert (start != 0).all()
+    sound = np.delete(np.arange(ANTENNAS), 2) if fault in ("no signal", "noise alone", "flagged") else np.arange(10)
+    assert rms(errors(toy, delays_of(start), delays, sound)) < 5e-9
+
+
+@pytest.mark.parametrize("with_sky", [True, False])
+def test_flagged_samples_have_no_influence(cables, with_sky):
+    toy, _ = cables
+
+    def spoil(data):
+        flag_many(data)
+        data.data_array[data.flag_array] = np.nan
+
+    sky = toy.foregrounds if with_sky else None
+    assert np.array_equal(start_of(toy, sky, flag_many), start_of(toy, sky, spoil))
+
+
+def test_parts_that_no_baseline_connects_are_fitted_each(cables):
+    toy, _ = cables
+    halves = (toy.antennas < 5).all(axis=1) | (toy.antennas >= 5).all(axis=1)
+    start = start_of(
+        toy, toy.foregrounds, lambda data: data.flag_array.__setitem__(slice(None), ~halves[:, None, None])
+    )
+    ratio = gain_products(start / toy.gains, toy.antennas)[halves]
+    assert rms(np.angle(np.mean(ratio, axis=1))) < 0.05
+
+
+@pytest.mark.parametrize("with_sky", [True, False])
+def test_long_cables_are_as_easy_as_none_from_there_and_out_of_reach_from_unity(cables, with_sky):
+    """Within 1 % of the loss that is reached from the true gains."""
+    toy, _ = cables
+    data = make_uvdata(toy, 1)
+    sky = from_cube(data, toy.foregrounds[None, :, :, None]) if with_sky else None
+    truth = make_uvcal(data, toy.gains[:, :, None, None])
+    floor = run_calibrator(SETTINGS, data, sky, truth).solutions[0]
+    found, unity = (run_calibrator(settings, data, sky).solutions[0] for settings in (WITH_DELAYS, SETTINGS))
+    assert found.status == "converged"
+    assert found.loss_history[-1] < 1.01 * floor.loss_history[-1]
+    assert unity.loss_history[-1] > 1.2 * floor.loss_history[-1]
+    assert unity.status != "converged"
+
+
+@pytest.mark.parametrize("with_sky", [True, False])
+def test_gains_that_are_noise_in_frequency_are_fitted_as_from_unity(toy, with_sky):
+    data = make_uvdata(toy, 1)
+    sky = from_cube(data, toy.foregrounds[None, :, :, None]) if with_sky else None
+    found, unity = (run_calibrator(settings, data, sky).solutions[0] for settings in (WITH_DELAYS, SETTINGS))
+    assert found.status == unity.status == "converged"
+    assert found.loss_history[-1] < 1.01 * unity.loss_history[-1]
+
+
+def test_sky_based_calibration_starts_where_phases_are_right(cables):
+    toy, _ = cables
+    data = make_uvdata(toy, 1)
+    sky = from_cube(data, toy.foregrounds[None, :, :, None])
+    settings = SkyBased(initial_gains=DelayStart(kind="delays"))
+    solution = run_calibrator(settings, data, sky).solutions[0]
+    assert solution.status == "converged"
+    noise = np.mean(np.abs(gain_products(toy.gains, toy.antennas) * toy.noise) ** 2)
+    assert solution.loss_history[-1] < noise
+
+
+def test_what_cannot_work_is_refused_in_a_sentence(cables):
+    toy, _ = cables
+    with pytest.raises(InputError, match="sky model, which is zero wherever"):
+        start_of(toy, 0 * toy.foregrounds)
+    far = replace(toy, positions=1000 * toy.positions)
+    with pytest.raises(InputError, match="needs a sky model where the shortest baseline has"):
+        start_of(far)
+
+
+def test_an_experiment_says_so_by_name(cables):
+    settings = type(SETTINGS).model_validate({"initial_gains": "delays"})
+    toy, delays = cables
+    prepared = prepare(Observation(make_uvdata(toy, 2)), settings, Assumed())
+    assert prepared.start.shape == (ANTENNAS, FREQUENCIES.size, 2, 1)
+    for time in (0, 1):
+        assert rms(errors(toy, delays_of(prepared.start[:, :, time, 0]), delays)) < 5e-9
