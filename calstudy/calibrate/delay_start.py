@@ -5,7 +5,8 @@ foregrounds in delay by tau_a - tau_b. The delays of all antennas follow from th
 
 With a sky model m, V m* has the phase of g_a g_b*, and its delay spectrum is a narrow peak at the shift: the fringe fit
 of interferometry, here with the powers of the baselines of an antenna added up (Schwab & Cotton 1983). One complex gain
-per antenna then follows from least squares over all channels.
+per antenna then follows from least squares over all channels, or, if it is asked for, one in every channel, with m for
+the truth.
 
 Without a sky model, foregrounds are known to lie within the horizon delay b/c of a baseline of length b. The power in a
 Gaussian of half this width,
@@ -13,9 +14,9 @@ Gaussian of half this width,
     S_ab(D) = sum_tau |V_ab(tau)|^2 exp(-(tau - D)^2 / 2 sigma_ab^2),    sigma_ab = b / 2c + 1 / 2B,
 
 with the bandwidth B, is greatest where D is the shift plus the mean delay of the foregrounds. The wider the Gaussian,
-the less a baseline says. A gradient of delay over the array cannot be told from a displacement of the sky, and is such
-that the mean delay of the foregrounds is about zero. Amplitudes and phases of antennas cannot be told from those of the
-foregrounds at all, and are left as they are.
+the less a baseline says. A gradient of delay over the array cannot be told from a displacement of the sky. It is taken
+for one as far as cables with the scatter that was found would not have it (`_sky_gradient`). Amplitudes and phases of
+antennas cannot be told from those of the foregrounds at all, and are left as they are.
 
 Either way the delays are those with the greatest sum of S_ab(tau_a - tau_b) over baselines. Noise has a flat S, so that
 an antenna without signal does not change the delays of the others.
@@ -32,6 +33,7 @@ from scipy.sparse.csgraph import connected_components
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.calibrate.basis import channel_grid
+from calstudy.calibrate.settings import DelayStart
 
 PADDING = 4
 """Delays are searched on a grid this much finer than the inverse bandwidth."""
@@ -41,14 +43,21 @@ LEAST_CORRELATION = 1e-3
 """Without a sky model, the foregrounds of adjacent channels of the shortest baseline must be correlated this much."""
 SMALLEST_GAIN = 0.01
 """Gains are at least this times the median: a solver cannot leave zero."""
+SKY_SCATTER = 0.2
+"""How far the mean direction of foregrounds is from the zenith, in direction cosines east and north."""
+ROBUST_ITERATIONS = 10
 SWEEPS = 20
 """Rounds of moving antennas one by one, at most; two or three are the rule."""
 GAIN_ITERATIONS = 50
 BLOCK = 1024
 """Baselines that are transformed at a time."""
+MATRIX_ELEMENTS = 4_000_000
+"""Antennas squared times channels that are fitted at a time."""
 
 
-def delay_start(data: Observation, weights: np.ndarray, sky: np.ndarray | None) -> np.ndarray:
+def delay_start(
+    data: Observation, weights: np.ndarray, settings: DelayStart, sky: np.ndarray | None = None
+) -> np.ndarray:
     """Return gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
 
     Parameters
@@ -57,6 +66,8 @@ def delay_start(data: Observation, weights: np.ndarray, sky: np.ndarray | None) 
         The visibilities; autocorrelations are not used.
     weights
         (Ntimes, Nbls, Nfreqs, Npols); samples of weight zero have no influence.
+    settings
+        Whether gains are fitted in every channel.
     sky
         A sky model like the visibilities, or None.
 
@@ -67,18 +78,26 @@ def delay_start(data: Observation, weights: np.ndarray, sky: np.ndarray | None) 
     Raises
     ------
     InputError
-        If the channels are on no even grid; if the sky model is zero; or, without a sky model, if channels are too wide
-        for the delays of the foregrounds.
+        If the channels are on no even grid; if the sky model is zero; or if there is none, and gains are asked for in
+        every channel, or channels are too wide for the delays of the foregrounds.
     """
+    if settings.per_channel and sky is None:
+        raise InputError(
+            "calibration.initial_gains.per_channel: gains in every channel need a sky model, and there is none"
+        )
     crossed = ~data.autos
     gains = np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
-    fit = _DelayFit(data.antennas[crossed], data.n_antennas, data.lengths[crossed], data.frequencies)
+    fit = _DelayFit(data.antennas[crossed], data.positions, data.frequencies)
     for t, p in np.ndindex(data.n_times, data.n_polarizations):
         used = weights[t, crossed, :, p]
         visibilities = np.where(used > 0, data.visibilities[t, crossed, :, p], 0)
         model = None if sky is None else np.where(used > 0, sky[t, crossed, :, p], 0)
-        if visibilities.any():
-            gains[:, :, t, p] = fit.gains(_clipped(visibilities), used, model)
+        if not visibilities.any():
+            continue
+        found = fit.gains(_clipped(visibilities), used, model)
+        if settings.per_channel and model is not None:
+            found = _least_squares(used * visibilities * model.conj(), used * np.abs(model) ** 2, fit.antennas, found)
+        gains[:, :, t, p] = found
     return gains
 
 
@@ -89,16 +108,15 @@ class _DelayFit:
     ----------
     antennas
         Of each baseline, (Nbls, 2).
-    n_antennas
-        Their number.
-    lengths
-        Of the baselines, m, (Nbls,).
+    positions
+        Of the antennas, east, north, up, m, (Nants, 3).
     frequencies
         Hz, (Nfreqs,).
     """
 
-    def __init__(self, antennas: np.ndarray, n_antennas: int, lengths: np.ndarray, frequencies: np.ndarray) -> None:
-        self.antennas, self.n_antennas, self.lengths = antennas, n_antennas, lengths
+    def __init__(self, antennas: np.ndarray, positions: np.ndarray, frequencies: np.ndarray) -> None:
+        self.antennas, self.positions, self.n_antennas = antennas, positions, len(positions)
+        self.lengths = np.linalg.norm(positions[antennas[:, 1]] - positions[antennas[:, 0]], axis=1)
         self.grid = channel_grid(frequencies)
         self.n_delays = next_fast_len(PADDING * self.grid.n_channels)
         ascending = frequencies[-1] > frequencies[0]
@@ -110,14 +128,17 @@ class _DelayFit:
         """Return gains, (Nants, Nfreqs), from data, weights and sky model, (Nbls, Nfreqs), zero where flagged."""
         spectra = weights * visibilities if model is None else weights * visibilities * model.conj()
         scores = self._window_scores(spectra) if model is None else self._fringe_scores(spectra)
-        delays = self._delay_step * _antenna_delays(scores, self.antennas, self.n_antennas)
-        phasors = np.exp(delays[:, None] * self._turns)
+        delays, found = _antenna_delays(scores, self.antennas, self.n_antennas)
+        delays *= self._delay_step
         if model is None:
-            return phasors
+            delays[found] -= _sky_gradient(delays[found], self.positions[found])
+            return np.exp(delays[:, None] * self._turns)
+        phasors = np.exp(delays[:, None] * self._turns)
         first, second = self.antennas.T
-        correlation = np.sum(spectra * phasors[first].conj() * phasors[second], axis=1)
-        power = np.sum(weights * np.abs(model) ** 2, axis=1)
-        return phasors * _antenna_gains(correlation, power, self.antennas, self.n_antennas)[:, None]
+        correlation = np.sum(spectra * phasors[first].conj() * phasors[second], axis=1, keepdims=True)
+        power = np.sum(weights * np.abs(model) ** 2, axis=1, keepdims=True)
+        start = _phases(correlation[:, 0], self.antennas, self.n_antennas)[:, None]
+        return phasors * _least_squares(correlation, power, self.antennas, start)
 
     def _power(self, spectra: np.ndarray) -> np.ndarray:
         """Return |sum_nu x exp(-2 pi i nu tau)|^2 of some baselines at all delays, (Nspectra, Ndelays)."""
@@ -237,8 +258,10 @@ class _DelaySearch:
         return bool((self.delays != before).any())
 
 
-def _antenna_delays(scores: np.ndarray, antennas: np.ndarray, n_antennas: int) -> np.ndarray:
-    """Return the delays with the greatest sum of scores at tau_a - tau_b, in steps of the grid, median zero, (Nants,).
+def _antenna_delays(scores: np.ndarray, antennas: np.ndarray, n_antennas: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the delays with the greatest sum of scores at tau_a - tau_b, and which antennas have any, (Nants,).
+
+    Delays are in steps of the grid, with median zero.
 
     Parameters
     ----------
@@ -256,10 +279,46 @@ def _antenna_delays(scores: np.ndarray, antennas: np.ndarray, n_antennas: int) -
             break
     delays, used = search.delays + _offsets(scores, antennas, search.delays), search.evidence > 0
     if not used.any():
-        return np.zeros(n_antennas)
+        return np.zeros(n_antennas), used
     # Delays a period apart are the same, up to a phase.
     wrapped = (delays - delays[search.evidence.argmax()] + n_delays / 2) % n_delays - n_delays / 2
-    return np.where(used, wrapped - np.median(wrapped[used]), 0)
+    return np.where(used, wrapped - np.median(wrapped[used]), 0), used
+
+
+def _sky_gradient(delays: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Return the part of the delays, s, (Nants,), that is the displacement of the foregrounds from the zenith.
+
+    Delays are tau_a + k . x_a / c with the mean direction k of the foregrounds. With cable delays tau that scatter by s
+    and |k| by `SKY_SCATTER` in each direction, the mean of k is that of ridge regression,
+
+        k = (X^T W X / s^2 + 1 / SKY_SCATTER^2)^-1 X^T W delays / s^2,
+
+    with X = x / c about the mean, and weights W against outliers (Cauchy's, of scale 3 s). Arrays that are small for
+    their cables keep their gradient; on arrays that are large it is the sky's.
+
+    Parameters
+    ----------
+    delays
+        s, (Nants,).
+    positions
+        East, north, up, m, (Nants, 3).
+    """
+    if len(delays) <= 3:
+        return np.zeros(len(delays))
+    columns = np.column_stack([np.ones(len(delays)), positions[:, :2] / speed_of_light])
+    weights = np.ones(len(delays))
+    for _ in range(ROBUST_ITERATIONS):
+        root = np.sqrt(weights)
+        plane = np.linalg.lstsq(columns * root[:, None], delays * root, rcond=None)[0]
+        residual = np.abs(delays - columns @ plane)
+        # The median of the modulus of normal numbers is 0.67 of their deviation; three are fitted.
+        scatter = np.median(residual) / 0.67 * np.sqrt(len(delays) / (len(delays) - 3))
+        if scatter == 0:
+            break
+        weights = 1 / (1 + (residual / (3 * scatter)) ** 2)
+    slopes = columns[:, 1:] - np.average(columns[:, 1:], axis=0, weights=weights)
+    normal = (slopes.T * weights) @ slopes + (scatter / SKY_SCATTER) ** 2 * np.eye(2)
+    return slopes @ np.linalg.lstsq(normal, (slopes.T * weights) @ delays, rcond=None)[0]
 
 
 def _offsets(scores: np.ndarray, antennas: np.ndarray, delays: np.ndarray) -> np.ndarray:
@@ -276,42 +335,52 @@ def _offsets(scores: np.ndarray, antennas: np.ndarray, delays: np.ndarray) -> np
     return np.clip(offsets, -1, 1)
 
 
-def _antenna_gains(correlation: np.ndarray, power: np.ndarray, antennas: np.ndarray, n_antennas: int) -> np.ndarray:
-    """Return one complex gain u of each antenna, (Nants,), that minimizes the sum of w |v - u_a u_b* m|^2.
+def _phases(correlation: np.ndarray, antennas: np.ndarray, n_antennas: int) -> np.ndarray:
+    """Return phasors of the antennas, (Nants,), from correlations of baselines with the sky model, (Nbls,).
 
-    The phases to start with are those of the leading eigenvector of the matrix of correlations, in every part of the
-    array that baselines connect; then u_a = sum_b C_ab u_b / sum_b M_ab |u_b|^2, taken half the way each time.
+    They are those of the leading eigenvector of the Hermitian matrix of the correlations, in every part of the array
+    that baselines connect.
+    """
+    first, second = antennas.T
+    matrix = np.zeros((n_antennas, n_antennas), complex)
+    np.add.at(matrix, (first, second), correlation)
+    np.add.at(matrix, (second, first), correlation.conj())
+    phasors = np.ones(n_antennas, complex)
+    _, part = connected_components(coo_array(matrix != 0), directed=False)
+    for label in range(part.max() + 1):
+        members = np.flatnonzero(part == label)
+        phasors[members] = np.exp(1j * np.angle(np.linalg.eigh(matrix[np.ix_(members, members)])[1][:, -1]))
+    return phasors
+
+
+def _least_squares(correlation: np.ndarray, power: np.ndarray, antennas: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the gains u, (Nants, Nchannels), that minimize the sum of w |v - u_a u_b* m|^2 in each channel.
+
+    By u_a = sum_b C_ab u_b / sum_b M_ab |u_b|^2, going half the way each time (Salvini & Wijnholds 2014).
 
     Parameters
     ----------
     correlation
-        Sum of w v m* over channels, C, (Nbls,).
+        w v m*, C, (Nbls, Nchannels).
     power
-        Sum of w |m|^2 over channels, M, (Nbls,).
+        w |m|^2, M, (Nbls, Nchannels).
     antennas
         (Nbls, 2).
-    n_antennas
-        Their number; those without a correlation have gain one.
+    start
+        Gains to start from, and to keep where there are no data, (Nants, Nchannels).
     """
-    first, second = antennas.T
-    matrix, norm = np.zeros((n_antennas, n_antennas), complex), np.zeros((n_antennas, n_antennas))
-    np.add.at(matrix, (first, second), correlation)
-    np.add.at(matrix, (second, first), correlation.conj())
-    np.add.at(norm, (first, second), power)
-    np.add.at(norm, (second, first), power)
-    gains = np.zeros(n_antennas, complex)
-    _, part = connected_components(coo_array(matrix != 0), directed=False)
-    for label in range(part.max() + 1):
-        members = np.flatnonzero(part == label)
-        inside = np.ix_(members, members)
-        vectors = np.linalg.eigh(matrix[inside])[1]
-        gains[members] = np.exp(1j * np.angle(vectors[:, -1]))
-    for _ in range(GAIN_ITERATIONS):
-        below = norm @ np.abs(gains) ** 2
-        gains = np.where(below > 0, (gains + (matrix @ gains) / np.where(below > 0, below, 1)) / 2, 0)
+    gains, (first, second) = start.copy(), antennas.T
+    n_antennas, n_channels = start.shape
+    for channels in np.array_split(np.arange(n_channels), -(-n_channels * n_antennas**2 // MATRIX_ELEMENTS)):
+        matrix = np.zeros((channels.size, n_antennas, n_antennas), complex)
+        matrix[:, first, second], matrix[:, second, first] = correlation.T[channels], correlation.T[channels].conj()
+        norm = np.zeros(matrix.shape)
+        norm[:, first, second] = norm[:, second, first] = power.T[channels]
+        found = start.T[channels, :, None]
+        for _ in range(GAIN_ITERATIONS):
+            below = norm @ np.abs(found) ** 2
+            found = (found + (matrix @ found) / np.where(below > 0, below, 1)) / 2
+        gains[:, channels] = np.where(below > 0, found, start.T[channels, :, None])[..., 0].T
     modulus = np.abs(gains)
-    if not modulus.any():
-        return np.ones(n_antennas, complex)
-    smallest = SMALLEST_GAIN * np.median(modulus[modulus > 0])
-    raised = gains * np.maximum(smallest / np.where(modulus > 0, modulus, 1), 1)
-    return np.where(modulus > 0, raised, 1)
+    raised = gains * np.maximum(SMALLEST_GAIN * np.median(modulus) / np.where(modulus > 0, modulus, 1), 1)
+    return np.where(modulus > 0, raised, start)

@@ -79,7 +79,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     if gains is None and settings.initial_gains.kind == "redundant":
         start = redundant_start(data, weights, settings.initial_gains, settings.redundancy_tolerance)
     elif gains is None and settings.initial_gains.kind == "delays":
-        start = delay_start(data, weights, sky)
+        start = delay_start(data, weights, settings.initial_gains, sky)
     else:
         start = starting_gains(data, gains)
     return PreparedFit(data, fitted, structure, weights, start, sky)

@@ -143,6 +143,9 @@ class DelayStart(Section):
     """Start from one delay per antenna, and with a sky model one complex gain: for long cables on any array."""
 
     kind: Literal["delays"]
+    per_channel: bool = Field(
+        False, description="Then fit a gain in every channel to the sky model: for gain errors of order one."
+    )
 
 
 InitialGains = Annotated[
