@@ -120,9 +120,13 @@ class SingleIntegration:
         return make_uvcal(self.foregrounds, values)
 
     def calibrate(
-        self, visibilities: np.ndarray, settings: ForegroundFit | None = None, start: np.ndarray | None = None
+        self,
+        visibilities: np.ndarray,
+        settings: ForegroundFit | None = None,
+        start: np.ndarray | None = None,
+        sky_model: bool = True,
     ) -> CalibrationResult:
-        """Calibrate visibilities, (Nbls, Nfreqs), with the foregrounds fixing the scale.
+        """Calibrate visibilities, (Nbls, Nfreqs), with the foregrounds as sky model, which fixes the scale.
 
         Parameters
         ----------
@@ -131,10 +135,13 @@ class SingleIntegration:
         settings
             By default those of the experiment.
         start
-            Gains to start from, complex, (Nants, Nfreqs); None for unity.
+            Gains to start from, complex, (Nants, Nfreqs); None for what the settings say.
+        sky_model
+            Whether there is one.
         """
         gains = None if start is None else self.uvcal(start)
-        return run_calibrator(settings or self.settings, self.data(visibilities), self.foregrounds, gains)
+        sky = self.foregrounds if sky_model else None
+        return run_calibrator(settings or self.settings, self.data(visibilities), sky, gains)
 
     def misfit(self, result: CalibrationResult, visibilities: np.ndarray) -> np.ndarray:
         """Return V - g_a g_b* F of a result, (Nbls, Nfreqs): the residual in the unit and gauge of the data."""
