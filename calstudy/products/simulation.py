@@ -16,9 +16,10 @@ from calstudy.sky.settings import Eor
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
+    from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.component import Component
     from calstudy.simulate.floor import DelayFloor
-    from calstudy.sky.settings import Foregrounds
+    from calstudy.sky.settings import SkySettings
 
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
@@ -32,21 +33,37 @@ TIME_NODES, FREQUENCY_NODES = 16, 96
 @once
 def foregrounds(graph: Graph) -> Task | None:
     """Return the task of the foreground visibilities F, or None if the sky has none."""
-    settings = graph.experiment.sky.foregrounds
-    return None if settings.kind == "none" else _simulation(graph, "foregrounds", settings)
+    return foregrounds_of(graph, "foregrounds", graph.experiment.sky, graph.experiment.instrument)
+
+
+def foregrounds_of(graph: Graph, label: str, sky: SkySettings, instrument: InstrumentSettings) -> Task | None:
+    """Return the task of the foregrounds of any sky through any instrument, or None if the sky has none.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment whose section `simulation` is used.
+    label
+        What the product is.
+    sky, instrument
+        In place of the experiment's own.
+    """
+    if sky.foregrounds.kind == "none":
+        return None
+    return _simulation(graph, label, {"instrument": instrument, "sky": sky.foregrounds})
 
 
 @once
 def eor(graph: Graph) -> Task:
     """Return the task of the EoR visibilities S, in absolute units."""
-    return _simulation(graph, "eor", graph.experiment.sky.eor)
-
-
-def _simulation(graph: Graph, component: str, sky: Foregrounds | Eor) -> Task:
     experiment = graph.experiment
-    settings: dict[str, Any] = {"instrument": experiment.instrument, "simulation": experiment.simulation, "sky": sky}
-    if isinstance(sky, Eor):
-        settings["cosmology"] = experiment.power.cosmology
+    settings = {"instrument": experiment.instrument, "sky": experiment.sky.eor, "cosmology": experiment.power.cosmology}
+    return _simulation(graph, "eor", settings)
+
+
+def _simulation(graph: Graph, component: str, settings: Mapping[str, Any]) -> Task:
+    experiment = graph.experiment
+    settings = {**settings, "simulation": experiment.simulation}
     count = min(experiment.simulation.chunks, experiment.instrument.channels.count)
     pieces = {
         f"chunk{index:03d}": Task(
