@@ -11,7 +11,8 @@ from calstudy.products.files import VISIBILITIES, read_visibilities, write_json,
 from calstudy.products.graph import Graph, once
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
-from calstudy.sky.settings import Eor
+from calstudy.sky.counts import FAINTEST, expected_sources
+from calstudy.sky.settings import Eor, PointSources
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.component import Component
     from calstudy.simulate.floor import DelayFloor
-    from calstudy.sky.settings import SkySettings
+    from calstudy.sky.settings import Foregrounds, SkySettings
 
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
@@ -159,13 +160,21 @@ def _cost_of_chunk(task: Task) -> Cost:
     if isinstance(sky, Eor):
         sources, spectral = 12 * sky.nside**2, channels / simulation.chunks
     else:
-        sources, spectral = min(getattr(sky, "count", None) or SOURCES, SOURCES), 0.0
+        sources, spectral = _sources(sky), 0.0
         channels = min(channels, FREQUENCY_NODES) if nodes else channels
     work = SimulationSize(sources, times * channels / pieces, size.antennas, 1 + len(instrument.antenna_beams))
     engine = simulation.engine.cost(work)
     disk = size.samples / size.channels.count * channels / pieces * COMPLEX128
     memory = engine.memory + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
     return Cost(6 + engine.seconds, memory, disk)
+
+
+def _sources(sky: Foregrounds) -> int:
+    """Estimate the number of sources of the foregrounds, from the counts of sources above the flux limit."""
+    if not isinstance(sky, PointSources):
+        return SOURCES
+    expected = int(expected_sources(max(sky.flux_limit, FAINTEST)))
+    return max(min(sky.count or expected, expected), 1)
 
 
 def _cost(task: Task) -> Cost:
