@@ -46,9 +46,11 @@ SMALLEST_GAIN = 0.01
 SKY_SCATTER = 0.2
 """How far the mean direction of foregrounds is from the zenith, in direction cosines east and north."""
 ROBUST_ITERATIONS = 10
+"""Rounds of finding the antennas whose delays stand out."""
 SWEEPS = 20
 """Rounds of moving antennas one by one, at most; two or three are the rule."""
 GAIN_ITERATIONS = 50
+"""Rounds of least squares for gains: half a step each, they come to 1e-4 of the gains and less."""
 BLOCK = 1024
 """Baselines that are transformed at a time."""
 MATRIX_ELEMENTS = 4_000_000
@@ -73,7 +75,7 @@ def delay_start(
 
     Returns
     -------
-    Without a delay for antennas that have no data. The median delay is zero.
+    Without a sky model of modulus one; one for antennas that have no data, and where nothing is to be fitted.
 
     Raises
     ------
@@ -229,7 +231,10 @@ class _DelaySearch:
         self._others = [antennas[rows].sum(axis=1) - antenna for antenna, rows in enumerate(self._rows)]
 
     def _shifted(self, antenna: int, at: np.ndarray, forward: bool) -> np.ndarray:
-        """Return the scores of its baselines with a delay of the antenna (forward), or of the others, running."""
+        """Return the scores of the baselines of an antenna, (Nrows, Ndelays), by the delay of one of its two ends.
+
+        Forward: by its own delay, with the others at `at`; else by the delay of the others, with its own at `at`.
+        """
         rows = self._rows[antenna]
         signs = np.where((self.antennas[rows, 0] == antenna) == forward, 1, -1)
         return np.take_along_axis(
