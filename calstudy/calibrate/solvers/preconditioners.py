@@ -123,20 +123,20 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     gram = tf.reshape(degrees @ products, [-1, rank, rank])
     weighted = projection.curvature * projection.baseline_model
     absorbed: list[tf.Tensor] = []
-    for stretch, root in zip(tensors.stretches, projection.roots, strict=True):
-        # Temporaries of several stretches would add up.
+    for batch, batch_roots in zip(tensors.batches, projection.roots, strict=True):
+        # Temporaries of several batches would add up.
         with tf.control_dependencies(absorbed[-1:]):
-            start, end = baselines = tensors.baselines_of(stretch)
+            start, end = batch.baselines
             mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies]) @ products
             real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, rank, rank]))
-            roots = projector.baseline_roots(stretch, root)
+            roots = projector.baseline_roots(batch, batch_roots)
             real, imaginary = roots @ real, roots @ imaginary
             square = tf.matmul(real, real, transpose_a=True) + tf.matmul(imaginary, imaginary, transpose_a=True)
             crossed = tf.matmul(real, imaginary, transpose_a=True)
             both = tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)])
-            # Added up on the way: the sums of all stretches at once would be large.
+            # Added up on the way: the sums of all batches at once would be large.
             before = absorbed[-1] if absorbed else 0.0
-            absorbed.append(before + tensors.sum_over_antenna(both, baselines))
+            absorbed.append(before + tensors.sum_over_antenna(both, batch.baselines))
     return AntennaBlocks(degrees, common, gram, absorbed[-1])
 
 

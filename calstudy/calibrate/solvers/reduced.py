@@ -14,6 +14,7 @@ preconditioner has the channel blocks of each antenna, its inverse stands for th
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -105,7 +106,7 @@ class ReducedKernels:
         self.tensors = FitTensors(structure)
         self.frozen = frozen
         self.by_channel = (self.tensors.coupled or frozen) and structure.gain_vectors is None
-        self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(self.tensors)
+        self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(structure, self.tensors)
         self.space = GainSpace(structure.gain_vectors, tf.float32)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
         self.project = self.projector.project
@@ -122,6 +123,10 @@ class ReducedKernels:
         arrays: tuple[tf.Tensor, ...] = (data.visibilities, data.weights / total)
         if (model := problem.frozen_model) is not None:
             arrays += (self.tensors.load_model(model, data.scale, tf.float64),)
+        if (mean := problem.prior_mean) is not None:
+            # Coefficients of unit variance stay so if the loss is divided by its unit and the weights by their sum.
+            deviations = math.sqrt(total) * np.array(problem.deviations)
+            arrays += (self.tensors.load_model(mean, data.scale, tf.float64), tf.constant(deviations, tf.float64))
         start = self.exact_space.expand(self.exact_space.reduce(pairs.to_pair(gains, tf.float64)))
         return ReducedData(start, arrays, data.scale, total * data.scale**2)
 
