@@ -102,12 +102,12 @@ class ReducedKernels:
         frozen.
     """
 
-    def __init__(self, structure: FitStructure, frozen: bool = False) -> None:
+    def __init__(self, structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32) -> None:
         self.tensors = FitTensors(structure)
-        self.frozen = frozen
+        self.frozen, self.dtype = frozen, dtype
         self.by_channel = (self.tensors.coupled or frozen) and structure.gain_vectors is None
-        self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(structure, self.tensors)
-        self.space = GainSpace(structure.gain_vectors, tf.float32)
+        self.projector = FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype)
+        self.space = GainSpace(structure.gain_vectors, dtype)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
         self.project = self.projector.project
         self.channel_step = tf.function(self._channel_step)
