@@ -35,8 +35,9 @@ class Bucket:
         Indices of the models in this bucket, shape (Nmembers,).
     vectors
         Orthonormal sequences, shape (Nfreqs, Nvec), float64, for which every member has coefficients of its own, or a
-        root of the covariance of the foregrounds, where they have a prior; or, in a joint bucket, (Nmembers, Nfreqs, Nvec), orthonormal over all members together, with coefficients that the
-        members have in common.
+        root of the covariance of the foregrounds, where they have a prior. In a joint bucket,
+        (Nmembers, Nfreqs, Nvec), orthonormal over all members together, with coefficients that the members have in
+        common.
     """
 
     half_width: float | None
@@ -119,7 +120,7 @@ def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: f
 
 
 def flat_wedge_root(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> np.ndarray:
-    """Return a root B of the covariance B B^T of a signal that is white up to a delay, and has variance one per channel.
+    """Return a root B of the covariance B B^T of a signal, white up to a delay, that has variance one per channel.
 
     The covariance is sin(2 pi W (i - j)) / (2 pi W (i - j)) with the half-bandwidth N W of N channels; its
     eigenvectors are the DPSS, its eigenvalues their concentrations over 2 W (Slepian 1978).

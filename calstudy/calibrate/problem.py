@@ -15,7 +15,7 @@ from calstudy.base.observation import Frame
 from calstudy.calibrate.basis import ForegroundBasis
 from calstudy.calibrate.settings import MODELS_AT_ONCE
 
-Prior = Literal["sum", "post-hoc", "gains", "none"]
+Prior = Literal["sum", "post-hoc", "gains", "sky-model", "none"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,8 @@ class CalibrationProblem:
         visibilities divided by the initial gains.
     prior
         How the overall scale is fixed: in the loss and after it (``sum``), only after (``post-hoc``, by the sums of the
-        models, or ``gains``, by the size of the gains), or not.
+        models, ``gains``, by the size of the gains, or ``sky-model``, by regression of the calibrated data on the sky
+        model), or not.
     frozen
         Whether the foregrounds are the sky model, so that only gains are fitted. The scale is then known, and `prior`
         not used.

@@ -391,5 +391,7 @@ class FrozenForegrounds:
 
 
 def _side_by_side(basis: np.ndarray) -> np.ndarray:
-    """Return a basis (Nfreqs, Nvec), normalized, or those of all members of a joint piece, (Nfreqs, Nmembers * Nvec)."""
-    return basis / np.linalg.norm(basis, axis=0) if basis.ndim == 2 else np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)
+    """Return a normalized basis (Nfreqs, Nvec), or those of all members of a joint batch, (Nfreqs, Nmembers * Nvec)."""
+    if basis.ndim == 2:
+        return basis / np.linalg.norm(basis, axis=0)
+    return np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)

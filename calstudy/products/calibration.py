@@ -10,6 +10,7 @@ from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cos
 from calstudy.calibrate.execution import cost_of
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, simulation
+from calstudy.products.corruption import LEVELS
 from calstudy.products.files import (
     DATA,
     GAINS,
@@ -49,6 +50,8 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     inputs = {"data": data}
     if (foregrounds := simulation.foregrounds(graph)) is not None:
         inputs["sky_model"] = foregrounds
+    if settings.needs_noise:
+        inputs["levels"] = corruption.levels(graph)
     chunks = {
         f"chunk{index:03d}": Task(
             CALIBRATE_CHUNK,
@@ -87,7 +90,8 @@ def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     if "sky_model" in job.inputs:
         sky_model = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
         sky_model = _integrations(sky_model, index, count, together)
-    result = run_calibrator(settings, data, sky_model)
+    noise = read_json(job.inputs["levels"] / LEVELS)["noise_std"] if "levels" in job.inputs else None
+    result = run_calibrator(settings, data, sky_model, noise=noise)
     result.gains.write_calh5(job.output / GAINS)
     for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
         write_visibilities(uvd, job.output / name, single=True)
