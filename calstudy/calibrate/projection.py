@@ -36,8 +36,9 @@ RIDGE = 1e-12
 # The same for the kernel in float32, whose rounding would swamp the damping where flags leave foregrounds undetermined.
 # One iteration of Tikhonov's regularization keeps what it takes from well determined ones to its square.
 KERNEL_RIDGE = {tf.float32: 1e-3, tf.float64: 1e-9}
-# Singular values kept in the common basis of all buckets, relative to the largest.
-SPAN_CUTOFF = 1e-9
+# Singular values kept in the common basis of all buckets, relative to the largest: what is left out is an error of the
+# Gauss-Newton matrix.
+SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
 
 
 class Roots(NamedTuple):
@@ -157,7 +158,7 @@ class Projector:
         left, singular, _ = np.linalg.svd(
             np.concatenate([_side_by_side(basis) for basis in distinct], axis=1), full_matrices=False
         )
-        common = left[:, singular > SPAN_CUTOFF * singular[0]]
+        common = left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
         self.common = tf.constant(common, dtype)
         self.rank = common.shape[1]
         self._pieces = [self._piece(batch, common) for batch in tensors.batches]
@@ -283,6 +284,9 @@ class Projector:
             normal = tf.square(scale) * normal + tf.eye(normal.shape[2], dtype=normal.dtype)
         factor, root = self._factor(normal, vectors.filled)
         coefficients = tf.linalg.cholesky_solve(factor, scale * projected)
+        if not self._finite:
+            # One step of iterative refinement: the ridge would be an error of the gradient.
+            coefficients += tf.linalg.cholesky_solve(factor, projected - normal @ coefficients)
         penalty = tf.constant(0.0, tf.float64) if deviations is None else tf.reduce_sum(tf.square(coefficients))
         model = tf.reshape(vectors.expand(scale * coefficients), [2, -1, self.tensors.n_frequencies])
         return piece.to_baselines(model), penalty, Roots(vectors.overlap(tf.cast(scale * root, self.dtype)), None)
@@ -363,6 +367,20 @@ class Projector:
         left = change - curvature * self.answer(change, projection)
         return tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
 
+    def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return minus the product of the Jacobian with the second derivative of the residual along eta.
+
+        Along g exp(t eta), with foregrounds that follow as F + t dF, the second derivative of G F in t is
+        G ((eta_a + eta_b*)^2 F + 2 (eta_a + eta_b*) dF). Shape (2, Nants, Nfreqs).
+        """
+        tensors = self.tensors
+        curvature, model = projection.curvature, projection.baseline_model
+        relative = tensors.relative_change(eta)
+        first = pairs.multiply(model, relative)
+        change = curvature * pairs.multiply(relative, first - 2 * self.answer(curvature * first, projection))
+        left = change - curvature * self.answer(change, projection)
+        return -tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
+
 
 class FrozenForegrounds:
     """Takes the place of `Projector` for a sky-based fit, whose foregrounds are known: there is nothing to eliminate.
@@ -388,6 +406,13 @@ class FrozenForegrounds:
         model = projection.baseline_model
         change = projection.curvature * pairs.multiply(model, self.tensors.relative_change(eta))
         return self.tensors.sum_over_antenna(pairs.conjugate_multiply(model, change))
+
+    def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return what `Projector.curvature_descent` does; foregrounds do not follow."""
+        model = projection.baseline_model
+        relative = self.tensors.relative_change(eta)
+        change = projection.curvature * pairs.multiply(model, pairs.multiply(relative, relative))
+        return -self.tensors.sum_over_antenna(pairs.conjugate_multiply(model, change))
 
 
 def _side_by_side(basis: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ class Inverse(Protocol):
 
 
 def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
-    """Return sum_b D |F|^2 of each antenna and channel, floored, shape (Nants, Nfreqs), float32."""
+    """Return sum_b D |F|^2 of each antenna and channel, floored, shape (Nants, Nfreqs)."""
     power = projection.curvature * pairs.squared_modulus(projection.baseline_model)
     degree = tf.math.unsorted_segment_sum(power, tensors.first, tensors.n_antennas)
     degree += tf.math.unsorted_segment_sum(power, tensors.second, tensors.n_antennas)
@@ -73,7 +73,7 @@ def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Ten
     projection
         The reduced problem at the gains in question.
     damping
-        Relative to the diagonal, scalar, float32.
+        Relative to the diagonal, scalar, in the precision of the projection.
     """
     power = tf.transpose(projection.curvature * pairs.squared_modulus(projection.baseline_model))
     index = tf.stack([tensors.first, tensors.second], axis=1)
@@ -173,7 +173,7 @@ def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse
     gram = tf.cast(1 + damping, tf.float64) * tf.cast(blocks.gram, tf.float64)
     real, imaginary = tf.unstack(tf.cast(blocks.absorbed, tf.float64))
     correction = _inverse(tf.complex(gram - real, -imaginary)) - tf.cast(_inverse(gram), tf.complex128)
-    correction = tf.cast(tf.stack([tf.math.real(correction), tf.math.imag(correction)]), tf.float32)
+    correction = tf.cast(tf.stack([tf.math.real(correction), tf.math.imag(correction)]), damping.dtype)
     return AntennaInverse(blocks.common, 1 / ((1 + damping) * blocks.degrees), correction)
 
 
@@ -203,7 +203,7 @@ def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Te
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
     if blocks.absorbed is not None:
         # L of the module's M.
-        inverse = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), tf.float32)
+        inverse = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), blocks.gram.dtype)
         lift = tf.cast(blocks.degrees[:, :, None] * (blocks.common @ inverse), columns.dtype)
         inner = tf.matmul(columns, lift, adjoint_a=True)
         matrix -= inner @ tf.matmul(tf.complex(blocks.absorbed[0], blocks.absorbed[1]), inner, adjoint_b=True)
