@@ -34,9 +34,10 @@ class Bucket:
     members
         Indices of the models in this bucket, shape (Nmembers,).
     vectors
-        Orthonormal sequences, shape (Nfreqs, Nvec), float64, for which every member has coefficients of its own; or,
-        in a joint bucket, (Nmembers, Nfreqs, Nvec), orthonormal over all members together, with coefficients that the
-        members have in common.
+        Orthonormal sequences, shape (Nfreqs, Nvec), float64, for which every member has coefficients of its own, or a
+        root of the covariance of the foregrounds, where they have a prior. In a joint bucket,
+        (Nmembers, Nfreqs, Nvec), orthonormal over all members together, with coefficients that the members have in
+        common.
     """
 
     half_width: float | None
@@ -91,6 +92,18 @@ def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarra
 
 
 @lru_cache(maxsize=256)
+def _sequences(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sequences of `dpss_vectors`, and their concentrations, (Nvec,)."""
+    n_asked = min(n_frequencies, int(2 * half_bandwidth) + EXTRA_SEQUENCES)
+    vectors, concentrations = dpss(n_frequencies, half_bandwidth, Kmax=n_asked, return_ratios=True)
+    # Concentrations fall monotonically until rounding; what follows the first below the cutoff is noise.
+    below = concentrations < eigenvalue_cutoff
+    n_kept = int(np.argmax(below)) if below.any() else n_asked
+    basis = np.ascontiguousarray(vectors[:n_kept].T)
+    basis.flags.writeable = False
+    return basis, concentrations[:n_kept]
+
+
 def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> np.ndarray:
     """Return the DPSS concentrated within `half_bandwidth` better than the cutoff, shape (n_frequencies, Nvec).
 
@@ -103,14 +116,26 @@ def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: f
     eigenvalue_cutoff
         Sequences with a smaller spectral concentration are left out.
     """
-    n_asked = min(n_frequencies, int(2 * half_bandwidth) + EXTRA_SEQUENCES)
-    vectors, concentrations = dpss(n_frequencies, half_bandwidth, Kmax=n_asked, return_ratios=True)
-    # Concentrations fall monotonically until rounding; what follows the first below the cutoff is noise.
-    below = concentrations < eigenvalue_cutoff
-    n_kept = int(np.argmax(below)) if below.any() else n_asked
-    basis = np.ascontiguousarray(vectors[:n_kept].T)
-    basis.flags.writeable = False
-    return basis
+    return _sequences(n_frequencies, half_bandwidth, eigenvalue_cutoff)[0]
+
+
+def flat_wedge_root(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> np.ndarray:
+    """Return a root B of the covariance B B^T of a signal, white up to a delay, that has variance one per channel.
+
+    The covariance is sin(2 pi W (i - j)) / (2 pi W (i - j)) with the half-bandwidth N W of N channels; its
+    eigenvectors are the DPSS, its eigenvalues their concentrations over 2 W (Slepian 1978).
+
+    Parameters
+    ----------
+    n_frequencies, half_bandwidth, eigenvalue_cutoff
+        As for `dpss_vectors`.
+
+    Returns
+    -------
+    ndarray, float64, (n_frequencies, Nvec)
+    """
+    vectors, concentrations = _sequences(n_frequencies, half_bandwidth, eigenvalue_cutoff)
+    return vectors * np.sqrt(concentrations * n_frequencies / (2 * half_bandwidth))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +201,9 @@ def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -
     return np.ascontiguousarray(left[:, singular**2 > eigenvalue_cutoff])
 
 
-def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings) -> ForegroundBasis:
+def make_basis(
+    lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings, prior: bool = False
+) -> ForegroundBasis:
     """Build the foreground basis of models with the given baseline lengths (paper Eq. FGMODEL).
 
     Parameters
@@ -187,6 +214,9 @@ def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSett
         Channel centres in Hz on an even grid, gaps allowed, shape (Nfreqs,).
     settings
         Delays that are modelled, and the eigenvalue cutoff.
+    prior
+        Whether vectors are a root of the covariance of a flat wedge with variance one per channel (see
+        `flat_wedge_root`), in place of orthonormal ones.
 
     Raises
     ------
@@ -205,8 +235,11 @@ def make_basis(lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSett
         product = half_width * width
         vectors = None
         if product < 0.5:
-            sequences = dpss_vectors(grid.n_channels, grid.n_channels * product, settings.eigenvalue_cutoff)
-            vectors = restrict(sequences, grid, settings.eigenvalue_cutoff)
+            arguments = grid.n_channels, grid.n_channels * product, settings.eigenvalue_cutoff
+            if prior:
+                vectors = flat_wedge_root(*arguments)[grid.positions]
+            else:
+                vectors = restrict(dpss_vectors(*arguments), grid, settings.eigenvalue_cutoff)
         if vectors is None or vectors.shape[1] >= n_frequencies:
             raise InputError(
                 f"calibration.basis: a delay half-width of {half_width * 1e9:.0f} ns fills all {n_frequencies} "

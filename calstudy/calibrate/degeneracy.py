@@ -11,9 +11,11 @@ Gains times smooth functions against the model are nearly degenerate as well, bu
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.problem import CalibrationProblem, gain_products
 
 
 def fix_phase(gains: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -36,7 +38,12 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
 
     For the ``sum`` prior this is the exact minimum of the prior along the scale, so that the likelihood keeps its own
     minimum; for ``post-hoc`` the ratio of the moduli of the two sums (paper §Method); for ``gains`` what gives the
-    gains the geometric mean of the initial ones; for ``none`` one.
+    gains the geometric mean of the initial ones; for ``sky-model`` what makes the calibrated data regress on the sky
+    model with a slope of one; for ``none`` one.
+
+    Where a prior on the foregrounds is much wider than the noise, the fit finds g_a g_b* by a regression of the sky
+    model on the data, and not of the data on the sky model, and what the sky model lacks makes it too large, by the
+    square of its relative rms. ``sky-model`` corrects that.
 
     Parameters
     ----------
@@ -50,13 +57,21 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
     Raises
     ------
     ValueError
-        If the summed model vanishes, or opposes the summed sky model, so that no positive scale exists.
+        If the summed model vanishes, or opposes the summed sky model, or the data are not correlated with the sky
+        model, so that no positive scale exists.
     """
     if problem.prior == "none" or problem.frozen:
         return 1.0
     if problem.prior == "gains":
         used = problem.antenna_weights > 0
         return float(np.exp(2 * np.mean(np.log(np.abs(gains[used] / problem.initial_gains[used])))))
+    if problem.prior == "sky-model":
+        sky_model: Any = problem.sky_model
+        calibrated = problem.visibilities / gain_products(gains, problem.structure.antennas)
+        overlap = float(np.sum(problem.weights * (sky_model.conj() * calibrated).real))
+        if not overlap > 0:
+            raise ValueError("prior sky-model: the calibrated data are not correlated with the sky model")
+        return float(np.sum(problem.weights * np.abs(sky_model) ** 2)) / overlap
     total, target = complex(np.sum(problem.weights * model)), problem.prior_target
     if problem.prior == "sum":
         scale = (total.conjugate() * target).real / abs(total) ** 2 if total else 0.0

@@ -65,6 +65,7 @@ def run_calibrator(
     sky_model: UVData | None = None,
     gains: UVCal | None = None,
     progress: Progress | None = None,
+    noise: float | None = None,
 ) -> CalibrationResult:
     """Calibrate visibilities, and put what comes back into standard objects.
 
@@ -80,6 +81,8 @@ def run_calibrator(
         Where to start, for a calibrator that starts somewhere; None for what it does by itself.
     progress
         Called after each solve with the number done and the total.
+    noise
+        Standard deviation of the noise of a sample (see `Assumed`); None if it is not known.
 
     Raises
     ------
@@ -88,7 +91,7 @@ def run_calibrator(
         returns what does not fit.
     """
     observation = Observation(data)
-    assumed = Assumed(None if sky_model is None else Observation(sky_model), gains)
+    assumed = Assumed(None if sky_model is None else Observation(sky_model), gains, noise)
     if assumed.sky_model is not None:
         _require_usable(assumed.sky_model, observation)
     require_calibratable(calibrator, observation, assumed.sky_model is not None)

@@ -38,7 +38,7 @@ from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import channel_grid
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
 from calstudy.calibrate.solvers.preconditioners import DEGREE_FLOOR, Inverse, channel_inverse
-from calstudy.calibrate.solvers.reduced import DAMPING_BOUNDS, PRECONDITIONER_DAMPING, NormalEquations, compiled
+from calstudy.calibrate.solvers.reduced import LEAST_DAMPING, PRECONDITIONER_DAMPING, NormalEquations, compiled
 from calstudy.power.delay import make_taper
 
 TAPER = "blackman-harris"
@@ -235,7 +235,7 @@ def _exact_diagonal(
         )
     jacobian, degrees = _jacobian(problem, gains, tangent)
     normal = jacobian.T @ jacobian
-    inverse = np.linalg.inv(normal + np.diag(DAMPING_BOUNDS[0] * degrees))
+    inverse = np.linalg.inv(normal + np.diag(LEAST_DAMPING[tf.float32] * degrees))
     # The damped projector is one but for directions of next to no curvature; its square is what the probes measure.
     kernel = inverse @ normal @ inverse
     n_baselines, n_frequencies = tangent.roots.shape
@@ -289,12 +289,12 @@ class GainResponse:
         reduced = kernels.reduce(problem, gains)
         self._unit = reduced.loss_unit
         projection = kernels.project(reduced.gains, *reduced.data)
-        stronger = tf.constant(PRECONDITIONER_DAMPING, tf.float32)
+        stronger = kernels.scalar(PRECONDITIONER_DAMPING[kernels.dtype])
         if kernels.by_channel:
             inverse: Inverse = channel_inverse(kernels.tensors, projection, stronger)
         else:
             inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
-        damping = tf.constant(DAMPING_BOUNDS[0], tf.float32)
+        damping = kernels.scalar(LEAST_DAMPING[kernels.dtype])
         self._equations = NormalEquations(projection, reduced.gains, damping, inverse)
         self._compiled = tf.function(self._solve)
 

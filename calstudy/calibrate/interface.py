@@ -40,10 +40,14 @@ class Assumed:
         data, in the same order; None if there are none.
     gains
         Gains to start from, None for unity. A calibrator that does not iterate may leave them alone.
+    noise
+        Standard deviation of the complex noise of a sample that was measured once (nsamples of one), in the unit of
+        the data; None if it is not known. Asked for by `Calibrator.needs_noise`.
     """
 
     sky_model: Observation | None = None
     gains: UVCal | None = None
+    noise: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -172,6 +176,11 @@ class Calibrator(Plugin):
         """
         del frame, has_sky_model
         return None
+
+    @property
+    def needs_noise(self) -> bool:
+        """Whether `Assumed.noise` changes anything."""
+        return False
 
     def cost(self, size: Size) -> Cost:
         """Return what calibrating data of this size takes; by default little beyond the data themselves."""

@@ -27,6 +27,11 @@ def conjugate_multiply(a: tf.Tensor, b: tf.Tensor) -> tf.Tensor:
     return tf.stack([a[0] * b[0] + a[1] * b[1], a[0] * b[1] - a[1] * b[0]])
 
 
+def exponential(a: tf.Tensor) -> tf.Tensor:
+    """Return exp(a)."""
+    return tf.exp(a[0]) * tf.stack([tf.cos(a[1]), tf.sin(a[1])])
+
+
 def squared_modulus(a: tf.Tensor) -> tf.Tensor:
     """Return |a|^2, without the first axis."""
     return a[0] * a[0] + a[1] * a[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from calstudy.calibrate.settings import ForegroundFit, GainFit
 from calstudy.calibrate.standard_formats import require_parallel_hands
 from calstudy.calibrate.starts import redundant_start, starting_gains
 from calstudy.calibrate.structure import make_structure, repeat_structure
-from calstudy.calibrate.weights import make_weights
+from calstudy.calibrate.weights import inverse_variance, make_weights
 
 NOTHING = Assumed()
 
@@ -35,7 +36,7 @@ class PreparedFit:
     structure
         Of the fit of one integration.
     weights
-        Shape (Ntimes, Nbls, Nfreqs, Npols).
+        Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior.
     start
         Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
     sky
@@ -69,6 +70,8 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     require_parallel_hands(observation.uvd)
     fitted = fitted_baselines(observation, settings.autos)
     weights = make_weights(observation, fitted, settings.weights)
+    if isinstance(settings, ForegroundFit) and settings.foreground_prior.finite:
+        weights = weights * inverse_variance(observation, fitted, settings, assumed.noise)
     data = observation.baselines(fitted)
     sky = None if assumed.sky_model is None else assumed.sky_model.baselines(fitted).visibilities
     _require_finite(data)
@@ -119,8 +122,19 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         prepared.start[:, :, times.start, polarization],
         None if prepared.sky is None else rows(prepared.sky),
         settings.prior if isinstance(settings, ForegroundFit) else "sum",
-        frozen=not isinstance(settings, ForegroundFit),
+        frozen=settings.frozen,
+        deviations=_deviations(prepared, settings),
     )
+
+
+def _deviations(prepared: PreparedFit, settings: GainFit) -> tuple[float, float]:
+    """Return the deviations of the foregrounds' prior in the unit of the data, of each baseline's own and shared."""
+    if not isinstance(settings, ForegroundFit) or not settings.foreground_prior.finite or prepared.sky is None:
+        return math.inf, math.inf
+    prior = settings.foreground_prior
+    rms = float(np.sqrt(np.mean(np.abs(prepared.sky[prepared.weights > 0]) ** 2)))
+    own, shared = (float(value) * rms for value in (prior.deviation, prior.shared_deviation))
+    return own, shared
 
 
 def _require_finite(data: Observation) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, get_args
@@ -14,7 +15,7 @@ from calstudy.base.observation import Frame
 from calstudy.calibrate.basis import ForegroundBasis
 from calstudy.calibrate.settings import MODELS_AT_ONCE
 
-Prior = Literal["sum", "post-hoc", "gains", "none"]
+Prior = Literal["sum", "post-hoc", "gains", "sky-model", "none"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,10 @@ class FitStructure:
         gains without restriction.
     models_at_once
         Foreground models that are worked on at a time; fewer need less memory, and change results by rounding only.
+    prior
+        Which coefficients have a finite prior: ``own``, ``shared`` (those of a model that baselines have in common), or
+        ``both``, where every baseline has coefficients of its own besides the shared ones; ``none`` if they are free.
+        With a prior, the vectors of the basis are a root of the prior's covariance for a variance of one per channel.
     """
 
     antennas: np.ndarray
@@ -50,6 +55,7 @@ class FitStructure:
     conjugated: np.ndarray
     gain_vectors: np.ndarray | None = None
     models_at_once: int = MODELS_AT_ONCE
+    prior: Literal["none", "own", "shared", "both"] = "none"
 
     def __post_init__(self) -> None:
         n_baselines = len(self.antennas)
@@ -64,7 +70,7 @@ class FitStructure:
 
     @cached_property
     def _content(self) -> str:
-        digest = hashlib.sha256(str(self.models_at_once).encode())
+        digest = hashlib.sha256(f"{self.models_at_once} {self.prior}".encode())
         arrays = [self.antennas, self.groups, self.conjugated.astype(np.int64)]
         if self.gain_vectors is not None:
             arrays.append(self.gain_vectors)
@@ -128,10 +134,15 @@ class CalibrationProblem:
         visibilities divided by the initial gains.
     prior
         How the overall scale is fixed: in the loss and after it (``sum``), only after (``post-hoc``, by the sums of the
-        models, or ``gains``, by the size of the gains), or not.
+        models, ``gains``, by the size of the gains, or ``sky-model``, by regression of the calibrated data on the sky
+        model), or not.
     frozen
-        Whether the foregrounds are the sky model, so that only gains are fitted. The scale is then known, and the
-        prior not used.
+        Whether the foregrounds are the sky model, so that only gains are fitted. The scale is then known, and `prior`
+        not used.
+    deviations
+        Standard deviation per channel, in the unit of the data, of what the foregrounds' prior allows beside the sky
+        model: on each baseline by itself, and in common to those that share a model. Both count only where the
+        structure says so. The weights must be inverse variances then.
 
     Raises
     ------
@@ -147,6 +158,7 @@ class CalibrationProblem:
     sky_model: np.ndarray | None = None
     prior: Prior = "sum"
     frozen: bool = False
+    deviations: tuple[float, float] = (math.inf, math.inf)
 
     def __post_init__(self) -> None:
         self._check_shapes()
@@ -154,6 +166,8 @@ class CalibrationProblem:
             raise ValueError(f"prior: {self.prior!r} is not one of {', '.join(get_args(Prior))}")
         if self.frozen and self.sky_model is None:
             raise ValueError("sky_model: is needed where the foregrounds are frozen")
+        if self.structure.prior != "none" and (self.sky_model is None or not self._deviations_are_finite()):
+            raise ValueError("sky_model and finite positive deviations: are needed where foregrounds have a prior")
         if np.iscomplexobj(self.weights) or not np.isfinite(self.weights).all() or (self.weights < 0).any():
             raise ValueError("weights: must be real, finite and not negative")
         if not np.isfinite(self.initial_gains).all() or (self.initial_gains == 0).any():
@@ -163,6 +177,10 @@ class CalibrationProblem:
             raise ValueError("visibilities: zero wherever the weight is not, so that there is nothing to calibrate")
         if self.sky_model is not None:
             self._blank("sky_model")
+
+    def _deviations_are_finite(self) -> bool:
+        needed = {"own": self.deviations[:1], "shared": self.deviations[1:], "both": self.deviations}
+        return all(0 < value < math.inf for value in needed.get(self.structure.prior, ()))
 
     def _check_shapes(self) -> None:
         shape = (self.structure.n_baselines, self.structure.n_frequencies)
@@ -185,6 +203,11 @@ class CalibrationProblem:
     def frozen_model(self) -> np.ndarray | None:
         """The sky model if the foregrounds are frozen to it, (Nbls, Nfreqs); None if they are fitted."""
         return self.sky_model if self.frozen else None
+
+    @property
+    def prior_mean(self) -> np.ndarray | None:
+        """The mean of the foregrounds' finite prior, (Nbls, Nfreqs); None if there is no such prior."""
+        return None if self.structure.prior == "none" else self.sky_model
 
     @property
     def antenna_weights(self) -> np.ndarray:

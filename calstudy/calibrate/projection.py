@@ -1,9 +1,19 @@
-"""Variable projection: the best foregrounds for given gains in closed form, and the problem that is left for the gains.
+"""Elimination of the foregrounds: the best ones for given gains in closed form, and what is left for the gains.
 
-For gains g and a baseline p = (a, b) write G_p = g_a g_b* and D_p = w_p |G_p|^2, and let R be its foreground model. The
-likelihood is linear least squares in u_R, with normal matrix N_R = A^T (sum_p D_p) A over the baselines of R. Putting
-its solution back leaves a function of the gains alone (Golub & Pereyra 1973), whose gradient and Gauss-Newton matrix
-are below for a relative change eta of the gains, g (1 + eta).
+For gains g and a baseline p = (a, b) write G_p = g_a g_b* and D_p = w_p |G_p|^2. With a Gaussian prior of mean m and
+covariance C on the foregrounds F, the fit minimizes
+
+    sum w |V - G F|^2 + (F - m)^H C^-1 (F - m).
+
+C is known by its root: F_p = m_p + A_R (s z_R + t d_p) with vectors A_R of the model R of the baseline, coefficients
+z_R that the baselines of R share, and coefficients d_p of its own, all of unit variance, and deviations s and t. An
+infinite deviation is no prior at all: the foregrounds are A z, m does not matter, and A may be orthonormal (CALAMITY).
+
+The fit is linear least squares in z and d (variable projection, Golub & Pereyra 1973). With N_p = A^T D_p A, the own
+coefficients have the normal matrix t^2 N_p + 1. Putting their solution back leaves P_p = D_p - t^2 D_p A (t^2 N_p +
+1)^-1 A^T D_p in place of D_p for the shared ones, whose normal matrix is s^2 sum_p A^T P_p A + 1, and what is left for
+the gains is K in place of P, made in the same way. The gradient and the Gauss-Newton matrix for a relative change eta
+of the gains, g (1 + eta), are those of a fit with fixed foregrounds, but for K in place of D in the matrix.
 
 Models m that have their coefficients in common count as one, whose channels are those of all of them, one after the
 other: N = sum_m A_m^T D_m A_m.
@@ -11,21 +21,40 @@ other: N = sum_m A_m^T D_m A_m.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
+from calstudy.calibrate.batches import Batch, Vectors, batch_vectors
+from calstudy.calibrate.problem import FitStructure
 from calstudy.calibrate.tensors import FitTensors
 
 # Regularizes N relative to its mean diagonal: far below any signal, enough for models with most channels flagged.
 RIDGE = 1e-12
 # The same for the kernel in float32, whose rounding would swamp the damping where flags leave foregrounds undetermined.
 # One iteration of Tikhonov's regularization keeps what it takes from well determined ones to its square.
-KERNEL_RIDGE = 1e-3
-# Singular values kept in the common basis of all buckets, relative to the largest.
-SPAN_CUTOFF = 1e-9
+KERNEL_RIDGE = {tf.float32: 1e-3, tf.float64: 1e-9}
+# Singular values kept in the common basis of all buckets, relative to the largest: what is left out is an error of the
+# Gauss-Newton matrix.
+SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
+
+
+class Roots(NamedTuple):
+    """How foregrounds answer a weighted change y of the visibilities: ``Q S^T S Q^T y``, with the common basis Q.
+
+    Attributes
+    ----------
+    first
+        S of the models of a batch, or of its baselines if they have coefficients of their own besides the shared ones,
+        (N, Nvec, rank). Of a joint batch that of all members together, (1, Nvec, Nmembers * rank).
+    shared
+        S of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise.
+    """
+
+    first: tf.Tensor
+    shared: tf.Tensor | None
 
 
 class Projection(NamedTuple):
@@ -34,19 +63,17 @@ class Projection(NamedTuple):
     Attributes
     ----------
     loss
-        sum w |v - G F|^2 at the best foregrounds; scalar, float64.
+        sum w |V - G F|^2 at the best foregrounds, plus the squares of coefficients that have a prior; scalar, float64.
     model
-        F, shape (2, Nmodels, Nfreqs), float64.
+        F on the baselines, shape (2, Nbls, Nfreqs), float64.
     descent
         Minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64.
     curvature
-        D of each baseline, shape (Nbls, Nfreqs), float32.
+        D of each baseline, shape (Nbls, Nfreqs).
     baseline_model
-        F on the baselines, shape (2, Nbls, Nfreqs), float32.
+        `model` in the precision of the inner products, like `curvature` and `roots`.
     roots
-        S of the models of each stretch, shape (Nmodels, Nvec, rank), float32, padded with rows of zeros: foregrounds
-        answer a weighted change y of the visibilities of their group with ``Q S^T S Q^T y``, where Q is the common
-        basis. Of a joint piece that of all members together, shape (1, Nvec, Nmembers * rank).
+        Of each batch.
     """
 
     loss: tf.Tensor
@@ -54,160 +81,305 @@ class Projection(NamedTuple):
     descent: tf.Tensor
     curvature: tf.Tensor
     baseline_model: tf.Tensor
-    roots: tuple[tf.Tensor, ...]
+    roots: tuple[Roots, ...]
 
 
-class _Piece(NamedTuple):
-    """What one piece of models adds to a `Projection`; `pull` is its share of the descent, by baseline."""
+class _Part(NamedTuple):
+    """What one batch adds to a `Projection`; `pull` is its share of the descent, by baseline."""
 
     loss: tf.Tensor
     model: tf.Tensor
     pull: tf.Tensor
     curvature: tf.Tensor
-    baseline_model: tf.Tensor
-    root: tf.Tensor
+    roots: Roots
+
+
+class _PieceData(NamedTuple):
+    """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's mean, if any, of one batch."""
+
+    visibilities: tf.Tensor
+    weights: tf.Tensor
+    mean: tf.Tensor | None
+
+
+class _Piece(NamedTuple):
+    """One batch, and its vectors.
+
+    Attributes
+    ----------
+    owner
+        Position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model.
+    vectors
+        Of its models.
+    own
+        Of its baselines, if they have coefficients of their own besides the shared ones.
+    """
+
+    batch: Batch
+    owner: tf.Tensor | None
+    vectors: Vectors
+    own: Vectors | None
+
+    def to_models(self, values: tf.Tensor) -> tf.Tensor:
+        """Add up the baselines of each model: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
+        if self.owner is None:
+            return values
+        return tf.stack([tf.math.segment_sum(part, self.owner) for part in tf.unstack(values)])
+
+    def to_baselines(self, values: tf.Tensor) -> tf.Tensor:
+        """Give each baseline what its model has, the transpose of `to_models`."""
+        return values if self.owner is None else tf.gather(values, self.owner, axis=1)
 
 
 class Projector:
     """Eliminates the foregrounds of one fit structure.
 
+    Parameters
+    ----------
+    structure
+        Of the fit.
+    tensors
+        Its index tensors.
+    dtype
+        Of the inner products of the iteration, for which float32 is enough but close to a minimum far below the data.
+        The loss, its gradient and N are always evaluated in float64: in float32 the scale of the gains drifts unseen.
+
     Attributes
     ----------
     common
-        Orthonormal basis Q that spans all bases, (Nfreqs, rank), float32.
-    overlaps
-        A^T Q of each piece, (Nvec, rank), float32; one member after the other, (Nvec, Nmembers * rank), if it is
-        joint.
-
-    The loss, its gradient and N are evaluated in float64: in float32 the scale of the gains drifts unseen. The inner
-    products of the iteration need only float32.
+        Orthonormal basis Q that spans all bases, (Nfreqs, rank), of `dtype`.
     """
 
-    def __init__(self, tensors: FitTensors) -> None:
-        self.tensors = tensors
-        self._stretches = tensors.stretches
+    def __init__(self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
+        self.tensors, self.dtype = tensors, dtype
+        self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
+        self._level = 0 if structure.prior == "own" else 1
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
         left, singular, _ = np.linalg.svd(
             np.concatenate([_side_by_side(basis) for basis in distinct], axis=1), full_matrices=False
         )
-        common = left[:, singular > SPAN_CUTOFF * singular[0]]
-        self.common = tf.constant(common, tf.float32)
+        common = left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
+        self.common = tf.constant(common, dtype)
         self.rank = common.shape[1]
-        self._joint = [basis.ndim == 3 for basis in tensors.bases]
-        self._bases = [tf.constant(basis.reshape(-1, basis.shape[-1]), tf.float64) for basis in tensors.bases]
-        self.overlaps = [tf.constant(_overlap(basis, common), tf.float32) for basis in tensors.bases]
+        self._pieces = [self._piece(batch, common) for batch in tensors.batches]
         self.project = tf.function(self._project)
 
-    def _factor(self, curvature: tf.Tensor, basis: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return, for the models of one piece, the Cholesky factors of N and a root R of the kernel, N^-1 ~ R^T R.
+    def _piece(self, batch: Batch, common: np.ndarray) -> _Piece:
+        owner, kind = self.tensors.owner(batch), self.dtype.as_numpy_dtype
+        vectors = batch_vectors(batch, common, None, kind)
+        own = batch_vectors(batch, common, owner, kind) if self._two_levels else None
+        needed = self.tensors.shared or self._two_levels
+        return _Piece(batch, tf.constant(owner, tf.int32) if needed else None, vectors, own)
 
-        Both have the shape (Nmembers, Nvec, Nvec). With the ridge e and M = N + e, the kernel is M^-1 (1 + e M^-1).
+    def _factor(self, normal: tf.Tensor, filled: np.ndarray) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return the Cholesky factors of N, and a root R of the kernel, N^-1 ~ R^T R; all (N, Nvec, Nvec).
+
+        With the ridge e and M = N + e, the kernel is M^-1 (1 + e M^-1). With a finite prior, N has its 1 already.
+
+        Parameters
+        ----------
+        normal
+            N, (N, Nvec, Nvec).
+        filled
+            See `calstudy.calibrate.batches.Vectors`.
         """
-        n_frequencies, n_vectors = basis.shape
-        weighted = tf.reshape(curvature[:, None, :] * tf.transpose(basis), [-1, n_frequencies])
-        normal = tf.reshape(weighted @ basis, [-1, n_vectors, n_vectors])
-        mean = tf.reduce_mean(tf.linalg.diag_part(normal), -1)[:, None, None]
-        identity = tf.eye(n_vectors, batch_shape=tf.shape(normal)[:1], dtype=normal.dtype)
-        # A model without any data gets the identity, and with it coefficients of zero.
-        normal += tf.where(mean > 0, RIDGE * mean, 1.0) * identity
-        ridge = KERNEL_RIDGE * mean
+        identity = tf.eye(normal.shape[2], batch_shape=tf.shape(normal)[:1], dtype=normal.dtype)
+        diagonal = tf.linalg.diag_part(normal)
+        mean = (tf.reduce_sum(diagonal * filled, -1) / filled.sum(-1))[:, None, None]
+        if not self._finite:
+            # A model without any data gets the identity, and with it coefficients of zero.
+            normal += tf.where(mean > 0, RIDGE * mean, 1.0) * identity
+            if not filled.all():
+                normal += tf.linalg.diag((1 - filled) * tf.where(mean > 0, mean, 1.0)[:, 0])
+        ridge = KERNEL_RIDGE[self.dtype] * mean
         root = tf.linalg.triangular_solve(tf.linalg.cholesky(normal + ridge * identity), identity)
         again = tf.linalg.cholesky(identity + ridge * tf.matmul(root, root, transpose_b=True))
         return tf.linalg.cholesky(normal), tf.matmul(again, root, transpose_a=True)
 
-    def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> Projection:
-        pieces: list[_Piece] = []
+    def _project(
+        self,
+        gains: tf.Tensor,
+        visibilities: tf.Tensor,
+        weights: tf.Tensor,
+        mean: tf.Tensor | None = None,
+        deviations: tf.Tensor | None = None,
+    ) -> Projection:
+        """Return the projection at gains (2, Nants, Nfreqs).
+
+        Parameters
+        ----------
+        visibilities, weights
+            (2, Nbls, Nfreqs) and (Nbls, Nfreqs).
+        mean
+            m, like the visibilities, if the prior is finite.
+        deviations
+            t of the baselines' own coefficients and s of the shared ones, (2,), if the prior is finite.
+        """
+        parts: list[_Part] = []
         descent: list[tf.Tensor] = []
-        roots: list[tf.Tensor] = []
-        for stretch in self._stretches:
-            # Without this, all stretches would be worked on at once, and their temporaries add up.
-            with tf.control_dependencies([descent[-1], roots[-1]] if descent else []):
-                members = [self._project_piece(index, gains, visibilities, weights) for index in stretch]
-                pull = tf.concat([member.pull for member in members], axis=1)
+        for piece in self._pieces:
+            first, last = baselines = piece.batch.baselines
+            # Without this, all batches would be worked on at once, and their temporaries add up.
+            with tf.control_dependencies([descent[-1], parts[-1].roots.first] if parts else []):
+                products = self.tensors.gain_products(gains, first, last)
+                data = _PieceData(
+                    visibilities[:, first:last], weights[first:last], None if mean is None else mean[:, first:last]
+                )
+                part = self._eliminate(piece, products, data, deviations)
                 before = descent[-1] if descent else 0.0
-                descent.append(before + self.tensors.sum_over_antenna(pull, self.tensors.baselines_of(stretch)))
-                widest = max(member.root.shape[1] for member in members)
-                padded = [tf.pad(part.root, [[0, 0], [0, widest - part.root.shape[1]], [0, 0]]) for part in members]
-                roots.append(tf.concat(padded, axis=0))
-            pieces += members
+                descent.append(before + self.tensors.sum_over_antenna(part.pull, baselines))
+            parts.append(part)
+        model = tf.concat([part.model for part in parts], axis=1)
+        curvature = tf.concat([tf.cast(part.curvature, self.dtype) for part in parts], axis=0)
         return Projection(
-            tf.add_n([piece.loss for piece in pieces]),
-            tf.concat([piece.model for piece in pieces], axis=1),
-            descent[-1],
-            tf.concat([piece.curvature for piece in pieces], axis=0),
-            tf.concat([piece.baseline_model for piece in pieces], axis=1),
-            tuple(roots),
-        )
-
-    def _project_piece(self, index: int, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor) -> _Piece:
-        """Eliminate the foregrounds of one piece of models."""
-        tensors, basis = self.tensors, self._bases[index]
-        start, (first, last) = tensors.slices[index][0], tensors.baseline_slices[index]
-        visibilities, weights = visibilities[:, first:last], weights[first:last]
-        products = tensors.gain_products(gains, first, last)
-        curvature = weights * pairs.squared_modulus(products)
-        matched = pairs.conjugate_multiply(products, weights * visibilities)
-        owner = None if tensors.model_index is None else tensors.model_index[first:last] - start
-        if owner is None:
-            group_curvature = curvature
-        else:
-            group_curvature = tf.math.segment_sum(curvature, owner)
-            matched = tf.stack([tf.math.segment_sum(part, owner) for part in tf.unstack(matched)])
-        # More than the channels of one model where all members of a joint piece are one.
-        length, n_vectors = basis.shape
-        factor, root = self._factor(tf.reshape(group_curvature, [-1, length]), basis)
-        projected = tf.reshape(tf.reshape(matched, [-1, length]) @ basis, [2, -1, n_vectors])
-        coefficients = tf.linalg.cholesky_solve(factor, tf.transpose(projected, [1, 2, 0]))
-        coefficients = tf.reshape(tf.transpose(coefficients, [2, 0, 1]), [-1, n_vectors])
-        model = tf.reshape(tf.matmul(coefficients, basis, transpose_b=True), [2, -1, tensors.n_frequencies])
-        overlap = self.overlaps[index]
-        spread = tf.reshape(tf.cast(root, tf.float32), [-1, n_vectors]) @ overlap
-        baseline_model = model if owner is None else tf.gather(model, owner, axis=1)
-        residual = visibilities - pairs.multiply(products, baseline_model)
-        return _Piece(
-            tf.reduce_sum(weights * pairs.squared_modulus(residual)),
+            tf.add_n([part.loss for part in parts]),
             model,
-            pairs.conjugate_multiply(baseline_model, weights * pairs.conjugate_multiply(products, residual)),
-            tf.cast(curvature, tf.float32),
-            tf.cast(baseline_model, tf.float32),
-            tf.reshape(spread, [-1, n_vectors, overlap.shape[1]]),
+            descent[-1],
+            curvature,
+            tf.cast(model, self.dtype),
+            tuple(part.roots for part in parts),
         )
 
-    def absorb(self, values: tf.Tensor, roots: tuple[tf.Tensor, ...]) -> tf.Tensor:
-        """Return ``Q S^T S Q^T values`` for each model; values and result (2, Nmodels, Nfreqs).
+    def _eliminate(self, piece: _Piece, products: tf.Tensor, data: _PieceData, deviations: tf.Tensor | None) -> _Part:
+        """Eliminate the foregrounds of one batch, whose baselines have the gain products `products`."""
+        curvature = data.weights * pairs.squared_modulus(products)
+        matched = pairs.conjugate_multiply(products, data.weights * data.visibilities)
+        if data.mean is not None:
+            matched -= curvature * data.mean
+        eliminate = self._eliminate_both if self._two_levels else self._eliminate_one
+        model, penalty, roots = eliminate(piece, curvature, matched, deviations)
+        if data.mean is not None:
+            model += data.mean
+        residual = data.visibilities - pairs.multiply(products, model)
+        return _Part(
+            tf.reduce_sum(data.weights * pairs.squared_modulus(residual)) + penalty,
+            model,
+            pairs.conjugate_multiply(model, data.weights * pairs.conjugate_multiply(products, residual)),
+            curvature,
+            roots,
+        )
+
+    def _eliminate_one(
+        self, piece: _Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
+    ) -> tuple[tf.Tensor, tf.Tensor, Roots]:
+        """Return F - m on the baselines, the prior's share of the loss, and the roots, where a model has one kind.
+
+        Parameters
+        ----------
+        curvature, matched
+            D and G* w V - D m of its baselines.
+        deviations
+            See `_project`.
+        """
+        owner, vectors = piece.owner, piece.vectors
+        if owner is not None:
+            curvature, matched = tf.math.segment_sum(curvature, owner), piece.to_models(matched)
+        if piece.batch.joint:
+            # All members are one model with the channels of all of them.
+            curvature, matched = tf.reshape(curvature, [1, -1]), tf.reshape(matched, [2, 1, -1])
+        normal, projected = vectors.normal(curvature), vectors.reduce(matched)
+        scale = tf.constant(1.0, tf.float64)
+        if deviations is not None:
+            scale = deviations[self._level]
+            normal = tf.square(scale) * normal + tf.eye(normal.shape[2], dtype=normal.dtype)
+        factor, root = self._factor(normal, vectors.filled)
+        coefficients = tf.linalg.cholesky_solve(factor, scale * projected)
+        if not self._finite:
+            # One step of iterative refinement: the ridge would be an error of the gradient.
+            coefficients += tf.linalg.cholesky_solve(factor, projected - normal @ coefficients)
+        penalty = tf.constant(0.0, tf.float64) if deviations is None else tf.reduce_sum(tf.square(coefficients))
+        model = tf.reshape(vectors.expand(scale * coefficients), [2, -1, self.tensors.n_frequencies])
+        return piece.to_baselines(model), penalty, Roots(vectors.overlap(tf.cast(scale * root, self.dtype)), None)
+
+    def _eliminate_both(
+        self, piece: _Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
+    ) -> tuple[tf.Tensor, tf.Tensor, Roots]:
+        """Return what `_eliminate_one` does, where baselines have coefficients of their own besides the shared ones."""
+        vectors: Any = piece.own
+        owner, (own, shared) = piece.owner, tf.unstack(deviations)
+        normal, projected = vectors.normal(curvature), vectors.reduce(matched)
+        identity = tf.eye(normal.shape[2], dtype=normal.dtype)
+        factor, root = self._factor(tf.square(own) * normal + identity, vectors.filled)
+        half = tf.linalg.triangular_solve(factor, normal)
+        left = normal - tf.square(own) * tf.matmul(half, half, transpose_a=True)
+        answered = projected - tf.square(own) * normal @ tf.linalg.cholesky_solve(factor, projected)
+        common = tf.square(shared) * tf.math.segment_sum(left, owner) + identity
+        common_factor, common_root = self._factor(common, piece.vectors.filled)
+        z = tf.linalg.cholesky_solve(common_factor, shared * tf.math.segment_sum(answered, owner))
+        mine = tf.gather(shared * z, owner)
+        d = tf.linalg.cholesky_solve(factor, own * (projected - normal @ mine))
+        penalty = tf.reduce_sum(tf.square(z)) + tf.reduce_sum(tf.square(d))
+        roots = Roots(
+            vectors.overlap(tf.cast(own * root, self.dtype)),
+            piece.vectors.overlap(tf.cast(shared * common_root, self.dtype)),
+        )
+        return vectors.expand(mine + own * d), penalty, roots
+
+    def answer(self, change: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return how the foregrounds of the baselines answer a weighted change y of the visibilities.
 
         The product S^T S itself would not do in float32: where flags leave a foreground nearly undetermined it is
         large, and its rounding would be large for the others.
+
+        Parameters
+        ----------
+        change
+            (2, Nbls, Nfreqs).
+        projection
+            Whose curvature and roots count.
         """
         answers = []
-        n_frequencies, rank = self.common.shape
-        for stretch, root in zip(self._stretches, roots, strict=True):
-            first, last = self.tensors.models_of(stretch)
-            inner = tf.reshape(values[:, first:last], [-1, n_frequencies]) @ self.common
-            # Real and imaginary part share one batched product.
-            inner = tf.transpose(tf.reshape(inner, [2, -1, root.shape[2]]), [1, 0, 2])
-            inner = tf.matmul(inner, root, transpose_b=True) @ root
-            inner = tf.reshape(tf.transpose(inner, [1, 0, 2]), [-1, rank])
-            outer = tf.matmul(inner, self.common, transpose_b=True)
-            answers.append(tf.reshape(outer, [2, -1, n_frequencies]))
+        for piece, roots in zip(self._pieces, projection.roots, strict=True):
+            first, last = piece.batch.baselines
+            part = change[:, first:last]
+            if roots.shared is None:
+                answers.append(piece.to_baselines(self._absorb(piece.to_models(part), roots.first)))
+                continue
+            curvature = projection.curvature[first:last]
+            left = part - curvature * self._absorb(part, roots.first)
+            common = piece.to_baselines(self._absorb(piece.to_models(left), roots.shared))
+            answers.append(common + self._absorb(part - curvature * common, roots.first))
         return answers[0] if len(answers) == 1 else tf.concat(answers, axis=1)
 
-    def baseline_roots(self, stretch: range, root: tf.Tensor) -> tf.Tensor:
-        """Return S of each baseline of a stretch by itself, (Nbls, Nvec, rank)."""
-        if self._joint[stretch[0]]:
+    def _absorb(self, values: tf.Tensor, root: tf.Tensor) -> tf.Tensor:
+        """Return ``Q S^T S Q^T values``, (2, N, Nfreqs)."""
+        n_frequencies, rank = self.common.shape
+        inner = tf.reshape(values, [-1, n_frequencies]) @ self.common
+        # Real and imaginary part share one batched product.
+        inner = tf.transpose(tf.reshape(inner, [2, -1, root.shape[2]]), [1, 0, 2])
+        inner = tf.matmul(inner, root, transpose_b=True) @ root
+        inner = tf.reshape(tf.transpose(inner, [1, 0, 2]), [-1, rank])
+        return tf.reshape(tf.matmul(inner, self.common, transpose_b=True), [2, -1, n_frequencies])
+
+    def baseline_roots(self, batch: Batch, roots: Roots) -> tf.Tensor:
+        """Return S of each baseline of a batch by itself, (Nbls, Nvec, rank)."""
+        root = roots.first
+        if batch.joint:
             root = tf.transpose(tf.reshape(root, [root.shape[1], -1, self.rank]), [1, 0, 2])
-        if self.tensors.model_index is None:
-            return root
-        start, end = self.tensors.baselines_of(stretch)
-        return tf.gather(root, self.tensors.model_index[start:end] - self.tensors.models_of(stretch)[0])
+        owned = self._two_levels or not self.tensors.shared
+        return root if owned else tf.gather(root, self.tensors.owner(batch))
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
-        """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs), float32."""
+        """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs)."""
         tensors = self.tensors
         curvature, model = projection.curvature, projection.baseline_model
         change = curvature * pairs.multiply(model, tensors.relative_change(eta))
-        absorbed = tensors.to_baselines(self.absorb(tensors.sum_pairs_over_group(change), projection.roots))
-        return tensors.sum_over_antenna(pairs.conjugate_multiply(model, change - curvature * absorbed))
+        left = change - curvature * self.answer(change, projection)
+        return tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
+
+    def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return minus the product of the Jacobian with the second derivative of the residual along eta.
+
+        Along g exp(t eta), with foregrounds that follow as F + t dF, the second derivative of G F in t is
+        G ((eta_a + eta_b*)^2 F + 2 (eta_a + eta_b*) dF). Shape (2, Nants, Nfreqs).
+        """
+        tensors = self.tensors
+        curvature, model = projection.curvature, projection.baseline_model
+        relative = tensors.relative_change(eta)
+        first = pairs.multiply(model, relative)
+        change = curvature * pairs.multiply(relative, first - 2 * self.answer(curvature * first, projection))
+        left = change - curvature * self.answer(change, projection)
+        return -tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
 
 
 class FrozenForegrounds:
@@ -216,8 +388,8 @@ class FrozenForegrounds:
     Without foregrounds to respond, the Gauss-Newton matrix does not couple channels.
     """
 
-    def __init__(self, tensors: FitTensors) -> None:
-        self.tensors = tensors
+    def __init__(self, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
+        self.tensors, self.dtype = tensors, dtype
         self.project = tf.function(self._project)
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
@@ -225,24 +397,26 @@ class FrozenForegrounds:
         residual = visibilities - pairs.multiply(products, model)
         loss = tf.reduce_sum(weights * pairs.squared_modulus(residual))
         pull = pairs.conjugate_multiply(model, weights * pairs.conjugate_multiply(products, residual))
-        curvature = tf.cast(weights * pairs.squared_modulus(products), tf.float32)
+        curvature = tf.cast(weights * pairs.squared_modulus(products), self.dtype)
         descent = self.tensors.sum_over_antenna(pull)
-        return Projection(loss, model, descent, curvature, tf.cast(model, tf.float32), ())
+        return Projection(loss, model, descent, curvature, tf.cast(model, self.dtype), ())
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
-        """Return the Gauss-Newton matrix of the gains alone times eta, shape (2, Nants, Nfreqs), float32."""
+        """Return the Gauss-Newton matrix of the gains alone times eta, shape (2, Nants, Nfreqs)."""
         model = projection.baseline_model
         change = projection.curvature * pairs.multiply(model, self.tensors.relative_change(eta))
         return self.tensors.sum_over_antenna(pairs.conjugate_multiply(model, change))
 
+    def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return what `Projector.curvature_descent` does; foregrounds do not follow."""
+        model = projection.baseline_model
+        relative = self.tensors.relative_change(eta)
+        change = projection.curvature * pairs.multiply(model, pairs.multiply(relative, relative))
+        return -self.tensors.sum_over_antenna(pairs.conjugate_multiply(model, change))
+
 
 def _side_by_side(basis: np.ndarray) -> np.ndarray:
-    """Return a basis (Nfreqs, Nvec), or those of all members of a joint piece, (Nfreqs, Nmembers * Nvec)."""
-    return basis if basis.ndim == 2 else np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)
-
-
-def _overlap(basis: np.ndarray, common: np.ndarray) -> np.ndarray:
-    """Return A^T Q, (Nvec, rank), or those of all members of a joint piece, (Nvec, Nmembers * rank)."""
+    """Return a normalized basis (Nfreqs, Nvec), or those of all members of a joint batch, (Nfreqs, Nmembers * Nvec)."""
     if basis.ndim == 2:
-        return basis.T @ common
-    return np.moveaxis(basis.transpose(0, 2, 1) @ common, 0, 1).reshape(basis.shape[-1], -1)
+        return basis / np.linalg.norm(basis, axis=0)
+    return np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from calstudy.base.schema import UNKEYED, Section, choice
-from calstudy.base.units import Delay, Length
+from calstudy.base.units import Delay, FluxDensity, Length
 from calstudy.calibrate.interface import Calibrator
 
 MODELS_AT_ONCE = 512
@@ -159,6 +159,48 @@ class JointBasisSettings(Section):
     path: Path = Field(strict=False)
 
 
+Deviation = Annotated[float, Field(ge=0)] | Literal["infinite"]
+
+
+class ForegroundPrior(Section):
+    """How far foregrounds may be from what is assumed: a Gaussian prior, flat over the modelled delays."""
+
+    mean: Literal["none", "sky-model"] = Field("none", description="What is assumed of the foregrounds.")
+    deviation: Deviation = Field(
+        "infinite",
+        description="Standard deviation of what each baseline may have beside the mean, over the rms of the sky model; "
+        "`infinite`: foregrounds are free within the modelled delays; 0: none.",
+    )
+    shared_deviation: Deviation = Field(
+        0.0, description="The same for what redundant baselines have in common beside the mean."
+    )
+    noise: FluxDensity | None = Field(
+        None,
+        gt=0,
+        description="Standard deviation of the noise of one sample, against which finite deviations are weighed; null: "
+        "that of the experiment, or, with `weights: autos`, of the radiometer equation.",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        own, shared = self.deviation, self.shared_deviation
+        if own == "infinite" and shared != 0:
+            raise ValueError("shared_deviation: must be 0 where deviation is infinite, which leaves nothing to share")
+        if shared == "infinite" and own != 0:
+            raise ValueError("deviation: must be 0 where shared_deviation is infinite, or both must be finite")
+        if self.mean == "none" and "infinite" not in (own, shared):
+            raise ValueError(
+                "mean: finite deviations need `mean: sky-model`; around nothing the best foregrounds are ever smaller, "
+                "and the gains ever larger"
+            )
+        return self
+
+    @property
+    def finite(self) -> bool:
+        """Whether any deviation is neither zero nor infinite, so that the prior is weighed against the noise."""
+        return any(value not in (0, "infinite") for value in (self.deviation, self.shared_deviation))
+
+
 class GainFit(Calibrator):
     """Settings of calibrators that fit gains by weighted least squares, w |V - g_a g_b* F|^2."""
 
@@ -181,26 +223,59 @@ class GainFit(Calibrator):
         json_schema_extra=UNKEYED,
     )
 
+    @property
+    def frozen(self) -> bool:
+        """Whether the foregrounds are the sky model, so that only gains are fitted."""
+        return True
+
 
 class ForegroundFit(GainFit):
     """Settings of calibrators that fit foregrounds with the gains, in a basis of functions of frequency.
 
-    Attributes
-    ----------
-    grouped
-        Whether redundant baselines share one foreground model.
+    A calibrator of this kind is a `foreground_prior`; fields of it that a file leaves out are the calibrator's own.
     """
 
-    grouped: ClassVar[bool] = False
-
+    foreground_prior: ForegroundPrior = ForegroundPrior()
     basis: BasisSettings = BasisSettings()
     joint_basis: JointBasisSettings | None = Field(
         None,
         description="Groups of baselines with common coefficients and vectors of your own, in place of the DPSS basis; "
         "other baselines keep theirs.",
     )
-    prior: Literal["sum", "post-hoc", "gains", "none"] = Field(
+    prior: Literal["sum", "post-hoc", "gains", "sky-model", "none"] = Field(
         "sum",
         description="How the overall scale is fixed: by the paper's prior on the summed model, by the summed model "
-        "afterwards, by the geometric mean of the gains afterwards, or not.",
+        "afterwards, by the geometric mean of the gains afterwards, by regression of the calibrated data on the sky "
+        "model afterwards, or not.",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete_prior(cls, data: Any) -> Any:
+        """Fill in the fields of `foreground_prior` that are not given."""
+        given = data.get("foreground_prior") if isinstance(data, dict) else None
+        if not isinstance(given, dict):
+            return data
+        preset = cls.model_fields["foreground_prior"].default
+        return {**data, "foreground_prior": {**preset.model_dump(exclude_none=True), **given}}
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        prior = self.foreground_prior
+        if prior.finite and self.joint_basis is not None:
+            raise ValueError("joint_basis: has no finite prior; leave it out, or make `deviation` infinite")
+        if prior.finite and isinstance(self.solver, FirstOrderSettings):
+            raise ValueError(f"solver: {self.solver.name} cannot fit a finite prior; use gauss-newton or lbfgs")
+        if self.prior == "sky-model" and prior.mean == "none":
+            raise ValueError("prior: 'sky-model' needs `foreground_prior.mean: sky-model`")
+        return self
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the prior leaves nothing but the sky model."""
+        return self.foreground_prior.deviation == 0 and self.foreground_prior.shared_deviation == 0
+
+    @property
+    def grouped(self) -> bool:
+        """Whether redundant baselines have foregrounds in common."""
+        return self.foreground_prior.shared_deviation != 0

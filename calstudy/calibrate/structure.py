@@ -32,7 +32,7 @@ def make_structure(frame: Frame, settings: GainFit) -> FitStructure:
         If the basis does not fit into the channels (see `calstudy.calibrate.basis.make_basis`), or joint groups cannot
         be read or do not fit the data (see `calstudy.calibrate.joint.place_groups`).
     """
-    if isinstance(settings, ForegroundFit):
+    if isinstance(settings, ForegroundFit) and not settings.frozen:
         structure = _foregrounds(frame, settings)
         cutoff = settings.basis.eigenvalue_cutoff
     else:
@@ -59,14 +59,19 @@ def _modelled(frame: Frame, chosen: np.ndarray, settings: ForegroundFit) -> FitS
     """Return the structure of the chosen baselines, in the DPSS basis."""
     antennas, vectors = frame.antennas[chosen], frame.vectors[chosen]
     lengths = np.linalg.norm(vectors, axis=1)
+    prior = settings.foreground_prior
     if not settings.grouped:
-        basis = make_basis(lengths, frame.frequencies, settings.basis)
-        return FitStructure.per_baseline(antennas, frame.n_antennas, basis)
+        basis = make_basis(lengths, frame.frequencies, settings.basis, prior.finite)
+        structure = FitStructure.per_baseline(antennas, frame.n_antennas, basis)
+        return replace(structure, prior="own") if prior.finite else structure
     groups = redundant_groups(vectors, settings.redundancy_tolerance)
     longest = np.zeros(groups.index.max() + 1)
     np.maximum.at(longest, groups.index, lengths)
-    basis = make_basis(longest, frame.frequencies, settings.basis)
-    return FitStructure(antennas, frame.n_antennas, basis, groups.index, groups.conjugated)
+    basis = make_basis(longest, frame.frequencies, settings.basis, prior.finite)
+    structure = FitStructure(antennas, frame.n_antennas, basis, groups.index, groups.conjugated)
+    if not prior.finite:
+        return structure
+    return replace(structure, prior="shared" if prior.deviation == 0 else "both")
 
 
 def _with_joint(

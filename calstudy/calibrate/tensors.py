@@ -7,13 +7,14 @@ nothing after that needs to know.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
+from calstudy.calibrate.batches import Batch, make_batches
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 
 
@@ -49,21 +50,17 @@ class FitTensors:
     coupled
         Whether any baselines share a model or coefficients.
     slices
-        Range of models of each piece: a bucket, or a part of a large one that is not joint.
-    baseline_slices
-        Range of baselines that have the models of each piece.
-    stretches
-        Consecutive pieces that are worked on together, as ranges of their indices: as many as have `models_at_once`
-        baselines, or one that has more or is joint.
+        Range of models of each bucket.
     bases
-        Basis of each piece, shape (Nfreqs, Nvec), or (Nmodels, Nfreqs, Nvec) if it is joint, float64 arrays.
+        Basis of each bucket, shape (Nfreqs, Nvec), or (Nmodels, Nfreqs, Nvec) if it is joint, float64 arrays.
+    batches
+        The models in pieces that are worked on one after the other: what a piece needs for a while bounds the memory,
+        and what has to be compiled grows with their number.
     orientation
         1, or -1 for baselines that were turned around, shape (Nbls, 1); None if there are none.
     """
 
     def __init__(self, structure: FitStructure) -> None:
-        # Bounds the temporaries, which have the size of their bases.
-        piece = structure.models_at_once
         buckets = structure.basis.buckets
         model_order = np.concatenate([bucket.members for bucket in buckets])
         model_position = np.empty(structure.basis.n_models, int)
@@ -81,19 +78,14 @@ class FitTensors:
         self.second = tf.constant(pairs_sorted[:, 1], tf.int32)
         self.shared = self.n_models < self.n_baselines
         self.model_index = tf.constant(position[self._order], tf.int32) if self.shared else None
-        self.slices, self.bases, first = [], [], 0
-        for bucket in buckets:
-            last = first + bucket.members.size
-            step = bucket.members.size if bucket.joint else piece
-            for start in range(first, last, step):
-                self.slices.append((start, min(start + step, last)))
-                self.bases.append(bucket.vectors)
-            first = last
-        edges = np.searchsorted(position[self._order], self.slices)
-        self.baseline_slices = [(int(start), int(end)) for start, end in edges]
-        joint = [basis.ndim == 3 for basis in self.bases]
-        self.coupled = self.shared or any(joint)
-        self.stretches = _stretches(self.baseline_slices, piece, joint)
+        edges = np.cumsum([0, *(bucket.members.size for bucket in buckets)]).tolist()
+        self.slices = list(pairwise(edges))
+        self.bases = [bucket.vectors for bucket in buckets]
+        # The first baseline of each model, and one past the last of all.
+        self._baseline_edges = np.searchsorted(position[self._order], np.arange(self.n_models + 1))
+        self.coupled = self.shared or any(bucket.joint for bucket in buckets)
+        sizes = [bucket.members.size for bucket in buckets]
+        self.batches = make_batches(self.bases, sizes, self._baseline_edges, structure.models_at_once)
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
 
     def load(self, problem: CalibrationProblem, dtype: tf.DType) -> SortedData:
@@ -119,11 +111,20 @@ class FitTensors:
         return pairs.to_pair(np.where(self._conjugated[:, None], values.conj(), values), dtype)
 
     def unload(self, model: tf.Tensor, scale: float) -> np.ndarray:
-        """Return a model (2, Nmodels, Nfreqs) on the problem's baselines, shape (Nbls, Nfreqs), times `scale`."""
-        sorted_model = scale * pairs.to_complex(self.to_baselines(model))
+        """Return a model (2, Nbls, Nfreqs) in the problem's order and orientation, (Nbls, Nfreqs), times `scale`."""
+        sorted_model = scale * pairs.to_complex(model)
         result = np.empty_like(sorted_model)
         result[self._order] = np.where(self._conjugated[:, None], sorted_model.conj(), sorted_model)
         return result
+
+    def owner(self, batch: Batch) -> np.ndarray:
+        """Return the position in a batch of the model of each of its baselines, ascending, (Nbls,)."""
+        start, end = batch.models
+        return np.repeat(np.arange(end - start), np.diff(self._baseline_edges[start : end + 1]))
+
+    def of_models(self, values: tf.Tensor) -> tf.Tensor:
+        """Return what the first baseline of each model has: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
+        return values if self.model_index is None else tf.gather(values, self._baseline_edges[:-1], axis=1)
 
     def to_baselines(self, model: tf.Tensor, axis: int = 1) -> tf.Tensor:
         """Give each baseline its model: (2, Nmodels, Nfreqs) to (2, Nbls, Nfreqs), or one part of it with axis 0."""
@@ -175,22 +176,3 @@ class FitTensors:
         real = scatter(values[0], first) + scatter(values[0], second)
         imaginary = scatter(values[1], first) - scatter(values[1], second)
         return tf.stack([real, imaginary])
-
-    def models_of(self, stretch: range) -> tuple[int, int]:
-        """Return the range of models in a stretch of pieces."""
-        return self.slices[stretch[0]][0], self.slices[stretch[-1]][1]
-
-    def baselines_of(self, stretch: range) -> tuple[int, int]:
-        """Return the range of baselines that have the models of a stretch of pieces."""
-        return self.baseline_slices[stretch[0]][0], self.baseline_slices[stretch[-1]][1]
-
-
-def _stretches(slices: Sequence[tuple[int, int]], most: int, alone: Sequence[bool]) -> list[range]:
-    """Return ranges of consecutive slices that hold `most` elements together, or one that holds more or is `alone`."""
-    first, found = 0, []
-    for index in range(1, len(slices) + 1):
-        full = index == len(slices) or slices[index][1] - slices[first][0] > most
-        if full or alone[index] or alone[first]:
-            found.append(range(first, index))
-            first = index
-    return found

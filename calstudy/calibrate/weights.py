@@ -9,7 +9,7 @@ from pyuvdata import UVFlag
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
-from calstudy.calibrate.settings import FileWeights, Weights
+from calstudy.calibrate.settings import FileWeights, ForegroundFit, Weights
 
 # Times of weights and data agree within this, in days.
 TIME_TOLERANCE = 1e-6
@@ -51,6 +51,44 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     size = weights.shape[1] * weights.shape[2]
     count, total = (np.sum(values, axis=(1, 2), keepdims=True) for values in (weights > 0, weights))
     return weights * (count / size / np.where(total > 0, total, 1))
+
+
+def inverse_variance(data: Observation, fitted: np.ndarray, settings: ForegroundFit, noise: float | None) -> np.ndarray:
+    """Return what weights are multiplied by to be 1 / sigma^2 in the mean over unflagged samples.
+
+    Parameters
+    ----------
+    data, fitted
+        As for `make_weights`.
+    settings
+        Whose `foreground_prior.noise` comes first.
+    noise
+        What is known of it otherwise (see `calstudy.calibrate.interface.Assumed`); None: the radiometer equation,
+        sigma^2 = V_aa V_bb / (channel width x integration time x nsamples), for weights from autocorrelations.
+
+    Returns
+    -------
+    ndarray, float64, (Ntimes, 1, 1, Npols)
+
+    Raises
+    ------
+    InputError
+        If nothing says what the noise is, or it is zero.
+    """
+    used = ~data.flags[:, fitted]
+    count = np.sum(used, axis=(1, 2), keepdims=True)
+    sigma = settings.foreground_prior.noise or noise
+    if sigma is None and settings.weights.kind == "autos":
+        samples = abs(float(np.mean(data.uvd.channel_width))) * float(np.mean(data.uvd.integration_time))
+        precision = np.sum(_from_autos(data, fitted) * used, axis=(1, 2), keepdims=True) * samples
+    elif sigma:
+        precision = np.sum(data.nsamples[:, fitted] * used, axis=(1, 2), keepdims=True) / sigma**2
+    else:
+        raise InputError(
+            "foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; "
+            "give the standard deviation of a sample, such as '1 Jy', or use `weights: autos`"
+        )
+    return precision / np.where(count > 0, count, 1) * (used.shape[1] * used.shape[2])
 
 
 def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cos
 from calstudy.calibrate.execution import cost_of
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
+from calstudy.products.corruption import LEVELS
 from calstudy.products.files import (
     DATA,
     GAINS,
@@ -50,6 +51,8 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     inputs = {"data": data}
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
+    if settings.needs_noise:
+        inputs["levels"] = corruption.levels(graph)
     chunks = {
         f"chunk{index:03d}": Task(
             CALIBRATE_CHUNK,
@@ -87,7 +90,8 @@ def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     sky = None
     if "sky_model" in job.inputs:
         sky = _integrations(read_visibilities(job.inputs["sky_model"] / VISIBILITIES), index, count, together)
-    result = run_calibrator(settings, data, sky)
+    noise = read_json(job.inputs["levels"] / LEVELS)["noise_std"] if "levels" in job.inputs else None
+    result = run_calibrator(settings, data, sky, noise=noise)
     result.gains.write_calh5(job.output / GAINS)
     for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
         write_visibilities(uvd, job.output / name, single=True)

@@ -135,7 +135,8 @@ def test_projection_is_weighted_least_squares(case):
     problem, gains, _ = case
     tensors = FitTensors(problem.structure)
     data = tensors.load(problem, tf.float64)
-    projection = Projector(tensors).project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights)
+    projector = Projector(problem.structure, tensors)
+    projection = projector.project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights)
     model = dense_projection(problem, gains)
     used = problem.weights > 0
     difference = (tensors.unload(projection.model, data.scale) - model)[used]
@@ -147,7 +148,8 @@ def test_descent_is_the_gradient_of_the_reduced_loss(case):
     problem, gains, _ = case
     tensors = FitTensors(problem.structure)
     data = tensors.load(problem, tf.float64)
-    projection = Projector(tensors).project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights)
+    projector = Projector(problem.structure, tensors)
+    projection = projector.project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights)
     eta = complex_normal(np.random.default_rng(7), gains.shape)
     slope = -2 * float(pairs.inner_product(projection.descent, pairs.to_pair(eta, tf.float64)))
     h = 1e-5
@@ -168,7 +170,7 @@ def test_hessian_is_the_projected_jacobian_squared(case):
     problem, gains, _ = case
     tensors = FitTensors(problem.structure)
     data = tensors.load(problem, tf.float64)
-    projector = Projector(tensors)
+    projector = Projector(problem.structure, tensors)
     projection = projector.project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights)
     rng = np.random.default_rng(8)
     eta, other = complex_normal(rng, gains.shape), complex_normal(rng, gains.shape)

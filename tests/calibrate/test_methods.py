@@ -183,10 +183,10 @@ def test_pieces_of_any_size_give_the_same_projection(toy):
     for piece in (1, 3, 512):
         tensors = FitTensors(replace(structure, models_at_once=piece))
         data = tensors.load(toy.problem(), tf.float64)
-        projector = Projector(tensors)
+        projector = Projector(structure, tensors)
         results.append(projector.project(gains, data.visibilities, data.weights))
         images.append(projector.hessian_product(eta, results[-1]))
-    assert len(results[0].roots) > len(results[2].roots) == 1
+    assert len(results[0].roots) > len(results[2].roots)
     for image in images[:2]:
         assert np.abs(image - images[2]).max() < 1e-5 * np.abs(images[2]).max()
     for other in results[:2]:

@@ -30,7 +30,7 @@ def at_random_gains(problem, seed=9):
     """The projector, the projection at gains with errors, and those gains."""
     tensors = FitTensors(problem.structure)
     data = tensors.load(problem, tf.float64)
-    projector = Projector(tensors)
+    projector = Projector(problem.structure, tensors)
     gains = 1 + 0.2 * complex_normal(np.random.default_rng(seed), problem.initial_gains.shape)
     return projector, projector.project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights), gains
 
@@ -126,7 +126,8 @@ def test_models_in_common_count_as_models_of_their_own(hexagon):
     model, curvature = pairs.to_complex(projection.baseline_model), projection.curvature.numpy()
     tensors, common = projector.tensors, projector.common.numpy()
     expected = np.zeros((gains.shape[0], projector.rank, projector.rank), complex)
-    roots = tf.concat(projection.roots, axis=0).numpy()[tensors.model_index.numpy()]
+    batches = zip(tensors.batches, projection.roots, strict=True)
+    roots = [root for batch, part in batches for root in projector.baseline_roots(batch, part).numpy()]
     for p, (a, b) in enumerate(zip(tensors.first.numpy(), tensors.second.numpy(), strict=True)):
         mixed = common.T @ ((curvature[p] * model[p])[:, None] * common)
         part = mixed.conj() @ roots[p].T @ roots[p] @ mixed

@@ -21,6 +21,13 @@ CROWDED = 0.9
 class LeastSquares(GainFit):
     """A fit of gains, and of foregrounds where there is a basis for them."""
 
+    @property
+    def needs_noise(self) -> bool:
+        """Whether the foregrounds have a finite prior, whose noise the settings do not say."""
+        if not isinstance(self, ForegroundFit) or not self.foreground_prior.finite:
+            return False
+        return self.foreground_prior.noise is None and self.weights.kind != "autos"
+
     def cost(self, size: Size) -> Cost:
         """Return what the solves take, within a factor of about two, as if no baselines shared a foreground model."""
         return solve_cost(self, size)
@@ -33,12 +40,13 @@ class LeastSquares(GainFit):
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return why no foreground model can be made for these baselines and channels, or None."""
-        del has_sky_model
+        if isinstance(self, ForegroundFit) and self.foreground_prior.mean == "sky-model" and not has_sky_model:
+            return "foreground_prior.mean: 'sky-model' needs a sky model, and there is none"
         from calstudy.calibrate.problem import fitted_baselines
 
         try:
             frame = frame.baselines(fitted_baselines(frame, self.autos))
-            if isinstance(self, ForegroundFit):
+            if isinstance(self, ForegroundFit) and not self.frozen:
                 _require_basis(frame, self)
         except InputError as error:
             return str(error).removeprefix("calibration.")
@@ -54,7 +62,7 @@ class LeastSquares(GainFit):
         together = min(self.integrations_per_solve, frame.n_times)
         memory = solve_memory(Dimensions.of(repeat_structure(structure, together)), self)
         cost = Cost(solve_cost(self, Size.of_frame(frame)).seconds, memory)
-        if not isinstance(self, ForegroundFit):
+        if self.frozen:
             return Outline(cost)
         coefficients = structure.basis.n_coefficients
         unknowns = coefficients + structure.n_antennas * structure.n_frequencies

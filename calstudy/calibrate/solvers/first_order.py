@@ -158,7 +158,7 @@ class JointKernels:
     def __init__(self, structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> None:
         self.dtype = tf.float32 if precision == "single" else tf.float64
         self.tensors = FitTensors(structure)
-        self.projector = Projector(self.tensors)
+        self.projector = Projector(structure, self.tensors)
         self.space = GainSpace(structure.gain_vectors, self.dtype)
         self.bases = [tf.constant(np.moveaxis(basis, -1, 0), self.dtype) for basis in self.tensors.bases]
         self._optimizer, self._with_prior = optimizer, prior == "sum"
@@ -173,7 +173,7 @@ class JointKernels:
         if (frozen := problem.frozen_model) is not None:
             model = self.tensors.load_model(frozen, exact.scale, self.dtype)
         else:
-            best = self.projector.project(start, exact.visibilities, exact.weights).model
+            best = self.tensors.of_models(self.projector.project(start, exact.visibilities, exact.weights).model)
             parts = zip(self.tensors.slices, self.tensors.bases, strict=True)
             coefficients = tuple(
                 tf.cast(_coefficients(best[:, first:last], basis), self.dtype) for (first, last), basis in parts
@@ -207,7 +207,7 @@ class JointKernels:
         """
         model = data.model
         if model is None:
-            model = tf.stack(foreground_model(parameters.coefficients, self.bases))
+            model = self.tensors.to_baselines(tf.stack(foreground_model(parameters.coefficients, self.bases)))
         return Estimate(pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload(model, scale))
 
     def loss_and_gradient(self, parameters: Parameters, data: FitData) -> tuple[tf.Tensor, Parameters]:

@@ -3,8 +3,15 @@
 Each step solves the damped normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`) by
 preconditioned conjugate gradients, with the damping tied to the loss, so that it vanishes towards the minimum. The
 first two steps use the antenna blocks of each channel as preconditioner, later ones the channel blocks of each antenna,
-which also predict how much the loss can still fall: the criterion of convergence. Where baselines share models, the
-couplings between antennas remain the strong ones, and the antenna blocks of each channel are used throughout.
+which also predict how much the loss can still fall. Where baselines share models, the couplings between antennas remain
+the strong ones, and the antenna blocks of each channel are used throughout.
+
+Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
+that are smaller. They matter where the noise is far below the foregrounds: once the loss is so small that single
+precision does not resolve the damping, products are made in double precision, the damping is a hundredth of what it
+was, and the prediction comes from a solution of the normal equations. In such directions steps are long and valleys
+curved: the damping then remembers what it was raised to, gains change by the exponential of a step, along which a phase
+is only a phase, and steps are bent by their geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885).
 """
 
 from __future__ import annotations
@@ -22,18 +29,26 @@ from calstudy.calibrate.projection import Projection
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, Inverse
 from calstudy.calibrate.solvers.reduced import (
+    LEAST_DAMPING,
     PRECONDITIONER_DAMPING,
     ROUNDING_LOSS,
     ReducedKernels,
     compiled,
-    damping_at,
     newton_decrement_at,
 )
 
 # Accepted steps before the antenna blocks are made.
 CHANNEL_STEPS = 2
-# With more than this on the damping, no step is small enough to lower the loss.
-MAX_BOOST = 1e6
+# With a larger damping, no step is small enough to lower the loss.
+MAX_DAMPING = 1e4
+# What the damping is multiplied by once eigenvalues below it matter.
+CHECK = 1e-2
+# In the curved valleys that follow: what the damping is raised and lowered by; the length of an acceleration, relative
+# to its step, with which a step is too long; what a step gains of what it promises if the next is to be shorter, or may
+# be longer.
+RAISE = 4.0
+TOO_CURVED = 0.6
+POOR, GOOD = 0.25, 0.75
 # Antenna blocks that need more iterations than this are out of date.
 CG_REFRESH = 15
 
@@ -57,7 +72,11 @@ class GaussNewtonState:
     data
         Visibilities, weights whose sum is one, and the model if it is frozen.
     boost
-        Factor on the damping; grows tenfold whenever a step did not lower the loss.
+        Factor on the damping; grows whenever a step did not lower the loss.
+    relief
+        Another factor, of one or of `CHECK`.
+    checked
+        Whether the prediction comes from a check of convergence.
     preconditioner
         The antenna blocks, once they are in use.
     gained
@@ -75,6 +94,8 @@ class GaussNewtonState:
     history: tuple[float, ...]
     n_accepted: int = 0
     boost: float = 1.0
+    relief: float = 1.0
+    checked: bool = False
     preconditioner: AntennaPreconditioner | None = None
     gained: float = math.inf
     predicted: float = math.inf
@@ -82,7 +103,19 @@ class GaussNewtonState:
     @property
     def damping(self) -> float:
         """Damping of the next step, relative to the diagonal of the Gauss-Newton matrix."""
-        return damping_at(self.history[-1]) * self.boost
+        tied = self.relief * self.kernels.damping(self.history[-1])
+        return max(tied, LEAST_DAMPING[self.kernels.dtype]) * self.boost
+
+    @property
+    def beyond_single(self) -> bool:
+        """Whether products are made in single precision, which does not resolve the damping that is due."""
+        dtype = self.kernels.dtype
+        return dtype == tf.float32 and self.kernels.damping(self.history[-1]) <= LEAST_DAMPING[dtype]
+
+    @property
+    def curved(self) -> bool:
+        """Whether steps are bent, and the damping remembers."""
+        return self.relief < 1
 
     @property
     def decrease_to_come(self) -> float:
@@ -113,7 +146,9 @@ class GaussNewton:
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and take over the preconditioner of the warm start."""
-        kernels = compiled(problem.structure, problem.frozen)
+        memory: AntennaPreconditioner | None = None if warm is None else warm.memory
+        dtype = tf.float32 if memory is None else memory.blocks.degrees.dtype
+        kernels = compiled(problem.structure, problem.frozen, dtype)
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
         projection = kernels.project(reduced.gains, *reduced.data)
         state = GaussNewtonState(
@@ -124,39 +159,35 @@ class GaussNewton:
             reduced.gains,
             projection,
             (float(projection.loss),),
+            preconditioner=memory,
         )
-        if warm is not None:
-            state = replace(state, preconditioner=warm.memory)
         return self._prepared(state)
 
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
-        """Try one damped step, and keep it if it lowers the loss."""
-        kernels, preconditioner = state.kernels, state.preconditioner
-        damping = tf.constant(state.damping, tf.float32)
-        if preconditioner is None:
-            eta, promised = kernels.channel_step(state.projection, state.gains, damping)
-        else:
-            eta, iterations = kernels.antenna_step(state.projection, state.gains, preconditioner.inverse, damping)
-            if iterations > CG_REFRESH:
-                preconditioner = None
-        gains = state.gains + pairs.multiply(state.gains, tf.cast(eta, tf.float64))
+        """Try one damped step, and keep it if it lowers the loss; or check whether there is need of one."""
+        if self._settled(state) or (state.beyond_single and state.gained < state.history[-1]):
+            return self._checked(state)
+        kernels = state.kernels
+        state, step = self._curved_step(state) if state.curved else (state, self._plain_step(state))
+        relative = tf.cast(step.eta, tf.float64)
+        gains = pairs.multiply(state.gains, pairs.exponential(relative) if state.curved else _one_plus(relative))
         trial = kernels.project(gains, *state.data)
         loss = float(trial.loss)
         # Refused as well: a loss that is not a number, and no step at all, from blocks that are singular to float32.
         if not loss < state.history[-1]:
-            # At the minimum itself no step brings anything.
-            if kernels.by_channel and state.boost == 1 and promised > 0:
-                state = replace(state, predicted=float(promised))
-            return self._prepared(replace(state, history=(*state.history, state.history[-1]), boost=10 * state.boost))
+            return self._refused(state, step.promised)
         boosted = state.boost > 1
+        if state.curved:
+            state = replace(state, boost=_next_boost(state.boost, (state.history[-1] - loss) / step.promised))
         state = replace(
             state,
             gains=gains,
             projection=trial,
             history=(*state.history, loss),
             n_accepted=state.n_accepted + 1,
-            boost=1.0,
-            preconditioner=preconditioner,
+            boost=state.boost if state.curved else 1.0,
+            checked=False,
+            preconditioner=None if step.outdated else state.preconditioner,
             gained=state.history[-1] - loss,
             predicted=math.inf,
         )
@@ -164,7 +195,7 @@ class GaussNewton:
             return self._prepared(state)
         # Without slow directions, the next step will bring less than this one did. One that a boosted damping kept
         # small says nothing of the next.
-        return state if boosted else replace(state, predicted=float(promised))
+        return state if boosted else replace(state, predicted=step.promised)
 
     def terminate(self, state: GaussNewtonState) -> Verdict | None:
         """Judge convergence by the decrease of the loss that the next step is predicted to bring."""
@@ -174,15 +205,61 @@ class GaussNewton:
         if loss < ROUNDING_LOSS:
             return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
-        if fall < self.tolerance and min(state.decrease_to_come, state.gained / loss) < self.tolerance:
+        if self._settled(state) and (state.checked or not (state.beyond_single or state.curved)):
             return Verdict("converged", f"the next step would lower the loss by {fall:.1e} of itself")
-        if state.boost > MAX_BOOST:
-            hint = f", though {fall:.1e} of itself is predicted" if math.isfinite(fall) else ""
-            return Verdict("stalled", f"no step lowers the loss{hint}")
+        hint = f"{fall:.1e} of {{}} is predicted to go" if math.isfinite(fall) else ""
+        if state.damping > MAX_DAMPING:
+            return Verdict("stalled", f"no step lowers the loss{', though ' + hint.format('it') if hint else ''}")
         if n_steps >= self.max_steps:
-            hint = f": {fall:.1e} of the loss is predicted to go" if math.isfinite(fall) else ""
-            return Verdict("max-steps", f"not converged after {n_steps} steps{hint}")
+            return Verdict(
+                "max-steps", f"not converged after {n_steps} steps{': ' + hint.format('the loss') if hint else ''}"
+            )
         return None
+
+    def _settled(self, state: GaussNewtonState) -> bool:
+        """Whether the loss will hardly fall, as far as the damping lets be seen."""
+        loss = state.history[-1]
+        if state.checked:
+            return state.predicted / loss < self.tolerance
+        falling = min(state.decrease_to_come, state.gained / loss)
+        return state.predicted / loss < self.tolerance and falling < self.tolerance
+
+    def _checked(self, state: GaussNewtonState) -> GaussNewtonState:
+        """Predict the decrease of the loss with a hundredth of the damping, from a solution of the normal equations."""
+        if state.kernels.dtype == tf.float32:
+            state = _in_double(state)
+        state = self._prepared(replace(state, relief=CHECK, boost=1.0))
+        return replace(state, predicted=self._plain_step(state).promised, checked=True)
+
+    def _plain_step(self, state: GaussNewtonState) -> _Step:
+        """Solve the damped normal equations."""
+        kernels, preconditioner = state.kernels, state.preconditioner
+        damping = kernels.scalar(state.damping)
+        if preconditioner is None:
+            eta, promised = kernels.channel_step(state.projection, state.gains, damping)
+            return _Step(eta, float(promised), False)
+        eta, promised, iterations = kernels.antenna_step(state.projection, state.gains, preconditioner.inverse, damping)
+        return _Step(eta, float(promised), bool(iterations > CG_REFRESH))
+
+    def _curved_step(self, state: GaussNewtonState) -> tuple[GaussNewtonState, _Step]:
+        """Return the state with the damping that keeps a step about straight, and the step, bent."""
+        while True:
+            step = self._plain_step(state)
+            inverse = None if state.preconditioner is None else state.preconditioner.inverse
+            arguments = state.projection, state.gains, inverse, state.kernels.scalar(state.damping), step.eta
+            acceleration = state.kernels.accelerate(*arguments)
+            bend = float(tf.norm(acceleration) / tf.norm(step.eta))
+            # Written so that what is no number counts as curved.
+            if bend < TOO_CURVED or state.damping > MAX_DAMPING:
+                return state, step._replace(eta=step.eta + 0.5 * acceleration)
+            state = self._prepared(replace(state, boost=RAISE * state.boost))
+
+    def _refused(self, state: GaussNewtonState, promised: float) -> GaussNewtonState:
+        # At the minimum itself no step brings anything.
+        if state.kernels.by_channel and state.boost == 1 and promised > 0:
+            state = replace(state, predicted=promised)
+        history = (*state.history, state.history[-1])
+        return self._prepared(replace(state, history=history, boost=(RAISE if state.curved else 10) * state.boost))
 
     def losses(self, state: GaussNewtonState) -> Sequence[float]:
         """Return the loss history in the unit of the data squared."""
@@ -213,10 +290,10 @@ class GaussNewton:
         early = state.n_accepted < CHANNEL_STEPS and kernels.space.vectors is None
         if kernels.by_channel or (preconditioner is None and early):
             return state
-        damping = max(state.damping, PRECONDITIONER_DAMPING)
+        damping = max(state.damping, PRECONDITIONER_DAMPING[kernels.dtype])
         if preconditioner is None or preconditioner.damping != damping:
             blocks = kernels.blocks(state.projection) if preconditioner is None else preconditioner.blocks
-            inverse = kernels.inverse(blocks, tf.constant(damping, tf.float32), state.gains)
+            inverse = kernels.inverse(blocks, kernels.scalar(damping), state.gains)
             preconditioner = AntennaPreconditioner(blocks, damping, inverse)
         state = replace(state, preconditioner=preconditioner)
         # A boosted damping shrinks the prediction without bringing the minimum any closer.
@@ -224,3 +301,29 @@ class GaussNewton:
             return state
         fall = kernels.predicted_decrease(state.projection, state.gains, preconditioner.inverse)
         return replace(state, predicted=float(fall))
+
+
+class _Step(NamedTuple):
+    """A step eta, the decrease of the loss that it promises, and whether its preconditioner is out of date."""
+
+    eta: tf.Tensor
+    promised: float
+    outdated: bool
+
+
+def _one_plus(values: tf.Tensor) -> tf.Tensor:
+    return tf.stack([1 + values[0], values[1]])
+
+
+def _next_boost(boost: float, gain: float) -> float:
+    """Return the factor on the damping after a step that lowered the loss by `gain` times what it promised."""
+    if gain < POOR:
+        return RAISE * boost
+    return max(1.0, boost / RAISE) if gain > GOOD else boost
+
+
+def _in_double(state: GaussNewtonState) -> GaussNewtonState:
+    """Return a state whose products are made in double precision."""
+    kernels = state.kernels.in_double()
+    projection = kernels.project(state.gains, *state.data)
+    return replace(state, kernels=kernels, projection=projection, preconditioner=None)

@@ -39,7 +39,7 @@ class Inverse(Protocol):
 
 
 def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
-    """Return sum_b D |F|^2 of each antenna and channel, floored, shape (Nants, Nfreqs), float32."""
+    """Return sum_b D |F|^2 of each antenna and channel, floored, shape (Nants, Nfreqs)."""
     power = projection.curvature * pairs.squared_modulus(projection.baseline_model)
     degree = tf.math.unsorted_segment_sum(power, tensors.first, tensors.n_antennas)
     degree += tf.math.unsorted_segment_sum(power, tensors.second, tensors.n_antennas)
@@ -73,7 +73,7 @@ def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Ten
     projection
         The reduced problem at the gains in question.
     damping
-        Relative to the diagonal, scalar, float32.
+        Relative to the diagonal, scalar, in the precision of the projection.
     """
     power = tf.transpose(projection.curvature * pairs.squared_modulus(projection.baseline_model))
     index = tf.stack([tensors.first, tensors.second], axis=1)
@@ -123,20 +123,20 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     gram = tf.reshape(degrees @ products, [-1, rank, rank])
     weighted = projection.curvature * projection.baseline_model
     absorbed: list[tf.Tensor] = []
-    for stretch, root in zip(tensors.stretches, projection.roots, strict=True):
-        # Temporaries of several stretches would add up.
+    for batch, batch_roots in zip(tensors.batches, projection.roots, strict=True):
+        # Temporaries of several batches would add up.
         with tf.control_dependencies(absorbed[-1:]):
-            start, end = baselines = tensors.baselines_of(stretch)
+            start, end = batch.baselines
             mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies]) @ products
             real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, rank, rank]))
-            roots = projector.baseline_roots(stretch, root)
+            roots = projector.baseline_roots(batch, batch_roots)
             real, imaginary = roots @ real, roots @ imaginary
             square = tf.matmul(real, real, transpose_a=True) + tf.matmul(imaginary, imaginary, transpose_a=True)
             crossed = tf.matmul(real, imaginary, transpose_a=True)
             both = tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)])
-            # Added up on the way: the sums of all stretches at once would be large.
+            # Added up on the way: the sums of all batches at once would be large.
             before = absorbed[-1] if absorbed else 0.0
-            absorbed.append(before + tensors.sum_over_antenna(both, baselines))
+            absorbed.append(before + tensors.sum_over_antenna(both, batch.baselines))
     return AntennaBlocks(degrees, common, gram, absorbed[-1])
 
 
@@ -173,7 +173,7 @@ def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse
     gram = tf.cast(1 + damping, tf.float64) * tf.cast(blocks.gram, tf.float64)
     real, imaginary = tf.unstack(tf.cast(blocks.absorbed, tf.float64))
     correction = _inverse(tf.complex(gram - real, -imaginary)) - tf.cast(_inverse(gram), tf.complex128)
-    correction = tf.cast(tf.stack([tf.math.real(correction), tf.math.imag(correction)]), tf.float32)
+    correction = tf.cast(tf.stack([tf.math.real(correction), tf.math.imag(correction)]), damping.dtype)
     return AntennaInverse(blocks.common, 1 / ((1 + damping) * blocks.degrees), correction)
 
 
@@ -203,7 +203,7 @@ def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Te
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
     if blocks.absorbed is not None:
         # L of the module's M.
-        inverse = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), tf.float32)
+        inverse = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), blocks.gram.dtype)
         lift = tf.cast(blocks.degrees[:, :, None] * (blocks.common @ inverse), columns.dtype)
         inner = tf.matmul(columns, lift, adjoint_a=True)
         matrix -= inner @ tf.matmul(tf.complex(blocks.absorbed[0], blocks.absorbed[1]), inner, adjoint_b=True)

@@ -14,6 +14,7 @@ preconditioner has the channel blocks of each antenna, its inverse stands for th
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -36,11 +37,13 @@ from calstudy.calibrate.solvers.preconditioners import (
 )
 from calstudy.calibrate.tensors import FitTensors
 
-# Damping, relative to the diagonal, is this times the loss relative to the data, within the two bounds.
+# Damping, relative to the diagonal, is this times the loss relative to the data, but no more than the bound, and no
+# less than what products in a precision can resolve.
 DAMPING_PER_LOSS = 10.0
-DAMPING_BOUNDS = (1e-6, 1e-2)
-# The blocks of float32 numbers cannot be inverted with less.
-PRECONDITIONER_DAMPING = 1e-5
+MOST_DAMPING = 1e-2
+LEAST_DAMPING = {tf.float32: 1e-6, tf.float64: 1e-14}
+# Blocks in a precision cannot be inverted with less.
+PRECONDITIONER_DAMPING = {tf.float32: 1e-5, tf.float64: 1e-13}
 CG_TOLERANCE = 1e-3
 CG_CHANNEL_ITERATIONS = 300
 CG_ANTENNA_ITERATIONS = 60
@@ -77,9 +80,9 @@ class NormalEquations(NamedTuple):
     projection
         The reduced problem there.
     gains
-        (2, Nants, Nfreqs), float32 or float64.
+        (2, Nants, Nfreqs).
     damping
-        Relative to the diagonal, scalar, float32.
+        Relative to the diagonal, scalar.
     inverse
         Preconditioner.
     """
@@ -101,19 +104,32 @@ class ReducedKernels:
         frozen.
     """
 
-    def __init__(self, structure: FitStructure, frozen: bool = False) -> None:
+    def __init__(self, structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32) -> None:
         self.tensors = FitTensors(structure)
-        self.frozen = frozen
+        self.structure, self.frozen, self.dtype = structure, frozen, dtype
         self.by_channel = (self.tensors.coupled or frozen) and structure.gain_vectors is None
-        self.projector = FrozenForegrounds(self.tensors) if frozen else Projector(self.tensors)
-        self.space = GainSpace(structure.gain_vectors, tf.float32)
+        self.projector = FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype)
+        self.space = GainSpace(structure.gain_vectors, dtype)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
         self.project = self.projector.project
         self.channel_step = tf.function(self._channel_step)
         self.antenna_step = tf.function(self._antenna_step)
         self.blocks = tf.function(self._blocks)
         self.inverse = tf.function(self._inverse)
+        self.accelerate = tf.function(self._accelerate)
         self.predicted_decrease = tf.function(self._predicted_decrease)
+
+    def in_double(self) -> ReducedKernels:
+        """Return the kernels of the same fit whose inner products are float64."""
+        return compiled(self.structure, self.frozen, tf.float64)
+
+    def scalar(self, value: float) -> tf.Tensor:
+        """Return a number in the precision of the inner products."""
+        return tf.constant(value, self.dtype)
+
+    def damping(self, loss: float) -> float:
+        """Return the damping, relative to the diagonal, at a loss relative to the weighted square of the data."""
+        return min(max(DAMPING_PER_LOSS * loss, LEAST_DAMPING[self.dtype]), MOST_DAMPING)
 
     def reduce(self, problem: CalibrationProblem, gains: np.ndarray) -> ReducedData:
         """Return the data of a problem, and gains (Nants, Nfreqs) as close as their space allows, as tensors."""
@@ -122,6 +138,10 @@ class ReducedKernels:
         arrays: tuple[tf.Tensor, ...] = (data.visibilities, data.weights / total)
         if (model := problem.frozen_model) is not None:
             arrays += (self.tensors.load_model(model, data.scale, tf.float64),)
+        if (mean := problem.prior_mean) is not None:
+            # Coefficients of unit variance stay so if the loss is divided by its unit and the weights by their sum.
+            deviations = math.sqrt(total) * np.array(problem.deviations)
+            arrays += (self.tensors.load_model(mean, data.scale, tf.float64), tf.constant(deviations, tf.float64))
         start = self.exact_space.expand(self.exact_space.reduce(pairs.to_pair(gains, tf.float64)))
         return ReducedData(start, arrays, data.scale, total * data.scale**2)
 
@@ -130,23 +150,47 @@ class ReducedKernels:
     ) -> tuple[tf.Tensor, tf.Tensor]:
         """Return eta, and the decrease of the loss that its quadratic model promises."""
         inverse = channel_inverse(self.tensors, projection, damping)
-        descent = tf.cast(projection.descent, tf.float32)
+        descent = tf.cast(projection.descent, self.dtype)
         equations = NormalEquations(projection, gains, damping, inverse)
         eta, _ = self.solve(equations, descent, CG_TOLERANCE, CG_CHANNEL_ITERATIONS)
         return eta, pairs.inner_product(descent, eta)
 
+    def _accelerate(
+        self, projection: Projection, gains: tf.Tensor, inverse: Inverse | None, damping: tf.Tensor, eta: tf.Tensor
+    ) -> tf.Tensor:
+        """Return the geodesic acceleration of a step eta (Transtrum & Sethna 2012), (2, Nants, Nfreqs).
+
+        It solves the damped normal equations of the step for the second derivative of the residual along eta, and half
+        of it added to eta keeps a long step in a curved valley.
+
+        Parameters
+        ----------
+        projection, gains, damping
+            As for the step.
+        inverse
+            Its preconditioner; None for the antenna blocks of each channel.
+        eta
+            The step.
+        """
+        if inverse is None:
+            inverse = channel_inverse(self.tensors, projection, damping)
+        equations = NormalEquations(projection, gains, damping, inverse)
+        descent = self.projector.curvature_descent(eta, projection)
+        return self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)[0]
+
     def _antenna_step(
         self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
-    ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta, and the iterations it took."""
-        descent = tf.cast(projection.descent, tf.float32)
+    ) -> tuple[tf.Tensor, tf.Tensor, tf.Tensor]:
+        """Return eta, the decrease of the loss that its quadratic model promises, and the iterations it took."""
+        descent = tf.cast(projection.descent, self.dtype)
         equations = NormalEquations(projection, gains, damping, inverse)
-        return self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)
+        eta, iterations = self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)
+        return eta, pairs.inner_product(descent, eta), iterations
 
     def solve(
         self, equations: NormalEquations, descent: tf.Tensor, tolerance: float, iterations: int
     ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta for a descent direction, both (2, Nants, Nfreqs), float32, and the iterations it took.
+        """Return eta for a descent direction, both (2, Nants, Nfreqs), and the iterations it took.
 
         Parameters
         ----------
@@ -159,7 +203,7 @@ class ReducedKernels:
         """
         projection = equations.projection
         diagonal = equations.damping * antenna_degrees(self.tensors, projection)
-        gains = tf.cast(equations.gains, tf.float32)
+        gains = tf.cast(equations.gains, self.dtype)
 
         def operator(coordinates: tf.Tensor) -> tf.Tensor:
             eta = self.space.expand_relative(coordinates, gains)
@@ -170,7 +214,7 @@ class ReducedKernels:
             operator,
             equations.inverse.apply,
             self.space.reduce_relative(descent, gains),
-            tf.constant(tolerance),
+            tf.constant(tolerance, self.dtype),
             tf.constant(iterations),
         )
         return self.space.expand_relative(coordinates, gains), count
@@ -183,23 +227,25 @@ class ReducedKernels:
     def _inverse(self, blocks: AntennaBlocks, damping: tf.Tensor, gains: tf.Tensor) -> Inverse:
         if self.space.vectors is None:
             return antenna_inverse(blocks, damping)
-        return coordinate_inverse(blocks, self.space.columns(tf.cast(gains, tf.float32)), damping)
+        return coordinate_inverse(blocks, self.space.columns(tf.cast(gains, self.dtype)), damping)
 
     def _predicted_decrease(self, projection: Projection, gains: tf.Tensor, inverse: Inverse) -> tf.Tensor:
-        descent = self.space.reduce_relative(tf.cast(projection.descent, tf.float32), tf.cast(gains, tf.float32))
+        descent = self.space.reduce_relative(tf.cast(projection.descent, self.dtype), tf.cast(gains, self.dtype))
         return pairs.inner_product(descent, inverse.apply(descent))
 
 
-@lru_cache(maxsize=4)
-def compiled(structure: FitStructure, frozen: bool = False) -> ReducedKernels:
-    """Return the kernels of a structure, compiled once for all its integrations."""
-    return ReducedKernels(structure, frozen)
+@lru_cache(maxsize=6)
+def compiled(structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32) -> ReducedKernels:
+    """Return the kernels of a structure, compiled once for all its integrations.
 
-
-def damping_at(loss: float) -> float:
-    """Return the damping, relative to the diagonal, at a loss relative to the weighted square of the data."""
-    low, high = DAMPING_BOUNDS
-    return min(max(DAMPING_PER_LOSS * loss, low), high)
+    Parameters
+    ----------
+    structure, frozen
+        Of the fit.
+    dtype
+        Of the inner products (see `calstudy.calibrate.projection.Projector`).
+    """
+    return ReducedKernels(structure, frozen, dtype)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
@@ -218,10 +264,10 @@ def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float
     loss = float(projection.loss)
     if loss < ROUNDING_LOSS:
         return 0.0
-    damping = damping_at(loss)
+    damping = kernels.damping(loss)
     if kernels.by_channel:
-        _, decrease = kernels.channel_step(projection, reduced.gains, tf.constant(damping, tf.float32))
+        _, decrease = kernels.channel_step(projection, reduced.gains, kernels.scalar(damping))
         return float(decrease) / loss
-    stronger = tf.constant(max(damping, PRECONDITIONER_DAMPING), tf.float32)
+    stronger = kernels.scalar(max(damping, PRECONDITIONER_DAMPING[kernels.dtype]))
     inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
     return float(kernels.predicted_decrease(projection, reduced.gains, inverse)) / loss

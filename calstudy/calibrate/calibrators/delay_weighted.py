@@ -1,0 +1,16 @@
+"""Gains, and what the sky model lacks: a finite prior on the foregrounds of every baseline (Byrne 2023)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from calstudy.calibrate.calibrators._least_squares import LeastSquares
+from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior
+
+
+class DelayWeighted(LeastSquares, ForegroundFit):
+    """Gains are fitted with a sky model whose errors, of known size, fill the modelled delays of each baseline."""
+
+    calibrator: str = "delay-weighted"
+    foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
+    prior: Literal["sum", "post-hoc", "gains", "sky-model", "none"] = "sky-model"

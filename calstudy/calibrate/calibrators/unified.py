@@ -1,0 +1,16 @@
+"""Gains, and what the sky model lacks, partly in common to redundant baselines (Byrne et al. 2021)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from calstudy.calibrate.calibrators._least_squares import LeastSquares
+from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior
+
+
+class Unified(LeastSquares, ForegroundFit):
+    """Gains are fitted with a sky model whose errors are common to redundant baselines, but for a smaller part."""
+
+    calibrator: str = "unified"
+    foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
+    prior: Literal["sum", "post-hoc", "gains", "sky-model", "none"] = "sky-model"

@@ -1,0 +1,282 @@
+"""A Gaussian prior on the foregrounds: its fit against dense matrices, its limits against fits that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tensorflow as tf
+from hera_cal.datacontainer import DataContainer
+from hera_cal.redcal import RedundantCalibrator
+from hera_cal.skycal import refine_gains
+from test_calibration_loss import redundant_structure
+from toy import BASIS, FREQUENCIES, complex_normal, make_toy, scattered
+
+from calstudy.calibrate import pairs
+from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton
+from calstudy.calibrate.solvers.interface import solve
+from calstudy.calibrate.solvers.reduced import ReducedKernels
+
+SIGMA = 0.05
+OWN, SHARED = 0.7, 1.9
+
+
+def prior_structure(toy, prior):
+    """The toy's baselines, some of them turned around, by redundant groups unless all coefficients are their own."""
+    structure = redundant_structure(toy)
+    lengths = np.linalg.norm(toy.positions[structure.antennas[:, 1]] - toy.positions[structure.antennas[:, 0]], axis=1)
+    if prior == "own":
+        basis = make_basis(lengths, FREQUENCIES, BASIS, prior=True)
+        return replace(FitStructure.per_baseline(structure.antennas, len(toy.positions), basis), prior=prior)
+    longest = np.zeros(structure.basis.n_models)
+    np.maximum.at(longest, structure.groups, lengths)
+    return replace(structure, basis=make_basis(longest, FREQUENCIES, BASIS, prior=True), prior=prior)
+
+
+@pytest.fixture(params=["own", "shared", "both"])
+def problem(request, hexagon) -> CalibrationProblem:
+    """Random data, weights with flags, and a sky model that is not redundant."""
+    structure = prior_structure(hexagon, request.param)
+    rng = np.random.default_rng(11)
+    shape = (structure.n_baselines, structure.n_frequencies)
+    weights = (rng.random(shape) > 0.1) * rng.uniform(0.5, 2, shape) / SIGMA**2
+    sky = complex_normal(rng, shape) + hexagon.foregrounds
+    data = sky + complex_normal(rng, shape)
+    start = np.ones((structure.n_antennas, structure.n_frequencies), complex)
+    return CalibrationProblem(structure, data, weights, start, sky, deviations=(OWN, SHARED))
+
+
+def dense_covariance(structure):
+    """C of all samples, (Nbls Nfreqs) squared, for visibilities of which conjugated ones are turned back."""
+    vectors = [None] * structure.basis.n_models
+    for bucket in structure.basis.buckets:
+        for index in bucket.members:
+            vectors[index] = bucket.vectors
+    n = structure.n_frequencies
+    result = np.zeros((structure.n_baselines, n, structure.n_baselines, n))
+    for p, group in enumerate(structure.groups):
+        covariance = vectors[group] @ vectors[group].T
+        if structure.prior in ("own", "both"):
+            result[p, :, p] += OWN**2 * covariance
+        if structure.prior in ("shared", "both"):
+            for q in np.flatnonzero(structure.groups == group):
+                result[p, :, q] += SHARED**2 * covariance
+    return result.reshape(structure.n_baselines * n, -1)
+
+
+def turned(structure, values):
+    return np.where(structure.conjugated[:, None], values.conj(), values)
+
+
+def dense_fit(problem, gains):
+    """Loss and foregrounds by (N + G C G^H)^-1, with weights zero left out."""
+    structure = problem.structure
+    products = turned(structure, gain_products(gains, structure.antennas)).ravel()
+    mean = turned(structure, problem.sky_model).ravel()
+    data = turned(structure, problem.visibilities).ravel()
+    used = problem.weights.ravel() > 0
+    covariance = dense_covariance(structure)
+    crossed = covariance[:, used] * products[used].conj()
+    whole = products[used, None] * crossed[used] + np.diag(1 / problem.weights.ravel()[used])
+    excess = (data - products * mean)[used]
+    solved = np.linalg.solve(whole, excess)
+    model = turned(structure, (mean + crossed @ solved).reshape(problem.weights.shape))
+    return np.vdot(excess, solved).real, model
+
+
+def projected(problem, gains, dtype=tf.float32):
+    kernels = ReducedKernels(problem.structure, False, dtype)
+    reduced = kernels.reduce(problem, gains)
+    return kernels, reduced, kernels.project(reduced.gains, *reduced.data)
+
+
+@pytest.fixture
+def gains(problem):
+    return 1 + 0.2 * complex_normal(np.random.default_rng(3), problem.initial_gains.shape)
+
+
+def test_the_root_has_the_covariance_of_a_flat_wedge():
+    channels, width = 64, 5.3
+    covariance = flat_wedge_root(channels, width, 1e-13) @ flat_wedge_root(channels, width, 1e-13).T
+    lag = np.subtract.outer(np.arange(channels), np.arange(channels))
+    assert np.abs(covariance - np.sinc(2 * width / channels * lag)).max() < 1e-6
+
+
+def test_loss_and_foregrounds_are_those_of_dense_matrices(problem, gains):
+    kernels, reduced, projection = projected(problem, gains)
+    loss, model = dense_fit(problem, gains)
+    assert float(projection.loss) * reduced.loss_unit == pytest.approx(loss, rel=1e-9)
+    found = kernels.tensors.unload(projection.model, reduced.scale)
+    assert np.abs(found - model)[problem.weights > 0].max() < 1e-8 * np.abs(model).max()
+
+
+def test_descent_is_the_gradient(problem, gains):
+    _, reduced, projection = projected(problem, gains)
+    eta = complex_normal(np.random.default_rng(7), gains.shape)
+    slope = -2 * float(pairs.inner_product(projection.descent, pairs.to_pair(eta, tf.float64))) * reduced.loss_unit
+    h = 1e-5
+    above, below = (dense_fit(problem, gains * (1 + step * eta))[0] for step in (h, -h))
+    assert slope == pytest.approx((above - below) / (2 * h), rel=1e-6)
+
+
+def test_hessian_is_that_of_foregrounds_that_follow(problem, gains):
+    """eta^H H eta' = change^H (N + G C G^H)^-1 change', with the change of the data at fixed foregrounds."""
+    kernels, reduced, projection = projected(problem, gains, tf.float64)
+    structure = problem.structure
+    rng = np.random.default_rng(8)
+    eta, other = complex_normal(rng, gains.shape), complex_normal(rng, gains.shape)
+    image = kernels.projector.hessian_product(pairs.to_pair(eta, tf.float64), projection)
+    products = gain_products(gains, structure.antennas)
+    model = dense_fit(problem, gains)[1]
+
+    def change(direction):
+        relative = direction[structure.antennas[:, 0]] + direction[structure.antennas[:, 1]].conj()
+        return replace(problem, visibilities=products * (problem.sky_model + model * relative))
+
+    first, second = (turned(structure, change(x).visibilities - products * problem.sky_model) for x in (eta, other))
+    used = problem.weights.ravel() > 0
+    factors = turned(structure, products).ravel()[used]
+    whole = factors[:, None] * dense_covariance(structure)[np.ix_(used, used)] * factors.conj()
+    whole += np.diag(1 / problem.weights.ravel()[used])
+    expected = np.vdot(second.ravel()[used], np.linalg.solve(whole, first.ravel()[used])).real
+    found = float(pairs.inner_product(pairs.to_pair(other, tf.float64), image)) * reduced.loss_unit
+    assert found == pytest.approx(expected, rel=1e-6)
+
+
+def solved(problem, tolerance=1e-13):
+    """The fit, carried on far beyond what anybody needs."""
+    return solve(problem, GaussNewton(tolerance=tolerance, max_steps=200))
+
+
+def noisy(toy, structure, sky, deviations, seed=5):
+    """A measurement with gains of 10 % and noise SIGMA, of which the sky model is `sky`."""
+    rng = np.random.default_rng(seed)
+    shape = (structure.n_baselines, structure.n_frequencies)
+    products = gain_products(toy.gains, structure.antennas)
+    data = products * (toy.foregrounds + SIGMA * complex_normal(rng, shape))
+    weights = np.full(shape, SIGMA**-2)
+    return CalibrationProblem(
+        structure, data, weights, np.ones(toy.gains.shape, complex), sky, "none", deviations=deviations
+    )
+
+
+def spoiled(toy, fraction=0.06):
+    """The toy's foregrounds with an error that is white within the delays of the basis."""
+    rng = np.random.default_rng(9)
+    rms = np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))
+    error = np.empty_like(toy.foregrounds)
+    for bucket in make_basis(np.linalg.norm(toy.vectors, axis=1), FREQUENCIES, BASIS, prior=True).buckets:
+        coefficients = complex_normal(rng, (bucket.members.size, bucket.vectors.shape[1]))
+        error[bucket.members] = coefficients @ bucket.vectors.T
+    return toy.foregrounds - fraction * rms * error
+
+
+def free_structure(toy):
+    """The toy's own baselines, each with a prior of its own."""
+    basis = make_basis(np.linalg.norm(toy.vectors, axis=1), FREQUENCIES, BASIS, prior=True)
+    return replace(FitStructure.per_baseline(toy.antennas, len(toy.positions), basis), prior="own")
+
+
+def test_a_vanishing_deviation_is_sky_based_calibration_by_hera_cal(toy):
+    sky = spoiled(toy)
+    problem = noisy(toy, free_structure(toy), sky, (1e-7, 1e-7))
+    found = solved(problem)
+    assert found.status == "converged", found.message
+    ratio, weights, start = {}, {}, {}
+    for row, (a, b) in enumerate(toy.antennas.tolist()):
+        ratio[a, b, "nn"] = (problem.visibilities[row] / sky[row])[None]
+        weights[a, b, "nn"] = (problem.weights[row] * np.abs(sky[row]) ** 2)[None]
+    for antenna in range(len(toy.positions)):
+        start[antenna, "Jnn"] = np.ones((1, FREQUENCIES.size), complex)
+    refined, _ = refine_gains(DataContainer(ratio), DataContainer(weights), start, refine_tol=1e-12)
+    gains = np.array([refined[antenna, "Jnn"][0] for antenna in range(len(toy.positions))])
+    difference = gain_products(found.gains, toy.antennas) - gain_products(gains, toy.antennas)
+    assert np.abs(difference).max() < 1e-6
+
+
+def test_a_huge_deviation_is_calamity(toy):
+    """The loss at any gains is that of free foregrounds, if the sky model has nothing beyond the modelled delays."""
+    structure = free_structure(toy)
+    problem = noisy(toy, structure, np.zeros_like(toy.foregrounds), (1e12, 1e12))
+    free = replace(problem, structure=toy.structure, deviations=(np.inf, np.inf))
+    at = 1 + 0.1 * complex_normal(np.random.default_rng(2), toy.gains.shape)
+    losses = []
+    for case in (problem, free):
+        _, reduced, projection = projected(case, at)
+        losses.append(float(projection.loss) * reduced.loss_unit)
+    # Relative to the loss of no foregrounds at all, whose rounding this is.
+    assert abs(losses[0] - losses[1]) < 1e-12 * np.sum(problem.weights * np.abs(problem.visibilities) ** 2)
+
+
+def test_free_shared_foregrounds_are_omnical_by_hera_cal(hexagon):
+    """With one coefficient for every channel of a redundant group; free of what redundancy cannot know."""
+    structure = redundant_structure(hexagon)
+    channels = ForegroundBasis(
+        (Bucket(None, np.arange(structure.basis.n_models), np.eye(FREQUENCIES.size)),),
+        structure.basis.n_models,
+        FREQUENCIES.size,
+    )
+    structure = replace(structure, basis=channels)
+    turned_foregrounds = hexagon.foregrounds.copy()
+    odd = np.arange(len(turned_foregrounds)) % 2 == 1
+    turned_foregrounds[odd] = turned_foregrounds[odd].conj()
+    toy = replace(hexagon, foregrounds=turned_foregrounds)
+    problem = noisy(toy, structure, None, (np.inf, np.inf))
+    found = solved(problem)
+    keys = [
+        (int(b), int(a), "nn") if back else (int(a), int(b), "nn")
+        for (a, b), back in zip(structure.antennas, structure.conjugated, strict=True)
+    ]
+    cube = turned(structure, problem.visibilities)
+    data = DataContainer({key: cube[row][None] for row, key in enumerate(keys)})
+    weights = DataContainer({key: problem.weights[row][None] for row, key in enumerate(keys)})
+    groups = [[keys[row] for row in np.flatnonzero(structure.groups == g)] for g in range(structure.basis.n_models)]
+    calibrator = RedundantCalibrator(groups)
+    _, first = calibrator.logcal(data)
+    _, solution = calibrator.omnical(data, first, wgts=weights, conv_crit=1e-14, maxiter=5000)
+    model = turned(structure, gain_products(found.gains, structure.antennas) * found.model)
+    theirs = np.array([solution.model_bl(key)[0] for key in keys])
+    assert np.linalg.norm(model - theirs) < 1e-6 * np.linalg.norm(theirs)
+
+
+def test_the_loss_is_that_of_delay_weights(toy):
+    """Byrne (2023, ApJ 943, 117) weights the delay modes of V / G - m with their inverse variances.
+
+    On modes that are periodic in the band, and gains that are phases only, that is the loss of a finite prior.
+    """
+    n, deviation = FREQUENCIES.size, 0.8
+    delays = np.fft.fftfreq(n)
+    inside = np.abs(delays) <= 5 / n
+    angle = 2 * np.pi * np.outer(np.arange(n), np.arange(1, 6)) / n
+    modes = np.column_stack([np.ones(n), np.sqrt(2) * np.cos(angle), np.sqrt(2) * np.sin(angle)]) / np.sqrt(11)
+    basis = ForegroundBasis((Bucket(None, np.arange(len(toy.antennas)), modes),), len(toy.antennas), n)
+    structure = replace(FitStructure.per_baseline(toy.antennas, len(toy.positions), basis), prior="own")
+    problem = noisy(toy, structure, spoiled(toy), (deviation, deviation))
+    at = np.exp(1j * np.random.default_rng(4).normal(size=toy.gains.shape))
+    _, reduced, projection = projected(problem, at)
+    excess = problem.visibilities / gain_products(at, toy.antennas) - problem.sky_model
+    spectrum = np.fft.fft(excess, axis=1) / np.sqrt(n)
+    variance = SIGMA**2 + np.where(inside, deviation**2 * n / 11, 0)
+    expected = np.sum(np.abs(spectrum) ** 2 / variance)
+    assert float(projection.loss) * reduced.loss_unit == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_scale_of_a_wide_prior_is_corrected_by_the_sky_model():
+    """Without it, log |g g*| is too large by about the square of what the sky model lacks; with it, as sky-based."""
+    toy = make_toy(scattered(14))
+    missing, rms = 0.2, np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))
+    problem = noisy(toy, free_structure(toy), spoiled(toy, missing), (missing * rms, 0.0))
+    cases = {
+        "none": problem,
+        "sky-model": replace(problem, prior="sky-model"),
+        "sky-based": replace(problem, structure=toy.structure, frozen=True, deviations=(np.inf, np.inf)),
+    }
+    excess = {}
+    for name, case in cases.items():
+        ratio = gain_products(solve(case, GaussNewton()).gains, toy.antennas) / gain_products(toy.gains, toy.antennas)
+        excess[name] = np.mean(np.log(np.abs(ratio)))
+    assert 0.5 * missing**2 < excess["none"] - excess["sky-based"] < 2.5 * missing**2
+    assert abs(excess["sky-model"] - excess["sky-based"]) < 0.25 * missing**2
