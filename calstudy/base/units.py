@@ -129,6 +129,7 @@ FluxDensity = _quantity("Jy", "50 mJy")
 PowerDensity = _quantity("K2 Mpc3", "12482.356 K2 Mpc3")
 Memory = _quantity("byte", "6 GB")
 HourAngle = _field(parse_hour_angle, "h", "1.8 h")
+Temperature = _quantity("K", "180 K")
 Angle = _quantity("rad", "10 arcsec")
 Fraction = Annotated[
     float,

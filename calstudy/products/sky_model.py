@@ -72,6 +72,8 @@ def described(graph: Graph) -> str:
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, Mapping) and value.keys() == {"kind"}:
+        return value["kind"]
     return value if isinstance(value, str) else json.dumps(value)
 
 

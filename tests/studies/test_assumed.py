@@ -167,6 +167,31 @@ def test_what_the_sky_model_lacks_is_left_over_far_above_the_eor(folder):
     assert lacking > 100 * 1e-4
 
 
+def test_emission_that_is_not_assumed_is_missing_from_the_sky_model(folder):
+    """Its visibilities are those of the map alone: the truth is the sum of sources and map."""
+    data = override(sky_based(folder, **{"sky.diffuse": "none"}), "sky.diffuse", {"kind": "synthetic", "nside": 16})
+    graph, alone = graph_of(data, folder), graph_of(override(data, "sky.foregrounds", "none"), folder)
+    tasks = (simulation.foregrounds(graph), sky_model.sky_model(graph), simulation.foregrounds(alone))
+    assert tasks[1].key == simulation.foregrounds(graph_of(sky_based(folder), folder)).key
+    products = make_here(folder, *tasks).products
+    true, model, emission = (to_cube(UVData.from_file(products[task.key].path / "visibilities.uvh5")) for task in tasks)
+    assert np.abs(true - model - emission).max() < 1e-7 * np.abs(emission).max()
+    assert np.abs(emission).max() > 0.1 * np.abs(model).max()
+    warnings = products[tasks[0].key].record["notes"]["warnings"]
+    assert any("raise sky.diffuse.nside" in text for text in warnings)
+    rows = sky_model.differences(graph)
+    assert [(path, assumed) for path, _, assumed in rows] == [("sky.diffuse", "none")]
+
+
+def test_a_plan_counts_the_pixels_of_a_map(folder):
+    def seconds(**diffuse: object) -> float:
+        data = override(sky_based(folder), "sky.foregrounds.count", 5000)
+        data = override(data, "sky.diffuse", diffuse or "none")
+        return sum(piece.cost.seconds - 6 for piece in simulation.foregrounds(graph_of(data, folder)).pieces.values())
+
+    assert seconds(kind="haslam", nside=256) == pytest.approx((786_432 + 5000) / 5000 * seconds(), rel=0.01)
+
+
 @pytest.fixture(scope="module")
 def finished(folder) -> Run:
     data = sky_based(folder, **{"sky.foregrounds.count": 60})
