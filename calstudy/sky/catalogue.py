@@ -145,7 +145,7 @@ def with_errors(sky: SkyModel, errors: CatalogueErrors) -> SkyModel:
     factor = errors.flux_scale * (1 + errors.flux_scatter * flux.standard_normal(sky.Ncomponents))
     found.stokes = sky.stokes * factor
     if errors.position_scatter:
-        east, north = errors.position_scatter * offset.standard_normal((sky.Ncomponents, 2)).T * units.rad
+        east, north = errors.position_scatter * offset.standard_normal((sky.Ncomponents, 2)).T * units.deg
         found.skycoord = sky.skycoord.spherical_offsets_by(east, north)
     if errors.index_scatter:
         _tilt(found, errors.index_scatter * index.standard_normal(sky.Ncomponents))

@@ -289,7 +289,7 @@ def test_catalogue_errors_have_the_size_that_is_asked_for(synthetic):
     for offset in (east, north):
         assert offset.to_value("arcsec").std() == pytest.approx(10, rel=0.03)
     assert abs(np.corrcoef(east.deg, north.deg)[0, 1]) < 0.05
-    assert "flux_scatter 5 %" in wrong.stand_in
+    assert "flux_scatter 0.05" in wrong.stand_in
     np.testing.assert_array_equal(true.name, wrong.sky.name)
 
 

@@ -9,13 +9,6 @@ PAPER_CHANNELS, PAPER_TIMES, PAPER_ANTENNAS, PAPER_NSIDE = 384, 56, 36, 256
 
 
 def _sky(experiment: Experiment) -> str | None:
-    if experiment.sky.diffuse.kind == "none":
-        return _sources(experiment)
-    sources = _sources(experiment)
-    return f"{sources or 'sky: GLEAM'}; with diffuse emission ({experiment.sky.diffuse.kind})"
-
-
-def _sources(experiment: Experiment) -> str | None:
     foregrounds = experiment.sky.foregrounds
     if foregrounds.kind == "g4jy-and-counts":
         return "sky: G4Jy bright sources + synthetic faint ones from counts, not GLEAM"
