@@ -14,7 +14,7 @@ from rich.console import Console
 from tiny import tiny
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import to_cube
+from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.experiment.files import dump, load, override, validate
 from calstudy.instrument.telescope import make_template
@@ -336,3 +336,19 @@ def test_a_file_that_does_not_cover_the_data_is_refused(folder, tmp_path, fault)
     told = {"flagged": "1 samples are flagged or not finite", "lacking": "lacks channels of the data"}[fault]
     with pytest.raises(InputError, match=told):
         read_sky_model(tmp_path / "model.uvh5", make_template(validate(sky_based(folder), folder).instrument))
+
+
+def test_a_file_is_brought_to_the_order_of_the_data(tmp_path):
+    """Antenna numbers of a layout may come in any order; pyuvdata sorts baselines by them."""
+    (tmp_path / "layout.csv").write_text("east_m,north_m,up_m,number\n0,0,0,3\n14,0,0,1\n0,28,0,7\n40,9,0,2\n")
+    data = override(tiny(tmp_path), "instrument.layout", {"kind": "csv", "path": "layout.csv"})
+    template = make_template(validate(data, tmp_path).instrument)
+    shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
+    normal = np.random.default_rng(1).standard_normal((2, *shape))
+    written = from_cube(template, normal[0] + 1j * normal[1])
+    written.conjugate_bls("ant1<ant2")
+    written.reorder_blts(order="time", minor_order="baseline")
+    written.write_uvh5(tmp_path / "model.uvh5")
+    found = read_sky_model(tmp_path / "model.uvh5", template)
+    np.testing.assert_allclose(to_cube(found), normal[0] + 1j * normal[1], rtol=1e-12)
+    assert np.array_equal(found.ant_1_array, template.ant_1_array)
