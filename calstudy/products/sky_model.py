@@ -81,8 +81,9 @@ def described(graph: Graph) -> str:
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, Mapping) and value.keys() == {"kind"}:
-        return value["kind"]
+    if isinstance(value, Mapping) and "kind" in value:
+        fields = ", ".join(f"{name} {_text(field)}" for name, field in value.items() if name != "kind")
+        return f"{value['kind']} ({fields})" if fields else str(value["kind"])
     return value if isinstance(value, str) else json.dumps(value)
 
 
