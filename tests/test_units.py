@@ -8,7 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from calstudy.base.units import Decibel, Delay, Frequency, HourAngle, Length, PowerDensity, Wavenumber
+from calstudy.base.units import (
+    Angle,
+    Decibel,
+    Delay,
+    Fraction,
+    Frequency,
+    HourAngle,
+    Length,
+    PowerDensity,
+    Temperature,
+    Wavenumber,
+)
 
 
 @pytest.mark.parametrize(
@@ -25,6 +36,10 @@ from calstudy.base.units import Decibel, Delay, Frequency, HourAngle, Length, Po
         (PowerDensity, "12482.356 K2 Mpc3", 12482.356),
         (PowerDensity, "1e6 mK2 Mpc3", 1.0),
         (Frequency, 2 * units.MHz, 2e6),
+        (Angle, "10 arcsec", 10 / 3600),
+        (Temperature, "180 K", 180.0),
+        (Fraction, "5 %", 0.05),
+        (Fraction, 0.05, 0.05),
     ],
 )
 def test_quantities_are_converted_to_si(kind, text, value):
@@ -43,6 +58,9 @@ def test_quantities_are_converted_to_si(kind, text, value):
         (Decibel, "-40", "decibel"),
         (Decibel, -40, "decibel"),
         (Wavenumber, "0.2 1/Mpc", "h/Mpc"),
+        (Fraction, "5 m", "not a fraction"),
+        (Fraction, True, "not a fraction"),
+        (Temperature, "180", "has no unit"),
     ],
 )
 def test_anything_else_is_refused_with_the_reason(kind, value, reason):

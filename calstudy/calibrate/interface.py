@@ -156,9 +156,9 @@ class Calibrator(Plugin):
     )
     assumed: dict[str, Any] = Field(
         default_factory=dict,
-        description="What the calibrator takes for granted that is not true: fields of `sky.foregrounds` and "
-        "`instrument` (dotted path: value), from which its sky model is simulated; or `sky_model: PATH`, a file of "
-        "visibilities. Empty: the sky model is the true foregrounds.",
+        description="What the calibrator takes for granted that is not true: fields of `sky` and `instrument` (dotted "
+        "path: value), from which its sky model is simulated; or `sky_model: PATH`, a file of visibilities. Empty: the "
+        "sky model is the true foregrounds.",
     )
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:

@@ -20,7 +20,7 @@ def read_sky_model(path: Path, template: UVData) -> UVData:
     Parameters
     ----------
     path
-        A file or folder in any format of visibilities that pyuvdata reads, in Jy. Antennas are told by their numbers;
+        A file in any format of visibilities that pyuvdata reads, in Jy. Antennas are told by their numbers;
         their positions do not have to be those of the template.
     template
         Metadata of the observation: rectangular, time-major, a drift scan.

@@ -305,7 +305,7 @@ def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
     prefix = f"{FIELD}."
     if SKY_MODEL in changes:
         file = base / expand_user(Path(changes[SKY_MODEL]), f"{prefix}{SKY_MODEL}")
-        if not file.exists():
+        if not file.is_file():
             raise ExperimentError([_no_file(f"{prefix}{SKY_MODEL}", changes[SKY_MODEL], file)])
         resolved = {SKY_MODEL: file.resolve()}
     else:

@@ -195,7 +195,7 @@ class Experiment(Section):
         for name, variant in self.variants.items():
             if "noise" in variant.components and self.corruption.noise.kind == "none":
                 raise fault(f"variants.{name}.components", "asks for noise, but corruption.noise is 'none'")
-            if "foregrounds" in variant.components and self.sky.foregrounds.kind == "none":
+            if "foregrounds" in variant.components and not self.sky.has_foregrounds:
                 raise fault(f"variants.{name}.components", "asks for foregrounds, but sky.foregrounds is 'none'")
             if not VARIANT_NAME.fullmatch(name) or name == "transfer":
                 raise fault(f"variants.{name}", "is not a usable name: use letters, digits, '_', '-'; not 'transfer'")
@@ -239,7 +239,7 @@ class Experiment(Section):
 
     @model_validator(mode="after")
     def _levels_have_their_reference(self) -> Experiment:
-        if self.sky.foregrounds.kind == "none":
+        if not self.sky.has_foregrounds:
             if self.corruption.eor_level is not None:
                 raise fault(
                     "corruption.eor_level", "is relative to foregrounds, but sky.foregrounds is 'none': use null"

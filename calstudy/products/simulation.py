@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
@@ -12,7 +14,7 @@ from calstudy.products.graph import Graph, once
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
 from calstudy.sky.counts import FAINTEST, expected_sources
-from calstudy.sky.settings import Eor, PointSources
+from calstudy.sky.settings import Eor, NoSources, PointSources
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.component import Component
     from calstudy.simulate.floor import DelayFloor
-    from calstudy.sky.settings import Foregrounds, SkySettings
+    from calstudy.sky.settings import SkySettings
 
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
@@ -49,9 +51,10 @@ def foregrounds_of(graph: Graph, label: str, sky: SkySettings, instrument: Instr
     sky, instrument
         In place of the experiment's own.
     """
-    if sky.foregrounds.kind == "none":
+    if not sky.has_foregrounds:
         return None
-    return _simulation(graph, label, {"instrument": instrument, "sky": sky.foregrounds})
+    diffuse = {} if sky.diffuse.kind == "none" else {"diffuse": sky.diffuse}
+    return _simulation(graph, label, {"instrument": instrument, "sky": sky.foregrounds, **diffuse})
 
 
 @once
@@ -83,7 +86,11 @@ def _component(job: Job) -> Component:
 
     settings = job.settings
     return Component(
-        settings["instrument"], settings["simulation"], settings["sky"], settings.get("cosmology", "Planck15")
+        settings["instrument"],
+        settings["simulation"],
+        settings["sky"],
+        settings.get("cosmology", "Planck15"),
+        settings.get("diffuse"),
     )
 
 
@@ -119,7 +126,8 @@ def assemble(job: Job) -> Mapping[str, Any]:
         quality["delay_floor"] = _floors(data)
     write_visibilities(data, job.output / VISIBILITIES)
     write_json(job.output / QUALITY, quality)
-    return {**quality, "stand_ins": component.stand_ins, "warnings": _warnings(component, quality)}
+    warnings = [*_warnings(component, quality), *_coarse_pixels(job.settings)]
+    return {**quality, "stand_ins": component.stand_ins, "warnings": warnings}
 
 
 def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
@@ -130,6 +138,21 @@ def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
     return [
         f"interpolation between simulation nodes errs by {check['max_error']:.1e} of the rms, where simulation.nodes."
         f"tolerance is {nodes.tolerance:.0e}: raise simulation.nodes.beam_extent, or set simulation.nodes.enabled=false"
+    ]
+
+
+def _coarse_pixels(settings: Mapping[str, Any]) -> list[str]:
+    """Warn of pixels of a map that are larger than half a fringe: as points, they are aliased by long baselines."""
+    if "diffuse" not in settings:
+        return []
+    pixel = (4 * math.pi / (12 * settings["diffuse"].nside ** 2)) ** 0.5
+    longest = Size.of(settings["instrument"]).longest
+    fringe = SPEED_OF_LIGHT / (settings["instrument"].channels.band[1] * longest)
+    if pixel <= fringe / 2:
+        return []
+    return [
+        f"the pixels of the diffuse map ({math.degrees(pixel):.2f} deg) are larger than half a fringe of the longest "
+        f"baseline ({math.degrees(fringe):.2f} deg): raise sky.diffuse.nside"
     ]
 
 
@@ -160,7 +183,7 @@ def _cost_of_chunk(task: Task) -> Cost:
     if isinstance(sky, Eor):
         sources, spectral = 12 * sky.nside**2, channels / simulation.chunks
     else:
-        sources, spectral = _sources(sky), 0.0
+        sources, spectral = _sources(task.settings), 0.0
         channels = min(channels, FREQUENCY_NODES) if nodes else channels
     work = SimulationSize(sources, times * channels / pieces, size.antennas, 1 + len(instrument.antenna_beams))
     engine = simulation.engine.cost(work)
@@ -169,12 +192,13 @@ def _cost_of_chunk(task: Task) -> Cost:
     return Cost(6 + engine.seconds, memory, disk)
 
 
-def _sources(sky: Foregrounds) -> int:
-    """Estimate the number of sources of the foregrounds, from the counts of sources above the flux limit."""
-    if not isinstance(sky, PointSources):
-        return SOURCES
-    expected = int(expected_sources(max(sky.flux_limit, FAINTEST)))
-    return max(min(sky.count or expected, expected), 1)
+def _sources(settings: Mapping[str, Any]) -> int:
+    """Estimate the components of the foregrounds: sources by their counts above the flux limit, pixels of a map."""
+    sky, found = settings["sky"], 12 * settings["diffuse"].nside ** 2 if "diffuse" in settings else 0
+    if isinstance(sky, PointSources):
+        expected = int(expected_sources(max(sky.flux_limit, FAINTEST)))
+        return found + max(min(sky.count or expected, expected), 1)
+    return found if isinstance(sky, NoSources) else found + SOURCES
 
 
 def _cost(task: Task) -> Cost:

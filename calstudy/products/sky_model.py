@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.experiment.assumed import SKY_MODEL, assumed_changes, assumed_content, assumed_world, value_at
+from calstudy.experiment.assumed import SKY_MODEL, AssumedWorld, assumed_changes, assumed_world
 from calstudy.instrument.size import Size
 from calstudy.products import simulation
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
@@ -54,9 +54,18 @@ def differences(graph: Graph) -> list[tuple[str, str, str]]:
     changes = assumed_changes(experiment.calibration.assumed)
     if SKY_MODEL in changes:
         return [(SKY_MODEL, "the true foregrounds", str(changes[SKY_MODEL]))]
-    true, assumed = assumed_content(experiment, {}), assumed_content(experiment, changes)
-    rows = [(path, _text(value_at(true, path)), _text(value_at(assumed, path))) for path in changes]
-    return [row for row in rows if row[1] != row[2]]
+    world = assumed_world(experiment)
+    true = AssumedWorld(sky=experiment.sky, instrument=experiment.instrument)
+    return list(_differences(true.model_dump(mode="json"), world.model_dump(mode="json")))
+
+
+def _differences(true: Any, assumed: Any, path: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield the fields in which two nested plain values differ; a block of another kind as a whole."""
+    if isinstance(true, Mapping) and isinstance(assumed, Mapping) and true.get("kind") == assumed.get("kind"):
+        for key in {**true, **assumed}:
+            yield from _differences(true.get(key), assumed.get(key), f"{path}.{key}" if path else key)
+    elif true != assumed:
+        yield path, _text(true), _text(assumed)
 
 
 def described(graph: Graph) -> str:
@@ -72,6 +81,9 @@ def described(graph: Graph) -> str:
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, Mapping) and "kind" in value:
+        fields = ", ".join(f"{name} {_text(field)}" for name, field in value.items() if name != "kind")
+        return f"{value['kind']} ({fields})" if fields else str(value["kind"])
     return value if isinstance(value, str) else json.dumps(value)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.settings import SimulationSettings
-    from calstudy.sky.settings import Foregrounds
+    from calstudy.sky.settings import Diffuse, Foregrounds
 
 SMOOTH_SPECTRA = ("flat", "spectral_index")
 CHECKED = 2
@@ -38,9 +38,11 @@ class Component:
     instrument, simulation
         Sections of the experiment.
     sky
-        Settings of the foregrounds or of the EoR.
+        Settings of the sources or of the EoR.
     cosmology
         Name of the cosmology, which turns the EoR's P(k) into brightness.
+    diffuse
+        Settings of the diffuse emission that is added to sources, or None.
     """
 
     def __init__(
@@ -49,8 +51,9 @@ class Component:
         simulation: SimulationSettings,
         sky: Foregrounds | Eor,
         cosmology: str,
+        diffuse: Diffuse | None = None,
     ) -> None:
-        self._sky, self._cosmology = sky, cosmology
+        self._sky, self._cosmology, self._diffuse = sky, cosmology, diffuse
         self.is_eor = isinstance(sky, Eor)
         self.instrument, self.simulation = instrument, simulation
         self.template = make_template(instrument)
@@ -68,7 +71,7 @@ class Component:
     def _foregrounds(self) -> SkyModel:
         if isinstance(self._sky, Eor):
             raise TypeError("the EoR has no foregrounds")
-        foregrounds = make_foregrounds(self._sky, self.template.freq_array)
+        foregrounds = make_foregrounds(self._sky, self.template.freq_array, self._diffuse)
         self.stand_ins = [note for note in (foregrounds.stand_in, self.beam.stand_in) if note]
         return foregrounds.sky
 

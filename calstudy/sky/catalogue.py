@@ -140,14 +140,29 @@ def with_errors(sky: SkyModel, errors: CatalogueErrors) -> SkyModel:
     errors
         The `errors` block of a catalogue.
     """
-    flux, offset = (np.random.default_rng(stream) for stream in np.random.SeedSequence(errors.seed).spawn(2))
+    flux, offset, index = (np.random.default_rng(stream) for stream in np.random.SeedSequence(errors.seed).spawn(3))
     found = sky.copy()
     factor = errors.flux_scale * (1 + errors.flux_scatter * flux.standard_normal(sky.Ncomponents))
     found.stokes = sky.stokes * factor
     if errors.position_scatter:
-        east, north = errors.position_scatter * offset.standard_normal((sky.Ncomponents, 2)).T * units.rad
+        east, north = errors.position_scatter * offset.standard_normal((sky.Ncomponents, 2)).T * units.deg
         found.skycoord = sky.skycoord.spherical_offsets_by(east, north)
+    if errors.index_scatter:
+        _tilt(found, errors.index_scatter * index.standard_normal(sky.Ncomponents))
     return found
+
+
+def _tilt(sky: SkyModel, change: np.ndarray) -> None:
+    """Change the spectral indices of flat or power-law sources, in place, about their fluxes at 200 MHz."""
+    if sky.spectral_type not in ("flat", "spectral_index"):
+        raise InputError(
+            f"sky.foregrounds.errors.index_scatter: needs flat or power-law spectra, those here are {sky.spectral_type}"
+        )
+    if sky.spectral_type == "flat":
+        sky.spectral_type, sky.spectral_index = "spectral_index", np.zeros(sky.Ncomponents)
+        sky.reference_frequency = np.full(sky.Ncomponents, FREQUENCY) * units.Hz
+    sky.stokes = sky.stokes * (sky.reference_frequency.to_value("Hz") / FREQUENCY) ** change
+    sky.spectral_index = sky.spectral_index + change
 
 
 def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:

@@ -20,6 +20,7 @@ from calstudy.sky import settings as section
 from calstudy.sky.catalogue import Catalogue, brightest, concatenate, read_gleam_table, to_sky_model, with_errors
 from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL_INDEX, draw_population
 from calstudy.sky.csv_catalogue import read_csv_catalogue
+from calstudy.sky.diffuse import add_skies, describe, make_diffuse
 
 LOG = logging.getLogger(__name__)
 
@@ -27,6 +28,8 @@ LOG = logging.getLogger(__name__)
 COMPLETE_FLUX = 4.0
 # With any higher flux limit the same sources are drawn, so that G4Jy components replace the same ones.
 FAINTEST_DRAWN = 2.0
+# Spawn key of the random numbers of spectral indices; bins of flux have others.
+INDEX_STREAM = 0
 COMPLETE_DECLINATION = np.deg2rad(30.0)
 COMPLETE_LATITUDE = np.deg2rad(10.0)
 BRIGHTEST_NOW = BRIGHTEST * (FREQUENCY / COUNTS_FREQUENCY) ** SPECTRAL_INDEX
@@ -50,8 +53,10 @@ class Foregrounds:
     stand_in: str | None
 
 
-def make_foregrounds(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds:
-    """Return the point sources that the `sky.foregrounds` section asks for.
+def make_foregrounds(
+    settings: section.Foregrounds, frequencies: np.ndarray, diffuse: section.Diffuse | None = None
+) -> Foregrounds:
+    """Return the point sources that the `sky.foregrounds` section asks for, and diffuse emission as further points.
 
     Parameters
     ----------
@@ -59,12 +64,25 @@ def make_foregrounds(settings: section.Foregrounds, frequencies: np.ndarray) -> 
         Any kind of foregrounds section.
     frequencies
         All channels in Hz, shape (Nfreqs,).
+    diffuse
+        The `sky.diffuse` section; None for no diffuse emission.
 
     Raises
     ------
     InputError
-        If a catalogue is missing or cannot be used.
+        If a catalogue or a map is missing or cannot be used.
     """
+    points = _points(settings, frequencies)
+    if diffuse is None or isinstance(diffuse, section.NoDiffuse):
+        return points
+    sky, stand_in = make_diffuse(diffuse), describe(diffuse)
+    if isinstance(settings, section.NoSources):
+        return Foregrounds(sky, stand_in)
+    both = add_skies(points.sky, sky, np.asarray(frequencies, float))
+    return Foregrounds(both, f"{points.stand_in}; {stand_in}" if points.stand_in else stand_in)
+
+
+def _points(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds:
     made = _make(settings, frequencies)
     if not isinstance(settings, section.PointSources) or settings.errors == section.CatalogueErrors():
         return made
@@ -133,7 +151,10 @@ def _population(settings: section.SyntheticSources) -> Catalogue:
     )
     order = np.argsort(-flux, kind="stable")
     names = np.char.add("synthetic", np.arange(len(flux)).astype(str))
-    return Catalogue(names, right_ascension[order], declination[order], flux[order], np.full(len(flux), SPECTRAL_INDEX))
+    generator = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(INDEX_STREAM,)))
+    # Brightest first, so that the index of a source does not depend on the flux limit.
+    index = SPECTRAL_INDEX + settings.index_scatter * generator.standard_normal(len(flux))
+    return Catalogue(names, right_ascension[order], declination[order], flux[order], index)
 
 
 def in_complete_area(directions: SkyCoord) -> np.ndarray:

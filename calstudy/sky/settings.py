@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from calstudy.base.schema import Section, choice, fault
-from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity
+from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
 
 VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
 
@@ -28,7 +28,10 @@ class CatalogueErrors(Section):
         ge=0,
         description="Standard deviation of the error of each position, in each of two directions.",
     )
-    seed: int = Field(31, ge=0, description="Seed of the errors of fluxes and positions.")
+    index_scatter: float = Field(
+        0.0, ge=0, description="Standard deviation of the error of each spectral index, about the flux at 200 MHz."
+    )
+    seed: int = Field(31, ge=0, description="Seed of all these errors.")
 
 
 class PointSources(Section):
@@ -59,6 +62,18 @@ class SyntheticSources(PointSources):
         0.05, ge=0.001, description="Keep sources brighter than this; the counts are measured down to 1 mJy."
     )
     seed: int = Field(1, ge=0, description="Seed of the positions and fluxes of the synthetic sources.")
+    index_scatter: float = Field(
+        0.0,
+        ge=0,
+        description="Standard deviation of the spectral indices of synthetic sources about -0.8, with spectrum: "
+        "catalogue; that of the G4Jy components is 0.2.",
+    )
+
+    @model_validator(mode="after")
+    def _indices_are_used(self) -> SyntheticSources:
+        if self.index_scatter and self.spectrum == "flat":
+            raise fault("index_scatter", "has no effect with spectrum: flat; use spectrum: catalogue")
+        return self
 
 
 class VotableColumns(Section):
@@ -133,6 +148,45 @@ Foregrounds = Annotated[
 ]
 
 
+class DiffuseMap(Section):
+    """Fields that all maps of diffuse emission have."""
+
+    spectral_index: float = Field(
+        -2.55, ge=-4, le=2, description="Of the brightness temperature, the same everywhere; flux has 2 more."
+    )
+    nside: Literal[16, 32, 64, 128, 256] = Field(
+        256, description="HEALPix resolution; pixels should be smaller than half a fringe of the longest baseline."
+    )
+
+
+class HaslamMap(DiffuseMap):
+    """The 408 MHz all-sky survey (Haslam et al. 1982; 0.85 degrees, with its sources), from the mwa_pb package."""
+
+    kind: Literal["haslam"]
+
+
+class SyntheticDiffuse(DiffuseMap):
+    """A Gaussian field with a power-law angular spectrum about a mean temperature, without a Galactic plane."""
+
+    kind: Literal["synthetic"]
+    frequency: Frequency = Field(180e6, gt=0, description="At which the temperatures are meant.")
+    mean: Temperature = Field(180.0, description="Mean brightness temperature, which only short baselines see.")
+    rms: Temperature = Field(
+        40.0, ge=0, description="Of the fluctuations, of all multipoles up to 767 (of fewer, if nside is below 256)."
+    )
+    angular_index: float = Field(2.5, ge=0, le=4, description="C_l is proportional to l to the minus this.")
+    seed: int = Field(21, ge=0)
+
+
+class NoDiffuse(Section):
+    """No diffuse emission."""
+
+    kind: Literal["none"] = "none"
+
+
+Diffuse = Annotated[HaslamMap | SyntheticDiffuse | NoDiffuse, Field(discriminator="kind"), choice("kind")]
+
+
 class Eor(Section):
     """Gaussian random 21 cm brightness with a known power spectrum, as one HEALPix map per channel."""
 
@@ -150,4 +204,10 @@ class SkySettings(Section):
     """The foregrounds and the 21 cm signal."""
 
     foregrounds: Foregrounds = SyntheticSources()
+    diffuse: Diffuse = Field(NoDiffuse(), description="Galactic emission, added to the foregrounds.")
     eor: Eor = Eor()
+
+    @property
+    def has_foregrounds(self) -> bool:
+        """Whether there are sources or diffuse emission."""
+        return self.foregrounds.kind != "none" or self.diffuse.kind != "none"

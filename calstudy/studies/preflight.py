@@ -17,7 +17,7 @@ def require_calibration(experiment: Experiment) -> None:
     """Raise InputError if the calibrator refuses the antennas, baselines and channels of an experiment."""
     if any(variant.calibrate for variant in experiment.variants.values()):
         changes, world = assumed_changes(experiment.calibration.assumed), assumed_world(experiment)
-        has_sky_model = SKY_MODEL in changes or world.sky.foregrounds.kind != "none"
+        has_sky_model = SKY_MODEL in changes or world.sky.has_foregrounds
         require_calibratable(experiment.calibration, frame_of(experiment.instrument), has_sky_model)
         if world.instrument.layout != experiment.instrument.layout:
             _require_same_antennas(make_layout(experiment.instrument.layout), make_layout(world.instrument.layout))

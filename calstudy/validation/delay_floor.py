@@ -81,7 +81,7 @@ def compare_floors(
     whole = make_template(instrument)
     times = integration_times(whole)
     template = subset_template(whole, times[len(times) // 2 :][:1], whole.freq_array)
-    sky = make_foregrounds(experiment.sky.foregrounds, whole.freq_array).sky
+    sky = make_foregrounds(experiment.sky.foregrounds, whole.freq_array, experiment.sky.diffuse).sky
     settings = experiment.simulation
     engine = settings.engine
     floors = {}

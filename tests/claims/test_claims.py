@@ -317,6 +317,8 @@ def changed(experiment: dict, changes: dict) -> dict:
             "corruption.effects is per-channel-gains, reflection-gains",
         ),
         ({"corruption.eor_level": "-30 dB"}, "corruption.eor_level is not -40 dB"),
+        ({"sky.diffuse": "haslam"}, "sky.diffuse is 'haslam'"),
+        ({"calibration.assumed": {"sky.foregrounds.count": 3}}, "calibration.assumed is"),
         (
             {"variants": {"residual": {"components": ["eor"], "calibrate": True}}},
             "variants.residual is not the paper's",

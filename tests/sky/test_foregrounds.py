@@ -289,7 +289,7 @@ def test_catalogue_errors_have_the_size_that_is_asked_for(synthetic):
     for offset in (east, north):
         assert offset.to_value("arcsec").std() == pytest.approx(10, rel=0.03)
     assert abs(np.corrcoef(east.deg, north.deg)[0, 1]) < 0.05
-    assert "flux_scatter 5 %" in wrong.stand_in
+    assert "flux_scatter 0.05" in wrong.stand_in
     np.testing.assert_array_equal(true.name, wrong.sky.name)
 
 
@@ -310,3 +310,35 @@ def test_a_flux_scale_alone_moves_nothing():
     )
     np.testing.assert_allclose(flux(wrong), 1.5 * flux(right), rtol=1e-14)
     np.testing.assert_array_equal(wrong.skycoord.ra.deg, right.skycoord.ra.deg)
+
+
+def test_spectral_indices_scatter_and_do_not_depend_on_the_flux_limit():
+    """Ten thousands of sources: the standard deviation is known to 0.5 %."""
+    many, few = (
+        make_foregrounds(
+            section.SyntheticSources(flux_limit=limit, spectrum="catalogue", index_scatter=0.2), FREQUENCIES
+        ).sky
+        for limit in ("0.5 Jy", "5 Jy")
+    )
+    made_up = np.char.startswith(many.name.astype(str), "synthetic")
+    assert made_up.sum() > 50_000
+    assert many.spectral_index[made_up].std() == pytest.approx(0.2, rel=0.03)
+    assert many.spectral_index[made_up].mean() == pytest.approx(-0.8, abs=0.005)
+    # As much as of the real ones, for which the description of the field gives this number.
+    assert many.spectral_index[~made_up].std() == pytest.approx(0.2, abs=0.05)
+    np.testing.assert_array_equal(few.spectral_index, many.spectral_index[: few.Ncomponents])
+    with pytest.raises(ValidationError, match="has no effect with spectrum: flat"):
+        section.SyntheticSources(index_scatter=0.2)
+
+
+@pytest.mark.parametrize("spectrum", ["flat", "catalogue"])
+def test_errors_of_indices_tilt_spectra_about_200_mhz(spectrum):
+    right, wrong = (
+        make_foregrounds(
+            section.SyntheticSources(flux_limit="2 Jy", spectrum=spectrum, errors=errors), FREQUENCIES
+        ).sky.at_frequencies([100e6, 200e6] * units.Hz, inplace=False)
+        for errors in (section.CatalogueErrors(), section.CatalogueErrors(index_scatter=0.1))
+    )
+    ratio = (wrong.stokes[0] / right.stokes[0]).value
+    np.testing.assert_allclose(ratio[1], 1, rtol=1e-12)
+    assert np.log2(ratio[0]).std() == pytest.approx(0.1, rel=0.05)

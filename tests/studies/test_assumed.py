@@ -14,7 +14,7 @@ from rich.console import Console
 from tiny import tiny
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import to_cube
+from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.experiment.files import dump, load, override, validate
 from calstudy.instrument.telescope import make_template
@@ -167,6 +167,32 @@ def test_what_the_sky_model_lacks_is_left_over_far_above_the_eor(folder):
     assert lacking > 100 * 1e-4
 
 
+def test_emission_that_is_not_assumed_is_missing_from_the_sky_model(folder):
+    """Its visibilities are those of the map alone: the truth is the sum of sources and map."""
+    data = override(sky_based(folder, **{"sky.diffuse": "none"}), "sky.diffuse", {"kind": "synthetic", "nside": 16})
+    graph, alone = graph_of(data, folder), graph_of(override(data, "sky.foregrounds", "none"), folder)
+    tasks = (simulation.foregrounds(graph), sky_model.sky_model(graph), simulation.foregrounds(alone))
+    assert tasks[1].key == simulation.foregrounds(graph_of(sky_based(folder), folder)).key
+    products = make_here(folder, *tasks).products
+    true, model, emission = (to_cube(UVData.from_file(products[task.key].path / "visibilities.uvh5")) for task in tasks)
+    assert np.abs(true - model - emission).max() < 1e-7 * np.abs(emission).max()
+    assert np.abs(emission).max() > 0.1 * np.abs(model).max()
+    warnings = products[tasks[0].key].record["notes"]["warnings"]
+    assert any("raise sky.diffuse.nside" in text for text in warnings)
+    ((path, emitting, assumed),) = sky_model.differences(graph)
+    assert (path, assumed) == ("sky.diffuse", "none")
+    assert emitting.startswith("synthetic (spectral_index -2.55, nside 16, frequency 180000000.0 Hz, ")
+
+
+def test_a_plan_counts_the_pixels_of_a_map(folder):
+    def seconds(**diffuse: object) -> float:
+        data = override(sky_based(folder), "sky.foregrounds.count", 5000)
+        data = override(data, "sky.diffuse", diffuse or "none")
+        return sum(piece.cost.seconds - 6 for piece in simulation.foregrounds(graph_of(data, folder)).pieces.values())
+
+    assert seconds(kind="haslam", nside=256) == pytest.approx((786_432 + 5000) / 5000 * seconds(), rel=0.01)
+
+
 @pytest.fixture(scope="module")
 def finished(folder) -> Run:
     data = sky_based(folder, **{"sky.foregrounds.count": 60})
@@ -311,3 +337,19 @@ def test_a_file_that_does_not_cover_the_data_is_refused(folder, tmp_path, fault)
     told = {"flagged": "1 samples are flagged or not finite", "lacking": "lacks channels of the data"}[fault]
     with pytest.raises(InputError, match=told):
         read_sky_model(tmp_path / "model.uvh5", make_template(validate(sky_based(folder), folder).instrument))
+
+
+def test_a_file_is_brought_to_the_order_of_the_data(tmp_path):
+    """Antenna numbers of a layout may come in any order; pyuvdata sorts baselines by them."""
+    (tmp_path / "layout.csv").write_text("east_m,north_m,up_m,number\n0,0,0,3\n14,0,0,1\n0,28,0,7\n40,9,0,2\n")
+    data = override(tiny(tmp_path), "instrument.layout", {"kind": "csv", "path": "layout.csv"})
+    template = make_template(validate(data, tmp_path).instrument)
+    shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
+    normal = np.random.default_rng(1).standard_normal((2, *shape))
+    written = from_cube(template, normal[0] + 1j * normal[1])
+    written.conjugate_bls("ant1<ant2")
+    written.reorder_blts(order="time", minor_order="baseline")
+    written.write_uvh5(tmp_path / "model.uvh5")
+    found = read_sky_model(tmp_path / "model.uvh5", template)
+    np.testing.assert_allclose(to_cube(found), normal[0] + 1j * normal[1], rtol=1e-12)
+    assert np.array_equal(found.ant_1_array, template.ant_1_array)

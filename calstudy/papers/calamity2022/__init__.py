@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
+from pydantic import BaseModel
+
 from calstudy.calibrate.settings import FirstOrderSettings, GainFit, Solver
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.settings import NoNoise
 from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
     from calstudy.verdicts.statement import Statement
@@ -79,7 +79,7 @@ class Calamity2022(Paper):
         """
         if role == "run_time":
             return "an experiment measures no run times"
-        checks = (_other_calibrator, _other_gains, _other_noise, _other_data, _too_few_steps)
+        checks = (_other_calibrator, _other_gains, _other_noise, _other_data, _other_sky, _too_few_steps)
         study = _study(role)
         found = next((refusal for check in checks if (refusal := check(study, experiment)) is not None), None)
         return _other_solver(experiment) if found is None and role != study else found
@@ -157,6 +157,13 @@ def _other_data(role: str, experiment: Experiment) -> str | None:
     papers = type(experiment).model_fields["variants"].get_default(call_default_factory=True)
     others = [name for name, variant in experiment.variants.items() if papers.get(name, variant) != variant]
     return f"variants.{others[0]} is not the paper's" if others else None
+
+
+def _other_sky(role: str, experiment: Experiment) -> str | None:
+    del role
+    if experiment.sky.diffuse.kind != "none":
+        return f"sky.diffuse is {experiment.sky.diffuse.kind!r}, and the paper's sky has sources alone"
+    return None
 
 
 def _solver(experiment: Experiment) -> Solver | None:
