@@ -55,7 +55,7 @@ class Truth:
     Attributes
     ----------
     gains
-        True gains, constant in time, (Nants, Nfreqs).
+        True gains, (Ntimes, Nants, Nfreqs).
     foregrounds, noise
         F and N without gains.
     data
@@ -162,11 +162,11 @@ def _rms(values: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
 
 
 def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
-    aligned = np.stack([align(gains, truth.gains)[0] for gains in fit.gains])
-    size = _rms(truth.gains, axis=1)
+    aligned = np.stack([align(*both)[0] for both in zip(fit.gains, truth.gains, strict=True)])
+    size = _rms(truth.gains, axis=2)
     power = [
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
-        for values in (aligned - truth.gains, truth.gains[None], fit.gains - truth.gains)
+        for values in (aligned - truth.gains, truth.gains, fit.gains - truth.gains)
     ]
     by_delay = np.sqrt(power[0] / power[1])
     raw_by_delay = np.sqrt(power[2] / power[1])
@@ -181,7 +181,7 @@ def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]
 
 
 def _models(truth: Truth, fit: Fit) -> dict[str, Statistic]:
-    scales = np.array([align(gains, truth.gains)[1] for gains in fit.gains])
+    scales = np.array([align(*both)[1] for both in zip(fit.gains, truth.gains, strict=True)])
     size = _rms(truth.foregrounds, axis=(0, 2))
     aligned = fit.model / scales[:, None, None] ** 2 - truth.foregrounds
     error = _rms(aligned, axis=(0, 2))

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.corrupt.drift import Drift
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
@@ -70,40 +71,46 @@ class GainEffect(Effect):
     The product of all gain effects is the true gains, with which a calibration is compared.
     """
 
+    drift: Drift | None = Field(None, description="How the gains change during the run; null: they are constant.")
+
     @abstractmethod
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
-        """Return the gains, complex, shape (Nants, Nfreqs, 1, Npols); they must be constant in time.
+        """Return the gains, complex, shape (Nants, Nfreqs, 1 or Ntimes, Npols), without the drift.
 
-        Antennas are in the order of ``observation.numbers``, to which ``observation.antennas`` of the baselines refer.
+        A single time stands for all. Antennas are in the order of ``observation.numbers``, to which
+        ``observation.antennas`` of the baselines refer.
         """
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
-        """Return the gains, complex128, by the name "gains".
+        """Return the gains, drift included, complex128, (Nants, Nfreqs, 1 or Ntimes, Npols), by the name "gains".
 
         Raises
         ------
         InputError
-            If they are not an array of the right shape, vary in time, or are zero or not finite somewhere.
+            If they are not an array of the right shape, or are zero or not finite somewhere.
         """
         gains = np.asarray(self.gains(observation, random))
-        sizes = observation.n_antennas, observation.n_channels, 1, observation.n_polarizations
-        # Everything that reads true gains (figures, agreement, convergence) takes them as constant in time.
-        if gains.shape == (*sizes[:2], observation.n_times, sizes[3]) != sizes:
-            raise InputError(f"effect {self.label!r}: its gains vary in time, which is not supported yet")
-        if gains.shape != sizes or gains.dtype.kind not in "fc":
+        sizes = observation.n_antennas, observation.n_channels, observation.n_times, observation.n_polarizations
+        if gains.shape not in (sizes, (*sizes[:2], 1, sizes[3])) or gains.dtype.kind not in "fc":
             raise InputError(
                 f"effect {self.label!r}: its gains are {gains.dtype} of shape {gains.shape}, expected complex of shape "
-                f"{sizes} (antennas, channels, times, polarizations)"
+                f"{sizes} (antennas, channels, times, polarizations), or of one time for constant ones"
             )
+        if self.drift is not None:
+            gains = gains * self.drift.factors(observation, getattr(self, "seed", 0))
         if not np.isfinite(gains).all() or (gains == 0).any():
             raise InputError(f"effect {self.label!r}: its gains are zero or not finite somewhere")
         return {"gains": gains.astype(np.complex128)}
 
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
-        """Return g_a(nu) g_b*(nu) V_ab(nu, t), shape (Ntimes, Nbls, Nfreqs, Npols)."""
+        """Return g_a(nu, t) g_b*(nu, t) V_ab(nu, t), shape (Ntimes, Nbls, Nfreqs, Npols)."""
         first, second = observation.antennas.T
         gains = np.moveaxis(truth["gains"], 2, 0)
-        visibilities *= gains[:, first] * gains[:, second].conj()
+        # One integration after the other: products of all would be as large as the data.
+        for time in range(observation.n_times):
+            if time < len(gains):
+                products = gains[time, first] * gains[time, second].conj()
+            visibilities[time] *= products
         return visibilities
 
 

@@ -91,16 +91,19 @@ class CorruptionSettings(Section):
 
     @model_validator(mode="after")
     def _effects_are_independent(self) -> CorruptionSettings:
-        seen: dict[int, int] = {}
+        seen: dict[Any, int] = {}
         for place, effect in enumerate(self.effects):
-            if (seed := getattr(effect, "seed", None)) is None:
-                continue
-            if seed in seen:
-                raise fault(
-                    f"effects.{place}.seed",
-                    f"is {seed}, as that of item {seen[seed]}: what they draw would not be independent",
-                )
-            seen[seed] = place
+            own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
+            seeds = [("seed", own, own)]
+            if drift is not None:
+                seeds.append(("drift.seed", drift.seed, (drift.seed, own)))
+            for name, seed, identity in seeds:
+                if identity is not None and identity in seen:
+                    raise fault(
+                        f"effects.{place}.{name}",
+                        f"is {seed}, as that of item {seen[identity]}: what they draw would not be independent",
+                    )
+                seen[identity] = place
         return self
 
 

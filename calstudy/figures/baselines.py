@@ -162,8 +162,9 @@ class Baselines(StudyFigure):
         places = job.settings["baselines"] or spread_in_length(layout, SHOWN_BASELINES)
         pairs, lengths = zip(*(baseline(layout, place) for place in places), strict=True)
         gains = read_gains(job.inputs["calibration"])
-        first, second = (np.moveaxis(gains.of([pair[side] for pair in pairs]), 1, 0) for side in (0, 1))
         residual = read_spectra(job.inputs["calibration"] / RESIDUAL, pairs)
+        sides = ([pair[side] for pair in pairs] for side in (0, 1))
+        first, second = (gains.over(residual.shape[1], numbers).swapaxes(0, 1) for numbers in sides)
         model = first * second.conj() * read_spectra(job.inputs["calibration"] / MODEL, pairs)
         spectra = {"residual": residual, "model": model}
         measured = [name for name in ("data", "noise", "uncorrupted") if name in job.inputs]

@@ -59,7 +59,7 @@ class Data(StudyFigure):
         paths = (job.inputs["data"] / DATA, job.inputs["calibration"] / MODEL, job.inputs["noise"] / DATA)
         data, model, noise = (read_spectra(path, [pair])[0, integration] for path in paths)
         true, fitted = read_gains(job.inputs["gains"]), read_gains(job.inputs["calibration"])
-        both = (true.of(pair)[0], fitted.of(pair)[integration])
+        both = (true.at(integration, pair), fitted.at(integration, pair))
         corruption_factor, correction = (gains[0] * gains[1].conj() for gains in both)
         shown = Visibilities(data, correction * model, corruption_factor * noise)
         comparison = compare_visibilities(pair, length, fitted.frequency, shown)

@@ -63,7 +63,7 @@ def measure(job: Job) -> Mapping[str, Any]:
         buffer=job.settings["buffer"],
     )
     truth = Truth(
-        gains=true.of(fitted.numbers)[0],
+        gains=true.over(len(fitted.values), fitted.numbers)[solved],
         foregrounds=_cube(job.inputs["foregrounds"] / VISIBILITIES)[solved],
         noise=_cube(job.inputs["noise"] / DATA)[solved],
         data=to_cube(data)[solved, ..., 0],

@@ -152,7 +152,7 @@ def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Basel
     antennas = prepared.structure.antennas
     products = np.ones(problem.visibilities.shape, complex)
     if "gains" in job.inputs:
-        products = gain_products(read_gains(job.inputs["gains"]).of(prepared.data.numbers)[0], antennas)
+        products = gain_products(read_gains(job.inputs["gains"]).at(index, prepared.data.numbers), antennas)
     noise = np.zeros_like(products)
     if f"noise {parity}" in job.inputs:
         noise = _integration(job, f"noise {parity}")

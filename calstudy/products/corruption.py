@@ -141,10 +141,13 @@ def multiply_gains(job: Job) -> Mapping[str, Any]:
     from calstudy.instrument.telescope import make_template
 
     template = make_template(job.settings["instrument"])
-    product = np.ones((template.telescope.Nants, template.Nfreqs, 1, template.Npols), dtype=complex)
+    factors = [read_truth(folder)["gains"] for folder in job.inputs.values()]
+    # Gains that hold for the whole run have a single time.
+    n_times = max((gains.shape[2] for gains in factors), default=1)
+    product = np.ones((template.telescope.Nants, template.Nfreqs, n_times, template.Npols), dtype=complex)
     rows = antenna_rows(template)
-    for folder in job.inputs.values():
-        product[rows] *= read_truth(folder)["gains"]
+    for gains in factors:
+        product[rows] *= gains
     make_uvcal(template, product).write_calh5(job.output / GAINS)
     return {}
 
@@ -213,7 +216,18 @@ def _cost_of_levels(task: Task) -> Cost:
     return Cost(2, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e3)
 
 
-DRAW_EFFECT = Stage(name="effect", version=1, make=draw_effect, cost=lambda task: Cost(1, disk=1e6))
-MULTIPLY_GAINS = Stage(name="gains", version=2, make=multiply_gains, cost=lambda task: Cost(1, disk=1e6))
+def _cost_of_gains(task: Task) -> Cost:
+    """Return the cost of gains, which are as many as antennas, channels and, where they drift, integrations."""
+    size = size_of(task)
+    effects = (
+        [task.settings["effect"]] if "effect" in task.settings else [t.settings["effect"] for t in task.needs.values()]
+    )
+    times = size.times if any(getattr(effect, "drift", None) is not None for effect in effects) else 1
+    disk = size.antennas * size.channels.count * times * size.polarizations * COMPLEX128
+    return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, 1e6 + disk)
+
+
+DRAW_EFFECT = Stage(name="effect", version=1, make=draw_effect, cost=_cost_of_gains)
+MULTIPLY_GAINS = Stage(name="gains", version=2, make=multiply_gains, cost=_cost_of_gains)
 MEASURE_LEVELS = Stage(name="levels", version=2, make=measure_levels, cost=_cost_of_levels)
 CORRUPT = Stage(name="corrupt", version=2, make=corrupt, cost=_cost_of_corruption)

@@ -72,7 +72,8 @@ def expect(job: Job) -> Mapping[str, Any]:
     model = to_cube(read_visibilities(job.inputs["calibration"] / MODEL))[index, ..., 0]
     frequency = np.asarray(data.freq_array, float)
     modes = DelayModes(frequency, power.taper)
-    expected = expected_transfer(problem, fitted.of(prepared.data.numbers)[index], model, modes, job.settings["probes"])
+    gains = fitted.at(index, prepared.data.numbers)
+    expected = expected_transfer(problem, gains, model, modes, job.settings["probes"])
     cosmology, centre = make_cosmology(power.cosmology), float(frequency.mean())
     lengths = prepared.data.lengths
     binned = bin_expected(

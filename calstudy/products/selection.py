@@ -28,7 +28,7 @@ class Gains:
     frequency
         Channel centres, Hz, (Nfreqs,).
     values
-        Complex, (Ntimes, Nants, Nfreqs); one time stands for all.
+        Complex, (Ntimes, Nants, Nfreqs), or (1, Nants, Nfreqs) for gains that hold for the whole run.
     flags
         Where there is no solution, of the same shape.
     """
@@ -38,9 +38,14 @@ class Gains:
     values: np.ndarray
     flags: np.ndarray
 
-    def of(self, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Return the gains of some antennas, (Ntimes, len(numbers), Nfreqs)."""
-        return self.values[:, np.searchsorted(self.numbers, numbers)]
+    def at(self, integration: int, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Return the gains of some antennas at one integration of the run, (len(numbers), Nfreqs)."""
+        time = 0 if len(self.values) == 1 else integration
+        return self.values[time, np.searchsorted(self.numbers, numbers)]
+
+    def over(self, n_times: int, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Return the gains of some antennas at all integrations of the run, (n_times, len(numbers), Nfreqs)."""
+        return np.stack([self.at(integration, numbers) for integration in range(n_times)])
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,7 @@ def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGai
             f"outputs.inspect.integration = {integration}: it was not calibrated in all antennas and channels; "
             "choose one that was"
         )
-    reference = truth.of(fit.numbers)[0]
+    reference = truth.at(integration, fit.numbers)
     aligned, scale = align(fit.values[integration], reference)
     return AlignedGains(fit.numbers, fit.frequency, reference, aligned, scale)
 
