@@ -11,10 +11,12 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.base.resources import Cost
 from calstudy.corrupt.drift import Drift
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
+    from calstudy.instrument.size import Size
 
 Truth = Mapping[str, np.ndarray]
 """Arrays of numbers, by name."""
@@ -63,6 +65,17 @@ class Effect(Plugin, ABC):
         truth
             From `draw`.
         """
+
+    def cost(self, size: Size) -> Cost:
+        """Return what `apply` takes besides a pass over the data; by default nothing.
+
+        Parameters
+        ----------
+        size
+            Of the data.
+        """
+        del size
+        return Cost(0.0, memory=0.0)
 
 
 class GainEffect(Effect):

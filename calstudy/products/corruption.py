@@ -208,8 +208,11 @@ def corrupt(job: Job) -> Mapping[str, Any]:
 
 
 def _cost_of_corruption(task: Task) -> Cost:
-    samples = size_of(task).samples
-    return Cost(1 + samples * 1e-7, LIBRARIES_MEMORY + 5 * samples * COMPLEX128, samples * COMPLEX64)
+    size = size_of(task)
+    effects = [effect.cost(size) for effect in task.settings.get("effects", ())]
+    seconds = 1 + size.samples * 1e-7 + sum(cost.seconds for cost in effects)
+    memory = LIBRARIES_MEMORY + 5 * size.samples * COMPLEX128 + max((cost.memory for cost in effects), default=0.0)
+    return Cost(seconds, memory, size.samples * COMPLEX64)
 
 
 def _cost_of_levels(task: Task) -> Cost:
