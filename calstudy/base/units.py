@@ -100,6 +100,14 @@ def parse_wavenumber(value: Any) -> float:
     return float(match[1])
 
 
+def parse_fraction(value: Any) -> float:
+    """Turn ``"5 %"`` into the fraction 0.05; a number without the percent sign is refused."""
+    match = NUMBER.match(value) if isinstance(value, str) else None
+    if match is None or match[2] != "%":
+        raise _fail(value, 'is not a percentage: write for example "5 %"')
+    return float(f"{float(match[1]) / 100:.15g}")
+
+
 def _field(validate: Callable[[Any], float], unit: str, example: str) -> Any:
     return Annotated[
         float,
@@ -124,5 +132,12 @@ Area = _quantity("m2", "21.5 m2")
 Memory = _quantity("byte", "6 GB")
 Phase = _quantity("rad", "0.01 rad")
 HourAngle = _field(parse_hour_angle, "h", "1.8 h")
+Angle = _quantity("rad", "10 arcsec")
+Fraction = Annotated[
+    float,
+    BeforeValidator(parse_fraction, json_schema_input_type=str),
+    PlainSerializer(lambda value: f"{100 * value:.15g} %", return_type=str),
+    Field(json_schema_extra={"unit": "%", "example": "5 %"}),
+]
 Wavenumber = _field(parse_wavenumber, "h/Mpc", "0.2 h/Mpc")
 Decibel = _field(parse_decibel, "dB", "-40 dB")
