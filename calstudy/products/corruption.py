@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.corrupt.interface import GainEffect
-from calstudy.corrupt.settings import NoNoise
+from calstudy.corrupt.settings import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Variant
 from calstudy.products import simulation
 from calstudy.products.files import (
@@ -68,7 +68,9 @@ def levels(graph: Graph) -> Task:
         inputs["foregrounds"] = foregrounds
     corruption = graph.experiment.corruption.reset("effects")
     noise = corruption.noise if corruption.noise.kind == "none" else corruption.noise.reset("seeds")
-    settings = {"corruption": corruption.model_copy(update={"noise": noise})}
+    settings: dict[str, Any] = {"corruption": corruption.model_copy(update={"noise": noise})}
+    if isinstance(noise, RadiometerNoise):
+        settings["instrument"] = graph.experiment.instrument
     return Task(MEASURE_LEVELS, "levels", settings, inputs)
 
 
@@ -156,13 +158,18 @@ def measure_levels(job: Job) -> Mapping[str, Any]:
     """Write the scales of EoR and noise to levels.json."""
     from calstudy.base.visibilities import to_cube
     from calstudy.corrupt.levels import rms, set_levels
+    from calstudy.corrupt.noise import radiometer_std
 
     measured = {
         name: rms(to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))) if name in job.inputs else 0.0
         for name in ("foregrounds", "eor")
     }
-    found = asdict(set_levels(measured["foregrounds"], measured["eor"], job.settings["corruption"]))
-    write_json(job.output / LEVELS, found)
+    settings = job.settings["corruption"]
+    noise = settings.noise
+    radiometer = radiometer_std(noise, job.settings["instrument"]) if isinstance(noise, RadiometerNoise) else None
+    levels = set_levels(measured["foregrounds"], measured["eor"], settings, radiometer)
+    write_json(job.output / LEVELS, levels.as_json())
+    found = replace(levels, noise_spectrum=None).as_json()
     return {"levels_jy": found, "warnings": _floor_warnings(job)}
 
 
@@ -199,7 +206,7 @@ def corrupt(job: Job) -> Mapping[str, Any]:
         if name in components:
             cube += factor * to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))
     if "noise" in components:
-        cube += thermal_noise(cube.shape, found.noise_std, job.settings["noise_seed"])
+        cube += thermal_noise(cube.shape, found.noise, job.settings["noise_seed"])
     observation = Observation(template)
     for place, effect in enumerate(job.settings.get("effects", ())):
         cube = apply_effect(effect, cube, observation, read_truth(job.inputs[f"truth{place:03d}"]))
@@ -216,7 +223,9 @@ def _cost_of_corruption(task: Task) -> Cost:
 
 
 def _cost_of_levels(task: Task) -> Cost:
-    return Cost(2, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e3)
+    noise = task.settings["corruption"].noise
+    beam = 10 if isinstance(noise, RadiometerNoise) and noise.effective_area is None else 0
+    return Cost(2 + beam, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e5)
 
 
 def _cost_of_gains(task: Task) -> Cost:

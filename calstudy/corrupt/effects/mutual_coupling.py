@@ -26,7 +26,9 @@ class MutualCoupling(Effect):
     terms with k = j and k = i have the autocorrelations of the antennas, which simulations do not have.
     """
 
-    amplitude: float = Field(1e-3, ge=0, lt=1, description="Modulus of e for two antennas at `distance`, a ratio of voltages.")
+    amplitude: float = Field(
+        1e-3, ge=0, lt=1, description="Modulus of e for two antennas at `distance`, a ratio of voltages."
+    )
     distance: Length = Field(14.0, gt=0)
     falloff: float = Field(1.0, ge=0, le=4, description="Exponent; 1: a wave that spreads in all directions.")
     autos: Autocorrelations | None = Field(
