@@ -52,6 +52,8 @@ class Statistic:
 class Truth:
     """What a simulated measurement consists of; visibilities (Ntimes, Nbls, Nfreqs) complex, in Jy.
 
+    What is flagged is zero, here and in `Fit`.
+
     Attributes
     ----------
     gains
@@ -211,7 +213,8 @@ def _correction(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Stati
     used = outside.any(axis=1)
     if not used.any():
         return {}
-    ratio = baselines.gain_products(truth.gains) / baselines.gain_products(fit.gains) - 1
+    true, fitted = baselines.gain_products(truth.gains), baselines.gain_products(fit.gains)
+    ratio = np.divide(true, fitted, out=np.ones_like(fitted), where=fitted != 0) - 1
     relative_noise = truth.noise / _rms(truth.foregrounds, axis=(0, 2))[:, None]
     power = [_masked_mean(baselines.delay_power(values), outside)[used] for values in (ratio, relative_noise)]
     return {"correction_over_noise_outside": Statistic.of(np.sqrt(power[0] / power[1]), "baselines")}

@@ -52,9 +52,8 @@ class Effect(Plugin, ABC):
         del observation, random
         return {}
 
-    @abstractmethod
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
-        """Return the visibilities after the effect, complex, of the same shape.
+        """Return the visibilities after the effect, complex, of the same shape; by default as they are.
 
         Parameters
         ----------
@@ -65,6 +64,26 @@ class Effect(Plugin, ABC):
         truth
             From `draw`.
         """
+        del observation, truth
+        return visibilities
+
+    def flags(self, observation: Observation, truth: Truth) -> np.ndarray | None:
+        """Return which samples the effect flags, bool, of a shape that broadcasts with the visibilities; None: none.
+
+        Parameters
+        ----------
+        observation
+            See the notes of the class.
+        truth
+            From `draw`.
+        """
+        del observation, truth
+        return None
+
+    @property
+    def can_flag(self) -> bool:
+        """Whether the effect has flags of its own."""
+        return type(self).flags is not Effect.flags
 
     def cost(self, size: Size) -> Cost:
         """Return what `apply` takes besides a pass over the data; by default nothing.
@@ -179,6 +198,37 @@ def apply_effect(effect: Effect, visibilities: np.ndarray, observation: Observat
     if not np.isfinite(changed).all():
         raise InputError(f"effect {effect.label!r}: apply returned visibilities that are not finite")
     return changed.astype(np.complex128, copy=False)
+
+
+def draw_flags(effect: Effect, observation: Observation, truth: Truth) -> np.ndarray | None:
+    """Return what an effect flags, bool, of a shape that broadcasts with the visibilities, checked; None for nothing.
+
+    Parameters
+    ----------
+    effect
+        Which.
+    observation
+        See the notes of `Effect`.
+    truth
+        What the effect drew.
+
+    Raises
+    ------
+    InputError
+        If the effect fails, or returns flags of another type or shape.
+    """
+    with guarded(effect):
+        flags = effect.flags(observation, truth)
+    if flags is None:
+        return None
+    shape = observation.shape
+    fits = isinstance(flags, np.ndarray) and flags.dtype == bool and flags.ndim == len(shape)
+    if not fits or any(size not in (1, whole) for size, whole in zip(flags.shape, shape, strict=True)):
+        raise InputError(
+            f"effect {effect.label!r}: flags returned {_described(flags)}, expected bool of shape {shape}, or 1 along "
+            "an axis"
+        )
+    return flags
 
 
 def _described(value: Any) -> str:

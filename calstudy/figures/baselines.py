@@ -156,7 +156,14 @@ class Baselines(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the RMS over time of delay transforms of some baselines."""
-        from calstudy.products.selection import baseline, layout_of, read_gains, read_spectra, spread_in_length
+        from calstudy.products.selection import (
+            baseline,
+            layout_of,
+            read_gains,
+            read_spectra,
+            read_used,
+            spread_in_length,
+        )
 
         layout = layout_of(job.settings["layout"])
         places = job.settings["baselines"] or spread_in_length(layout, SHOWN_BASELINES)
@@ -169,7 +176,8 @@ class Baselines(StudyFigure):
         spectra = {"residual": residual, "model": model}
         measured = [name for name in ("data", "noise", "uncorrupted") if name in job.inputs]
         spectra |= {name: read_spectra(job.inputs[name] / DATA, pairs) for name in measured}
-        shown = {name: rms_over_time(values, gains.frequency) for name, values in spectra.items()}
+        used = read_used(job.inputs["calibration"] / RESIDUAL, pairs)
+        shown = {name: rms_over_time(used * values, gains.frequency) for name, values in spectra.items()}
         delay = delays(gains.frequency.size, channel_width(gains.frequency))
         panels = [
             BaselineSpectra(pair, length, delay, **{name: values[index] for name, values in shown.items()})

@@ -149,6 +149,8 @@ def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Basel
     problem = make_problem(prepared, settings, slice(0, 1), 0)
     if isinstance(problem, str):
         raise InputError(f"outputs.convergence: integration {index} cannot be calibrated: {problem}")
+    if (problem.weights == 0).any():
+        raise InputError("outputs.convergence: some data are flagged, which the figure does not support")
     antennas = prepared.structure.antennas
     products = np.ones(problem.visibilities.shape, complex)
     if "gains" in job.inputs:

@@ -108,6 +108,10 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         settings["effects"] = list(experiment.corruption.effects)
         inputs |= _numbered(truths(graph))
         label = f"effects on ({label})"
+    elif flagging := [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]:
+        # Variants are compared, and give each other's errors: all have the same samples.
+        settings["flagged_by"] = [experiment.corruption.effects[place] for place in flagging]
+        inputs |= _numbered([_truth(graph, place) for place in flagging])
     return Task(CORRUPT, label, settings, inputs, temporary=not graph.keep_visibilities)
 
 
@@ -116,14 +120,23 @@ def draw_effect(job: Job) -> Mapping[str, Any]:
     import h5py
 
     from calstudy.base.observation import Observation
-    from calstudy.corrupt.interface import draw_truth
+    from calstudy.corrupt.interface import draw_flags, draw_truth
     from calstudy.instrument.telescope import make_template
 
-    truth = draw_truth(job.settings["effect"], Observation(make_template(job.settings["instrument"])))
+    effect, observation = job.settings["effect"], Observation(make_template(job.settings["instrument"]))
+    truth = draw_truth(effect, observation)
     with h5py.File(job.output / TRUTH, "w") as file:
         for name, array in truth.items():
             file[name] = array
-    return {"arrays": {name: list(array.shape) for name, array in truth.items()}}
+    notes: dict[str, Any] = {"arrays": {name: list(array.shape) for name, array in truth.items()}}
+    if (flags := draw_flags(effect, observation, truth)) is not None:
+        notes["flagged_fraction"] = float(flags.mean())
+        if flags.shape[2] > 1 and flags.any():
+            notes["warnings"] = [
+                f"effect {effect.label!r} flags {100 * flags.mean():.2g} % of the samples: spectra with gaps mix "
+                "delays, and what is left of the foregrounds leaks beyond the wedge"
+            ]
+    return notes
 
 
 def read_truth(folder: Path) -> dict[str, np.ndarray]:
@@ -188,12 +201,15 @@ def _floor_warnings(job: Job) -> list[str]:
 
 
 def corrupt(job: Job) -> Mapping[str, Any]:
-    """Write the sum of F, S and N, or of those that are asked for, after all effects, to data.uvh5."""
+    """Write the sum of F, S and N, or of those that are asked for, after all effects, to data.uvh5.
+
+    The flags of all effects are set in all data, whether effects happen to them or not.
+    """
     import numpy as np
 
     from calstudy.base.observation import Observation
-    from calstudy.base.visibilities import from_cube, to_cube
-    from calstudy.corrupt.interface import apply_effect
+    from calstudy.base.visibilities import flag_cube, from_cube, to_cube
+    from calstudy.corrupt.interface import apply_effect, draw_flags
     from calstudy.corrupt.levels import Levels, rms
     from calstudy.corrupt.noise import thermal_noise
     from calstudy.instrument.telescope import make_template
@@ -208,10 +224,20 @@ def corrupt(job: Job) -> Mapping[str, Any]:
     if "noise" in components:
         cube += thermal_noise(cube.shape, found.noise, job.settings["noise_seed"])
     observation = Observation(template)
-    for place, effect in enumerate(job.settings.get("effects", ())):
-        cube = apply_effect(effect, cube, observation, read_truth(job.inputs[f"truth{place:03d}"]))
-    write_visibilities(from_cube(template, cube), job.output / DATA, single=True)
-    return {"rms_jy": rms(cube)}
+    flags = np.zeros(cube.shape, dtype=bool)
+    for place, effect in enumerate(job.settings.get("effects", job.settings.get("flagged_by", ()))):
+        truth = read_truth(job.inputs[f"truth{place:03d}"])
+        if "effects" in job.settings:
+            cube = apply_effect(effect, cube, observation, truth)
+        if (flagged := draw_flags(effect, observation, truth)) is not None:
+            flags |= flagged
+    data = from_cube(template, cube)
+    flag_cube(data)[:] = flags
+    write_visibilities(data, job.output / DATA, single=True)
+    notes: dict[str, Any] = {"rms_jy": rms(cube)}
+    if flags.any():
+        notes["flagged_fraction"] = float(flags.mean())
+    return notes
 
 
 def _cost_of_corruption(task: Task) -> Cost:
