@@ -166,6 +166,8 @@ def _rms(values: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
 def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
     aligned = np.stack([align(*both)[0] for both in zip(fit.gains, truth.gains, strict=True)])
     size = _rms(truth.gains, axis=2)
+    known = size > 0
+    error, raw_error = (_rms(gains - truth.gains, axis=2)[known] / size[known] for gains in (aligned, fit.gains))
     power = [
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
         for values in (aligned - truth.gains, truth.gains, fit.gains - truth.gains)
@@ -173,8 +175,8 @@ def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]
     by_delay = np.sqrt(power[0] / power[1])
     raw_by_delay = np.sqrt(power[2] / power[1])
     return {
-        "gains_aligned": Statistic.of(_rms(aligned - truth.gains, axis=2) / size, "antennas and integrations"),
-        "gains_raw": Statistic.of(_rms(fit.gains - truth.gains, axis=2) / size, "antennas and integrations"),
+        "gains_aligned": Statistic.of(error, "antennas and integrations"),
+        "gains_raw": Statistic.of(raw_error, "antennas and integrations"),
         "gains_by_delay": Statistic.of(by_delay, "delays"),
         "gains_worst_delay": Statistic(float(by_delay.max()), 0.0, by_delay.size, "delays"),
         "gains_raw_by_delay": Statistic.of(raw_by_delay, "delays"),

@@ -109,6 +109,24 @@ def test_white_gain_errors_are_measured_at_their_size_and_fill_the_correction(tr
     assert found["product_over_noise"] > 30
 
 
+def test_gaps_do_not_change_what_is_measured(truth):
+    """Flagged channels and integrations of an antenna are zero in all that is compared."""
+    known = np.ones(truth.gains.shape, bool)
+    known[:, :, [7, 100, 101, 250]] = False
+    known[2, 3] = False
+    used = known[:, PAIRS[:, 0]] & known[:, PAIRS[:, 1]]
+    gaps = Truth(known * truth.gains, used * truth.foregrounds, used * truth.noise, used * truth.data)
+    rng = np.random.default_rng(44)
+    gains = known * truth.gains * (1 + 0.05 * complex_normal(rng, *truth.gains.shape))
+    products = BASELINES.gain_products(gains)
+    residual = np.divide(gaps.data, products, out=np.zeros_like(gaps.data), where=used) - gaps.foregrounds
+    found = values(gaps, Fit(gains, gaps.foregrounds, residual))
+    assert np.isfinite(list(found.values())).all()
+    assert found["gains_aligned"] == pytest.approx(0.05, rel=0.1)
+    assert found["correction_over_noise_outside"] == pytest.approx(np.sqrt(2) * 0.05 / 1e-3, rel=0.1)
+    assert found["model_raw"] == 0
+
+
 def test_gains_that_stay_as_they_were_at_first_are_charged_with_the_drift():
     """A phase of 0.1 t of every second antenna, seen against fits that know only the gains at the first time."""
     rng = np.random.default_rng(46)

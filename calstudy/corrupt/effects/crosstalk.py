@@ -23,7 +23,7 @@ class Crosstalk(Effect):
     amplitude: FluxDensity = Field(0.1, ge=0, description="rms of |c| over the baselines.")
     delay: Delay = Field(900e-9, description="Mean of the normal distribution of the delay.")
     delay_scatter: Delay = Field(50e-9, ge=0)
-    seed: int = Field(12, ge=0)
+    seed: int = Field(8, ge=0)
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return amplitudes (Jy, complex) and delays (s) of the cross-correlations, (Nbls, 1, Npols)."""

@@ -8,11 +8,13 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.resources import Cost
 from calstudy.base.units import FluxDensity
 from calstudy.corrupt.interface import Effect, Truth
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
+    from calstudy.instrument.size import Size
 
 
 class Rfi(Effect):
@@ -30,7 +32,7 @@ class Rfi(Effect):
     flux: FluxDensity = Field(
         100.0, ge=0, description="Mean of the flux density times the beam, in a visibility, where a sample is occupied."
     )
-    seed: int = Field(14, ge=0)
+    seed: int = Field(10, ge=0)
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return flux densities (Jy) and directions (azimuth, east through north, rad), and flags, (Ntimes, Nfreqs)."""
@@ -55,6 +57,12 @@ class Rfi(Effect):
             turns = observation.frequencies[channel] * path / SPEED_OF_LIGHT
             visibilities[time, :, channel] += (truth["flux"][time, channel] * np.exp(2j * np.pi * turns))[:, None]
         return visibilities
+
+    def cost(self, size: Size) -> Cost:
+        """Return the cost of the occupied samples of all baselines."""
+        occupied = self.broadband + (1 - self.broadband) * self.channels * self.duty_cycle
+        samples = occupied * size.times * size.channels.count
+        return Cost(samples * (2e-5 + 6e-8 * size.baselines), memory=0.0)
 
     def flags(self, observation: Observation, truth: Truth) -> np.ndarray:
         """Return the flags, (Ntimes, 1, Nfreqs, 1)."""
