@@ -10,15 +10,18 @@ from scipy.constants import Boltzmann, speed_of_light
 from tiny import tiny
 
 from calstudy.base.visibilities import to_cube
+from calstudy.corrupt.levels import Levels
 from calstudy.corrupt.noise import radiometer_std, thermal_noise
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.corrupt.temperature import SystemTemperature, effective_area
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import Variant
 from calstudy.instrument.beams import make_beam
+from calstudy.power.settings import PowerSettings
 from calstudy.products import corruption
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
+from calstudy.validation.measurements.noise import noise_power
 
 
 def radiometer(**settings: object):
@@ -92,3 +95,16 @@ def test_a_run_has_the_noise_of_its_beam_in_every_channel(tmp_path):
     # 42 samples of each of 32 channels; their mean is known to 1 / sqrt(2 x 42 x 32) = 2 %.
     ratio = np.sqrt(np.mean(abs(noise) ** 2, axis=(0, 1))) / expected
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.06)
+
+
+def test_the_theory_of_the_noise_power_takes_a_spectrum_of_noise():
+    """A spectrum that is flat is a single number, and one that rises weighs channels by the taper."""
+    instrument, power = small_instrument(), PowerSettings()
+    levels = {"foreground_rms": 1.0, "eor_rms": 1.0, "eor_factor": 1.0}
+    flat = Levels(**levels, noise_std=2.0)
+    same = Levels(**levels, noise_std=2.0, noise_spectrum=[[2.0]] * 16)
+    assert noise_power(instrument, power, same) == pytest.approx(noise_power(instrument, power, flat), rel=1e-12)
+    edges = [[50.0]] + [[2.0]] * 14 + [[50.0]]
+    # The Blackman-Harris taper is 6e-5 at the ends of the band.
+    rising = Levels(**levels, noise_std=2.0, noise_spectrum=edges)
+    assert noise_power(instrument, power, rising) == pytest.approx(noise_power(instrument, power, flat), rel=1e-3)
