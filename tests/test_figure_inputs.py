@@ -97,6 +97,22 @@ def test_true_gains_are_the_products_and_the_fit_is_aligned_with_them(made):
     assert found.antennas == (2, 4)
 
 
+def test_true_gains_that_drift_are_those_of_the_integration(tmp_path):
+    """In every figure that shows them: the gains are not those of the first time."""
+    made = Products(tmp_path)
+    drift = np.exp(complex_normal(np.random.default_rng(52), len(made.true), 1, made.template.Ntimes))
+    true = made.true[..., None] * drift
+    made.write_fit(np.ones_like(true)[..., None], np.zeros((*true.shape, 1), bool))
+    make_uvcal(made.template, true[..., None]).write_calh5(made.folders["gains"] / "gains.calh5", clobber=True)
+    found = shown("gains", made.job("gains", "calibration"))
+    np.testing.assert_array_equal(found.true.values, true[[0, 1], :, INTEGRATION])
+    np.testing.assert_array_equal(shown("reflections", made.job("gains")).values, true[..., INTEGRATION])
+    factor = true[0, :, INTEGRATION] * true[1, :, INTEGRATION].conj()
+    index = antenna_pairs(made.template).tolist().index([0, 1])
+    noise = shown("data", made.job("gains", "calibration", "data", "noise")).noise.values
+    np.testing.assert_allclose(noise, factor * made.noise[INTEGRATION, index, :, 0], rtol=1e-6)
+
+
 def test_an_error_of_one_antenna_is_shown_as_it_is(made, tmp_path):
     off = Products(tmp_path)
     gains = np.repeat(off.true[:, :, None, None], 3, axis=2)

@@ -52,10 +52,12 @@ class Statistic:
 class Truth:
     """What a simulated measurement consists of; visibilities (Ntimes, Nbls, Nfreqs) complex, in Jy.
 
+    What is flagged is zero, here and in `Fit`.
+
     Attributes
     ----------
     gains
-        True gains, constant in time, (Nants, Nfreqs).
+        True gains, (Ntimes, Nants, Nfreqs).
     foregrounds, noise
         F and N without gains.
     data
@@ -162,17 +164,19 @@ def _rms(values: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
 
 
 def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
-    aligned = np.stack([align(gains, truth.gains)[0] for gains in fit.gains])
-    size = _rms(truth.gains, axis=1)
+    aligned = np.stack([align(*both)[0] for both in zip(fit.gains, truth.gains, strict=True)])
+    size = _rms(truth.gains, axis=2)
+    known = size > 0
+    error, raw_error = (_rms(gains - truth.gains, axis=2)[known] / size[known] for gains in (aligned, fit.gains))
     power = [
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
-        for values in (aligned - truth.gains, truth.gains[None], fit.gains - truth.gains)
+        for values in (aligned - truth.gains, truth.gains, fit.gains - truth.gains)
     ]
     by_delay = np.sqrt(power[0] / power[1])
     raw_by_delay = np.sqrt(power[2] / power[1])
     return {
-        "gains_aligned": Statistic.of(_rms(aligned - truth.gains, axis=2) / size, "antennas and integrations"),
-        "gains_raw": Statistic.of(_rms(fit.gains - truth.gains, axis=2) / size, "antennas and integrations"),
+        "gains_aligned": Statistic.of(error, "antennas and integrations"),
+        "gains_raw": Statistic.of(raw_error, "antennas and integrations"),
         "gains_by_delay": Statistic.of(by_delay, "delays"),
         "gains_worst_delay": Statistic(float(by_delay.max()), 0.0, by_delay.size, "delays"),
         "gains_raw_by_delay": Statistic.of(raw_by_delay, "delays"),
@@ -181,7 +185,7 @@ def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]
 
 
 def _models(truth: Truth, fit: Fit) -> dict[str, Statistic]:
-    scales = np.array([align(gains, truth.gains)[1] for gains in fit.gains])
+    scales = np.array([align(*both)[1] for both in zip(fit.gains, truth.gains, strict=True)])
     size = _rms(truth.foregrounds, axis=(0, 2))
     aligned = fit.model / scales[:, None, None] ** 2 - truth.foregrounds
     error = _rms(aligned, axis=(0, 2))
@@ -211,7 +215,8 @@ def _correction(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Stati
     used = outside.any(axis=1)
     if not used.any():
         return {}
-    ratio = baselines.gain_products(truth.gains) / baselines.gain_products(fit.gains) - 1
+    true, fitted = baselines.gain_products(truth.gains), baselines.gain_products(fit.gains)
+    ratio = np.divide(true, fitted, out=np.ones_like(fitted), where=fitted != 0) - 1
     relative_noise = truth.noise / _rms(truth.foregrounds, axis=(0, 2))[:, None]
     power = [_masked_mean(baselines.delay_power(values), outside)[used] for values in (ratio, relative_noise)]
     return {"correction_over_noise_outside": Statistic.of(np.sqrt(power[0] / power[1]), "baselines")}

@@ -11,9 +11,12 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.base.resources import Cost
+from calstudy.corrupt.drift import Drift
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
+    from calstudy.instrument.size import Size
 
 Truth = Mapping[str, np.ndarray]
 """Arrays of numbers, by name."""
@@ -49,9 +52,8 @@ class Effect(Plugin, ABC):
         del observation, random
         return {}
 
-    @abstractmethod
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
-        """Return the visibilities after the effect, complex, of the same shape.
+        """Return the visibilities after the effect, complex, of the same shape; by default as they are.
 
         Parameters
         ----------
@@ -62,6 +64,37 @@ class Effect(Plugin, ABC):
         truth
             From `draw`.
         """
+        del observation, truth
+        return visibilities
+
+    def flags(self, observation: Observation, truth: Truth) -> np.ndarray | None:
+        """Return which samples the effect flags, bool, of a shape that broadcasts with the visibilities; None: none.
+
+        Parameters
+        ----------
+        observation
+            See the notes of the class.
+        truth
+            From `draw`.
+        """
+        del observation, truth
+        return None
+
+    @property
+    def can_flag(self) -> bool:
+        """Whether the effect has flags of its own."""
+        return type(self).flags is not Effect.flags
+
+    def cost(self, size: Size) -> Cost:
+        """Return what `apply` takes besides a pass over the data; by default nothing.
+
+        Parameters
+        ----------
+        size
+            Of the data.
+        """
+        del size
+        return Cost(0.0, memory=0.0)
 
 
 class GainEffect(Effect):
@@ -70,40 +103,46 @@ class GainEffect(Effect):
     The product of all gain effects is the true gains, with which a calibration is compared.
     """
 
+    drift: Drift | None = Field(None, description="How the gains change during the run; null: they are constant.")
+
     @abstractmethod
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
-        """Return the gains, complex, shape (Nants, Nfreqs, 1, Npols); they must be constant in time.
+        """Return the gains, complex, shape (Nants, Nfreqs, 1 or Ntimes, Npols), without the drift.
 
-        Antennas are in the order of ``observation.numbers``, to which ``observation.antennas`` of the baselines refer.
+        A single time stands for all. Antennas are in the order of ``observation.numbers``, to which
+        ``observation.antennas`` of the baselines refer.
         """
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
-        """Return the gains, complex128, by the name "gains".
+        """Return the gains, drift included, complex128, (Nants, Nfreqs, 1 or Ntimes, Npols), by the name "gains".
 
         Raises
         ------
         InputError
-            If they are not an array of the right shape, vary in time, or are zero or not finite somewhere.
+            If they are not an array of the right shape, or are zero or not finite somewhere.
         """
         gains = np.asarray(self.gains(observation, random))
-        sizes = observation.n_antennas, observation.n_channels, 1, observation.n_polarizations
-        # Everything that reads true gains (figures, agreement, convergence) takes them as constant in time.
-        if gains.shape == (*sizes[:2], observation.n_times, sizes[3]) != sizes:
-            raise InputError(f"effect {self.label!r}: its gains vary in time, which is not supported yet")
-        if gains.shape != sizes or gains.dtype.kind not in "fc":
+        sizes = observation.n_antennas, observation.n_channels, observation.n_times, observation.n_polarizations
+        if gains.shape not in (sizes, (*sizes[:2], 1, sizes[3])) or gains.dtype.kind not in "fc":
             raise InputError(
                 f"effect {self.label!r}: its gains are {gains.dtype} of shape {gains.shape}, expected complex of shape "
-                f"{sizes} (antennas, channels, times, polarizations)"
+                f"{sizes} (antennas, channels, times, polarizations), or of one time for constant ones"
             )
+        if self.drift is not None:
+            gains = gains * self.drift.factors(observation, getattr(self, "seed", 0))
         if not np.isfinite(gains).all() or (gains == 0).any():
             raise InputError(f"effect {self.label!r}: its gains are zero or not finite somewhere")
         return {"gains": gains.astype(np.complex128)}
 
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
-        """Return g_a(nu) g_b*(nu) V_ab(nu, t), shape (Ntimes, Nbls, Nfreqs, Npols)."""
+        """Return g_a(nu, t) g_b*(nu, t) V_ab(nu, t), shape (Ntimes, Nbls, Nfreqs, Npols)."""
         first, second = observation.antennas.T
         gains = np.moveaxis(truth["gains"], 2, 0)
-        visibilities *= gains[:, first] * gains[:, second].conj()
+        # One integration after the other: products of all would be as large as the data.
+        for time in range(observation.n_times):
+            if time < len(gains):
+                products = gains[time, first] * gains[time, second].conj()
+            visibilities[time] *= products
         return visibilities
 
 
@@ -159,6 +198,37 @@ def apply_effect(effect: Effect, visibilities: np.ndarray, observation: Observat
     if not np.isfinite(changed).all():
         raise InputError(f"effect {effect.label!r}: apply returned visibilities that are not finite")
     return changed.astype(np.complex128, copy=False)
+
+
+def draw_flags(effect: Effect, observation: Observation, truth: Truth) -> np.ndarray | None:
+    """Return what an effect flags, bool, of a shape that broadcasts with the visibilities, checked; None for nothing.
+
+    Parameters
+    ----------
+    effect
+        Which.
+    observation
+        See the notes of `Effect`.
+    truth
+        What the effect drew.
+
+    Raises
+    ------
+    InputError
+        If the effect fails, or returns flags of another type or shape.
+    """
+    with guarded(effect):
+        flags = effect.flags(observation, truth)
+    if flags is None:
+        return None
+    shape = observation.shape
+    fits = isinstance(flags, np.ndarray) and flags.dtype == bool and flags.ndim == len(shape)
+    if not fits or any(size not in (1, whole) for size, whole in zip(flags.shape, shape, strict=True)):
+        raise InputError(
+            f"effect {effect.label!r}: flags returned {_described(flags)}, expected bool of shape {shape}, or 1 along "
+            "an axis"
+        )
+    return flags
 
 
 def _described(value: Any) -> str:

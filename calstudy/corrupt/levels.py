@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,13 +24,26 @@ class Levels:
     eor_factor
         What the EoR visibilities are multiplied by.
     noise_std
-        Standard deviation of the complex noise per baseline, channel, integration and realization.
+        Standard deviation of the complex noise per baseline, channel, integration and realization; its rms over
+        channels where they differ.
+    noise_spectrum
+        The same for every channel and polarization, (Nfreqs, Npols), where they differ.
     """
 
     foreground_rms: float
     eor_rms: float
     eor_factor: float
     noise_std: float
+    noise_spectrum: list[list[float]] | None = None
+
+    @property
+    def noise(self) -> float | np.ndarray:
+        """Standard deviation of the noise, a number or (Nfreqs, Npols)."""
+        return self.noise_std if self.noise_spectrum is None else np.array(self.noise_spectrum)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the amplitudes as plain JSON types, without those that there are not."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def rms(visibilities: np.ndarray) -> float:
@@ -38,7 +51,9 @@ def rms(visibilities: np.ndarray) -> float:
     return float(np.sqrt(np.mean(visibilities.real**2 + visibilities.imag**2)))
 
 
-def set_levels(foreground_rms: float, eor_rms: float, settings: CorruptionSettings) -> Levels:
+def set_levels(
+    foreground_rms: float, eor_rms: float, settings: CorruptionSettings, radiometer: np.ndarray | None = None
+) -> Levels:
     """Scale the EoR to `eor_level` below the foregrounds and the noise to its reference.
 
     The paper's decibels are of brightness: -40 dB is a ratio of rms visibilities of 1e-4, so that the residuals'
@@ -50,6 +65,8 @@ def set_levels(foreground_rms: float, eor_rms: float, settings: CorruptionSettin
         Of the simulated visibilities, Jy.
     settings
         Level of the EoR and factor of the noise.
+    radiometer
+        Standard deviation of radiometer noise, Jy, (Nfreqs, Npols) (`calstudy.corrupt.noise.radiometer_std`).
 
     Raises
     ------
@@ -63,11 +80,17 @@ def set_levels(foreground_rms: float, eor_rms: float, settings: CorruptionSettin
         if foreground_rms <= 0:
             raise InputError("corruption.eor_level: the foregrounds it refers to are all zero")
         factor = 10 ** (settings.eor_level / 10) * foreground_rms / eor_rms
-    noise = settings.noise
+    noise, spectrum = settings.noise, None
     if noise.kind == "none":
         std = 0.0
+    elif noise.kind == "radiometer":
+        if radiometer is None:
+            raise ValueError("radiometer noise needs its standard deviation")
+        std, spectrum = rms(radiometer), radiometer.tolist()
     elif noise.kind == "times-eor":
         std = noise.factor * factor * eor_rms
     else:
         std = noise.factor * foreground_rms
-    return Levels(foreground_rms=foreground_rms, eor_rms=eor_rms, eor_factor=factor, noise_std=std)
+    return Levels(
+        foreground_rms=foreground_rms, eor_rms=eor_rms, eor_factor=factor, noise_std=std, noise_spectrum=spectrum
+    )

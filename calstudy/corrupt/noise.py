@@ -2,10 +2,42 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from calstudy.corrupt.temperature import effective_area
 
-def thermal_noise(shape: tuple[int, ...], std: float, seed: int) -> np.ndarray:
+if TYPE_CHECKING:
+    from calstudy.corrupt.settings import RadiometerNoise
+    from calstudy.instrument.settings import InstrumentSettings
+
+
+def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np.ndarray:
+    """Return the standard deviation of the complex noise, V_aa / sqrt(width integration nights), Jy, (Nfreqs, Npols).
+
+    Parameters
+    ----------
+    noise
+        Temperatures, effective area and nights.
+    instrument
+        Its channels, integrations and polarizations, and the beam where it gives the effective area.
+    """
+    from calstudy.instrument.beams import make_beam
+
+    channels = instrument.channels
+    frequencies = channels.first + channels.width * np.arange(channels.count)
+    if noise.effective_area is not None:
+        areas = [np.full(channels.count, noise.effective_area)] * len(instrument.polarizations)
+    else:
+        beam = make_beam(instrument.beam, channels)
+        solid_angles = (beam.solid_angles(frequencies, polarization)[0] for polarization in instrument.polarizations)
+        areas = [effective_area(frequencies, omega_p) for omega_p in solid_angles]
+    samples = channels.width * instrument.times.integration * noise.nights
+    return np.stack([noise.autocorrelations(frequencies, area) for area in areas], axis=-1) / np.sqrt(samples)
+
+
+def thermal_noise(shape: tuple[int, ...], std: float | np.ndarray, seed: int) -> np.ndarray:
     """Draw circular complex Gaussian noise with E|n|^2 = std^2, independent in every sample.
 
     Parameters
@@ -13,7 +45,8 @@ def thermal_noise(shape: tuple[int, ...], std: float, seed: int) -> np.ndarray:
     shape
         Of the returned complex128 array.
     std
-        Standard deviation of the complex samples; each of the real and imaginary parts has std / sqrt(2).
+        Standard deviation of the complex samples, a number or an array that broadcasts with the shape; each of the
+        real and imaginary parts has std / sqrt(2).
     seed
         Same seed and shape, same noise.
     """

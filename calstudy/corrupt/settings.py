@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, SerializeAsAny, model_validator
 
 from calstudy.base.schema import Section, choice, fault
-from calstudy.base.units import Decibel
+from calstudy.base.units import Area, Decibel
 from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
 from calstudy.corrupt.interface import Effect, GainEffect
+from calstudy.corrupt.temperature import SystemTemperature
 
 
 def _different(seeds: tuple[int, int]) -> tuple[int, int]:
@@ -43,6 +44,22 @@ class NoiseRelativeToForegrounds(Section):
     seeds: Seeds = (3, 4)
 
 
+class RadiometerNoise(SystemTemperature):
+    """Thermal noise in absolute units, by the radiometer equation: k_B T / (A_e sqrt(width x integration x nights)).
+
+    T is receiver + sky (nu / sky_frequency)^sky_index. This is the standard deviation of the complex noise in xx or yy,
+    per baseline, channel, integration and realization; width and integration are those of the instrument. Foregrounds
+    are in absolute units; for the EoR to be so too, set `corruption.eor_level` to null.
+    """
+
+    kind: Literal["radiometer"]
+    effective_area: Area | None = Field(
+        None, gt=0, description="Of an antenna; null: wavelength^2 over the solid angle of `instrument.beam`."
+    )
+    nights: int = Field(1, ge=1, description="Nights at the same sidereal time that are averaged coherently.")
+    seeds: Seeds = (3, 4)
+
+
 class NoNoise(Section):
     """No thermal noise: the even and odd data are the same."""
 
@@ -50,7 +67,9 @@ class NoNoise(Section):
 
 
 Noise = Annotated[
-    NoiseRelativeToEor | NoiseRelativeToForegrounds | NoNoise, Field(discriminator="kind"), choice("kind", "times-eor")
+    NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise,
+    Field(discriminator="kind"),
+    choice("kind", "times-eor"),
 ]
 
 
@@ -91,16 +110,19 @@ class CorruptionSettings(Section):
 
     @model_validator(mode="after")
     def _effects_are_independent(self) -> CorruptionSettings:
-        seen: dict[int, int] = {}
+        seen: dict[Any, int] = {}
         for place, effect in enumerate(self.effects):
-            if (seed := getattr(effect, "seed", None)) is None:
-                continue
-            if seed in seen:
-                raise fault(
-                    f"effects.{place}.seed",
-                    f"is {seed}, as that of item {seen[seed]}: what they draw would not be independent",
-                )
-            seen[seed] = place
+            own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
+            seeds = [("seed", own, own)]
+            if drift is not None:
+                seeds.append(("drift.seed", drift.seed, (drift.seed, own)))
+            for name, seed, identity in seeds:
+                if identity is not None and identity in seen:
+                    raise fault(
+                        f"effects.{place}.{name}",
+                        f"is {seed}, as that of item {seen[identity]}: what they draw would not be independent",
+                    )
+                seen[identity] = place
         return self
 
 

@@ -156,19 +156,28 @@ class Baselines(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the RMS over time of delay transforms of some baselines."""
-        from calstudy.products.selection import baseline, layout_of, read_gains, read_spectra, spread_in_length
+        from calstudy.products.selection import (
+            baseline,
+            layout_of,
+            read_gains,
+            read_spectra,
+            read_used,
+            spread_in_length,
+        )
 
         layout = layout_of(job.settings["layout"])
         places = job.settings["baselines"] or spread_in_length(layout, SHOWN_BASELINES)
         pairs, lengths = zip(*(baseline(layout, place) for place in places), strict=True)
         gains = read_gains(job.inputs["calibration"])
-        first, second = (np.moveaxis(gains.of([pair[side] for pair in pairs]), 1, 0) for side in (0, 1))
         residual = read_spectra(job.inputs["calibration"] / RESIDUAL, pairs)
+        sides = ([pair[side] for pair in pairs] for side in (0, 1))
+        first, second = (gains.over(residual.shape[1], numbers).swapaxes(0, 1) for numbers in sides)
         model = first * second.conj() * read_spectra(job.inputs["calibration"] / MODEL, pairs)
         spectra = {"residual": residual, "model": model}
         measured = [name for name in ("data", "noise", "uncorrupted") if name in job.inputs]
         spectra |= {name: read_spectra(job.inputs[name] / DATA, pairs) for name in measured}
-        shown = {name: rms_over_time(values, gains.frequency) for name, values in spectra.items()}
+        used = read_used(job.inputs["calibration"] / RESIDUAL, pairs)
+        shown = {name: rms_over_time(used * values, gains.frequency) for name, values in spectra.items()}
         delay = delays(gains.frequency.size, channel_width(gains.frequency))
         panels = [
             BaselineSpectra(pair, length, delay, **{name: values[index] for name, values in shown.items()})

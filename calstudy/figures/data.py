@@ -52,14 +52,16 @@ class Data(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the data of a baseline with fitted gains times model, and with the noise in them."""
-        from calstudy.products.selection import baseline, layout_of, read_gains, read_spectra
+        from calstudy.products.selection import baseline, layout_of, read_gains, read_spectra, read_used, require_used
 
         integration = job.settings["integration"]
         pair, length = baseline(layout_of(job.settings["layout"]), job.settings["antennas"])
         paths = (job.inputs["data"] / DATA, job.inputs["calibration"] / MODEL, job.inputs["noise"] / DATA)
-        data, model, noise = (read_spectra(path, [pair])[0, integration] for path in paths)
+        used = read_used(paths[1], [pair])[0, integration]
+        require_used(used, pair, integration)
+        data, model, noise = (used * read_spectra(path, [pair])[0, integration] for path in paths)
         true, fitted = read_gains(job.inputs["gains"]), read_gains(job.inputs["calibration"])
-        both = (true.of(pair)[0], fitted.of(pair)[integration])
+        both = (true.at(integration, pair), fitted.at(integration, pair))
         corruption_factor, correction = (gains[0] * gains[1].conj() for gains in both)
         shown = Visibilities(data, correction * model, corruption_factor * noise)
         comparison = compare_visibilities(pair, length, fitted.frequency, shown)

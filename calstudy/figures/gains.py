@@ -50,7 +50,8 @@ def compare_gains(
 ) -> GainComparison:
     """Compare true and recovered gains, (2, Nfreqs) complex, on channels `frequency` (Nfreqs,) Hz.
 
-    The recovered gains must have their degeneracies fixed (overall scale and phase), or residuals mean nothing.
+    The recovered gains must have their degeneracies fixed (overall scale and phase), or residuals mean nothing. Where
+    there is no solution both are zero.
 
     Parameters
     ----------
@@ -66,7 +67,9 @@ def compare_gains(
             f"gains have shapes {np.shape(true)} and {np.shape(recovered)}, expected two antennas and "
             f"{frequency.size} channels"
         )
-    ratio = true[0] * np.conj(true[1]) / (recovered[0] * np.conj(recovered[1])) - 1
+    products = [gains[0] * np.conj(gains[1]) for gains in (true, recovered)]
+    known = products[1] != 0
+    ratio = np.divide(products[0], products[1], out=np.ones(frequency.size, complex), where=known) - 1
     spectra = (in_two_domains(frequency, values) for values in (true, recovered, true - recovered, ratio))
     return GainComparison(antennas, *spectra)
 
@@ -86,7 +89,7 @@ def draw_gains(comparison: GainComparison, stand_ins: Sequence[str] = ()) -> Fig
         axes.set_ylabel(rf"Re $g_{{{comparison.antennas[index]}}}$")
     ratio = comparison.correction
     black: dict[str, Any] = {"color": style.BLACK, "linestyle": ":"}
-    residuals.plot(ratio.frequency / 1e6, ratio.values.real, **black)
+    residuals.plot(ratio.frequency / 1e6, ratio.real, **black)
     delays.plot(ratio.delay * 1e9, np.abs(ratio.transform), **black)
     residuals.set_ylabel("Re residual")
     delay_panel(delays, comparison.true.delay, r"$|\widetilde{g}(\tau)|$")
@@ -96,7 +99,7 @@ def draw_gains(comparison: GainComparison, stand_ins: Sequence[str] = ()) -> Fig
 
 
 def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: dict[str, Any]) -> None:
-    axes.plot(spectra.frequency / 1e6, spectra.values[index].real, **look)
+    axes.plot(spectra.frequency / 1e6, spectra.real[index], **look)
     delays.plot(spectra.delay * 1e9, np.abs(spectra.transform[index]), **look)
 
 
@@ -155,10 +158,12 @@ class Gains(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw true and fitted gains of two antennas."""
-        from calstudy.products.selection import layout_of, read_aligned_gains
+        from calstudy.products.selection import layout_of, read_aligned_gains, require_used
 
         numbers = layout_of(job.settings["layout"]).numbers[job.settings["antennas"]].tolist()
         gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], job.settings["integration"])
         rows = gains.rows(numbers)
+        for row, number in zip(rows, numbers, strict=True):
+            require_used(gains.fitted[row] != 0, [number], job.settings["integration"])
         comparison = compare_gains(tuple(numbers), gains.frequency, gains.true[rows], gains.fitted[rows])
         return Drawing(draw_gains(comparison, stand_ins=job.settings["notes"]), comparison)

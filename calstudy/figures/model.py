@@ -52,7 +52,14 @@ class Model(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the true foregrounds of a baseline and the fitted ones, on the scale of the true gains."""
-        from calstudy.products.selection import baseline, layout_of, read_aligned_gains, read_spectra
+        from calstudy.products.selection import (
+            baseline,
+            layout_of,
+            read_aligned_gains,
+            read_spectra,
+            read_used,
+            require_used,
+        )
 
         integration = job.settings["integration"]
         pair, length = baseline(layout_of(job.settings["layout"]), job.settings["antennas"])
@@ -62,7 +69,9 @@ class Model(StudyFigure):
             job.inputs["calibration"] / MODEL,
             job.inputs["noise"] / DATA,
         )
-        foregrounds, model, noise = (read_spectra(path, [pair])[0, integration] for path in paths)
+        used = read_used(paths[1], [pair])[0, integration]
+        require_used(used, pair, integration)
+        foregrounds, model, noise = (used * read_spectra(path, [pair])[0, integration] for path in paths)
         shown = Visibilities(foregrounds, model / gains.scale**2, noise)
         comparison = compare_visibilities(pair, length, gains.frequency, shown)
         return Drawing(draw_model(comparison, stand_ins=job.settings["notes"]), comparison)

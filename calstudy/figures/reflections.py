@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -47,7 +48,7 @@ def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6, stand_ins: Sequ
 
 
 class Reflections(StudyFigure):
-    """The true gains against delay."""
+    """The true gains against delay, in one integration."""
 
     caption = "Delay transform of the true gains."
     shows_sky = False
@@ -56,10 +57,14 @@ class Reflections(StudyFigure):
         """Return the true gains."""
         return {"gains": corruption.gains(graph)}
 
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return which integration is shown."""
+        return {"integration": graph.experiment.outputs.inspect.integration}
+
     def draw(self, job: Job) -> Drawing:
         """Draw the delay transforms of the true gains."""
         from calstudy.products.selection import read_gains
 
         gains = read_gains(job.inputs["gains"])
-        shown = in_two_domains(gains.frequency, gains.values[0])
+        shown = in_two_domains(gains.frequency, gains.at(job.settings["integration"], gains.numbers))
         return Drawing(draw_reflections(shown, stand_ins=job.settings["notes"]), shown)

@@ -35,6 +35,11 @@ class TwoDomains:
     values: np.ndarray
     transform: np.ndarray
 
+    @property
+    def real(self) -> np.ndarray:
+        """Real parts of the spectra for a plot against frequency, NaN where they are zero: what is flagged."""
+        return np.where(self.values == 0, np.nan, self.values.real)
+
 
 def in_two_domains(frequency: np.ndarray, values: np.ndarray) -> TwoDomains:
     """Transform spectra (..., Nfreqs) on equally spaced channels `frequency` (Nfreqs,) Hz to delay.

@@ -90,7 +90,7 @@ def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str], s
         (residuals, comparison.residual, "residual", {"color": style.BLUE, "linestyle": ":", "linewidth": 1.1}),
     )
     for axes, spectrum, label, look in looks:
-        axes.plot(spectrum.frequency / 1e6, spectrum.values.real, label=label, **look)
+        axes.plot(spectrum.frequency / 1e6, spectrum.real, label=label, **look)
         delays.plot(spectrum.delay * 1e9, np.abs(spectrum.transform), label=label, **look)
     mark_horizon(delays, horizon_delay(comparison.baseline_length))
     values.set_ylabel(r"Re $V$ (Jy)")

@@ -200,16 +200,16 @@ def gain_ratio(true: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     true
-        Gains, (Nants, Nfreqs), complex.
+        Gains of each integration, (Ntimes, Nants, Nfreqs), complex.
     fitted
-        Gains of each integration, (Ntimes, Nants, Nfreqs), complex; NaN where there are none. Integrations without a
-        gain are left out of the mean of its pairs, which is NaN if all are.
+        Likewise; NaN where there are none. Integrations without a gain are left out of the mean of its pairs, which is
+        NaN if all are.
     """
-    first, second = np.triu_indices(len(true), 1)
-    total, count = np.zeros((first.size, true.shape[1]), complex), np.zeros((first.size, true.shape[1]))
-    for gains in fitted:
+    first, second = np.triu_indices(true.shape[1], 1)
+    total, count = np.zeros((first.size, true.shape[2]), complex), np.zeros((first.size, true.shape[2]))
+    for injected, gains in zip(true, fitted, strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = true / gains
+            ratio = injected / gains
             product = ratio[first] * ratio[second].conj()
         known = np.isfinite(product)
         total[known] += product[known]

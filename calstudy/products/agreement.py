@@ -12,8 +12,6 @@ from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import numpy as np
 
 AGREEMENT = "agreement.json"
@@ -48,28 +46,42 @@ def measure(job: Job) -> Mapping[str, Any]:
     """Write the measurements of the first polarization, and how redundant the array is, to agreement.json."""
     import numpy as np
 
-    from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
+    from calstudy.base.errors import InputError
+    from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
     from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth
     from calstudy.products.selection import read_gains
 
     data = read_visibilities(job.inputs["data"] / DATA)
     true, fitted = read_gains(job.inputs["gains"]), read_gains(job.inputs["calibration"])
-    solved = ~fitted.flags.any(axis=(1, 2))
+    calibrated = read_visibilities(job.inputs["calibration"] / RESIDUAL)
+    flags = flag_cube(calibrated)[..., 0]
+    solved, observed = ~flags.all(axis=(1, 2)), ~flags.all(axis=(0, 2))
+    if not solved.any():
+        raise InputError("calibration against truth: no integration was calibrated")
     vectors = baseline_vectors(data)
+    pairs = antenna_pairs(data)[observed]
+    numbers = np.unique(pairs)
     baselines = Baselines(
-        antennas=np.searchsorted(fitted.numbers, antenna_pairs(data)),
-        lengths=np.linalg.norm(vectors, axis=1),
+        antennas=np.searchsorted(numbers, pairs),
+        lengths=np.linalg.norm(vectors[observed], axis=1),
         frequency=data.freq_array,
         buffer=job.settings["buffer"],
     )
+    # What is flagged is zero in all that is compared.
+    used, known = ~flags[solved][:, observed], ~fitted.flags[solved][:, np.searchsorted(fitted.numbers, numbers)]
+
+    def visibilities(name: str, file: str) -> np.ndarray:
+        return used * to_cube(read_visibilities(job.inputs[name] / file))[solved, ..., 0][:, observed]
+
     truth = Truth(
-        gains=true.of(fitted.numbers)[0],
-        foregrounds=_cube(job.inputs["foregrounds"] / VISIBILITIES)[solved],
-        noise=_cube(job.inputs["noise"] / DATA)[solved],
-        data=to_cube(data)[solved, ..., 0],
+        gains=known * true.over(len(fitted.values), numbers)[solved],
+        foregrounds=visibilities("foregrounds", VISIBILITIES),
+        noise=visibilities("noise", DATA),
+        data=visibilities("data", DATA),
     )
-    model, residual = (_cube(job.inputs["calibration"] / name)[solved] for name in (MODEL, RESIDUAL))
-    found = compare_with_truth(truth, Fit(fitted.values[solved], model, residual), baselines)
+    gains = known * fitted.over(len(fitted.values), numbers)[solved]
+    fit = Fit(gains, *(visibilities("calibration", name) for name in (MODEL, RESIDUAL)))
+    found = compare_with_truth(truth, fit, baselines)
     write_json(
         job.output / AGREEMENT,
         {
@@ -80,13 +92,6 @@ def measure(job: Job) -> Mapping[str, Any]:
         },
     )
     return {}
-
-
-def _cube(path: Path) -> np.ndarray:
-    """Return the first polarization of a product, (Ntimes, Nbls, Nfreqs)."""
-    from calstudy.base.visibilities import to_cube
-
-    return to_cube(read_visibilities(path))[..., 0]
 
 
 def _redundant_fraction(vectors: np.ndarray, tolerance: float) -> float:

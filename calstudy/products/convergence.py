@@ -149,10 +149,12 @@ def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Basel
     problem = make_problem(prepared, settings, slice(0, 1), 0)
     if isinstance(problem, str):
         raise InputError(f"outputs.convergence: integration {index} cannot be calibrated: {problem}")
+    if (problem.weights == 0).any():
+        raise InputError("outputs.convergence: some data are flagged, which the figure does not support")
     antennas = prepared.structure.antennas
     products = np.ones(problem.visibilities.shape, complex)
     if "gains" in job.inputs:
-        products = gain_products(read_gains(job.inputs["gains"]).of(prepared.data.numbers)[0], antennas)
+        products = gain_products(read_gains(job.inputs["gains"]).at(index, prepared.data.numbers), antennas)
     noise = np.zeros_like(products)
     if f"noise {parity}" in job.inputs:
         noise = _integration(job, f"noise {parity}")

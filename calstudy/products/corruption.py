@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.corrupt.interface import GainEffect
-from calstudy.corrupt.settings import NoNoise
+from calstudy.corrupt.settings import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Variant
 from calstudy.products import simulation
 from calstudy.products.files import (
@@ -68,7 +68,9 @@ def levels(graph: Graph) -> Task:
         inputs["foregrounds"] = foregrounds
     corruption = graph.experiment.corruption.reset("effects")
     noise = corruption.noise if corruption.noise.kind == "none" else corruption.noise.reset("seeds")
-    settings = {"corruption": corruption.model_copy(update={"noise": noise})}
+    settings: dict[str, Any] = {"corruption": corruption.model_copy(update={"noise": noise})}
+    if isinstance(noise, RadiometerNoise):
+        settings["instrument"] = graph.experiment.instrument
     return Task(MEASURE_LEVELS, "levels", settings, inputs)
 
 
@@ -106,6 +108,10 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         settings["effects"] = list(experiment.corruption.effects)
         inputs |= _numbered(truths(graph))
         label = f"effects on ({label})"
+    elif flagging := [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]:
+        # Variants are compared, and give each other's errors: all have the same samples.
+        settings["flagged_by"] = [experiment.corruption.effects[place] for place in flagging]
+        inputs |= _numbered([_truth(graph, place) for place in flagging])
     return Task(CORRUPT, label, settings, inputs, temporary=not graph.keep_visibilities)
 
 
@@ -114,14 +120,23 @@ def draw_effect(job: Job) -> Mapping[str, Any]:
     import h5py
 
     from calstudy.base.observation import Observation
-    from calstudy.corrupt.interface import draw_truth
+    from calstudy.corrupt.interface import draw_flags, draw_truth
     from calstudy.instrument.telescope import make_template
 
-    truth = draw_truth(job.settings["effect"], Observation(make_template(job.settings["instrument"])))
+    effect, observation = job.settings["effect"], Observation(make_template(job.settings["instrument"]))
+    truth = draw_truth(effect, observation)
     with h5py.File(job.output / TRUTH, "w") as file:
         for name, array in truth.items():
             file[name] = array
-    return {"arrays": {name: list(array.shape) for name, array in truth.items()}}
+    notes: dict[str, Any] = {"arrays": {name: list(array.shape) for name, array in truth.items()}}
+    if (flags := draw_flags(effect, observation, truth)) is not None:
+        notes["flagged_fraction"] = float(flags.mean())
+        if flags.shape[2] > 1 and flags.any():
+            notes["warnings"] = [
+                f"effect {effect.label!r} flags {100 * flags.mean():.2g} % of the samples: spectra with gaps mix "
+                "delays, and what is left of the foregrounds leaks beyond the wedge"
+            ]
+    return notes
 
 
 def read_truth(folder: Path) -> dict[str, np.ndarray]:
@@ -141,10 +156,13 @@ def multiply_gains(job: Job) -> Mapping[str, Any]:
     from calstudy.instrument.telescope import make_template
 
     template = make_template(job.settings["instrument"])
-    product = np.ones((template.telescope.Nants, template.Nfreqs, 1, template.Npols), dtype=complex)
+    factors = [read_truth(folder)["gains"] for folder in job.inputs.values()]
+    # Gains that hold for the whole run have a single time.
+    n_times = max((gains.shape[2] for gains in factors), default=1)
+    product = np.ones((template.telescope.Nants, template.Nfreqs, n_times, template.Npols), dtype=complex)
     rows = antenna_rows(template)
-    for folder in job.inputs.values():
-        product[rows] *= read_truth(folder)["gains"]
+    for gains in factors:
+        product[rows] *= gains
     make_uvcal(template, product).write_calh5(job.output / GAINS)
     return {}
 
@@ -153,13 +171,18 @@ def measure_levels(job: Job) -> Mapping[str, Any]:
     """Write the scales of EoR and noise to levels.json."""
     from calstudy.base.visibilities import to_cube
     from calstudy.corrupt.levels import rms, set_levels
+    from calstudy.corrupt.noise import radiometer_std
 
     measured = {
         name: rms(to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))) if name in job.inputs else 0.0
         for name in ("foregrounds", "eor")
     }
-    found = asdict(set_levels(measured["foregrounds"], measured["eor"], job.settings["corruption"]))
-    write_json(job.output / LEVELS, found)
+    settings = job.settings["corruption"]
+    noise = settings.noise
+    radiometer = radiometer_std(noise, job.settings["instrument"]) if isinstance(noise, RadiometerNoise) else None
+    levels = set_levels(measured["foregrounds"], measured["eor"], settings, radiometer)
+    write_json(job.output / LEVELS, levels.as_json())
+    found = replace(levels, noise_spectrum=None).as_json()
     return {"levels_jy": found, "warnings": _floor_warnings(job)}
 
 
@@ -178,12 +201,15 @@ def _floor_warnings(job: Job) -> list[str]:
 
 
 def corrupt(job: Job) -> Mapping[str, Any]:
-    """Write the sum of F, S and N, or of those that are asked for, after all effects, to data.uvh5."""
+    """Write the sum of F, S and N, or of those that are asked for, after all effects, to data.uvh5.
+
+    The flags of all effects are set in all data, whether effects happen to them or not.
+    """
     import numpy as np
 
     from calstudy.base.observation import Observation
-    from calstudy.base.visibilities import from_cube, to_cube
-    from calstudy.corrupt.interface import apply_effect
+    from calstudy.base.visibilities import flag_cube, from_cube, to_cube
+    from calstudy.corrupt.interface import apply_effect, draw_flags
     from calstudy.corrupt.levels import Levels, rms
     from calstudy.corrupt.noise import thermal_noise
     from calstudy.instrument.telescope import make_template
@@ -196,24 +222,50 @@ def corrupt(job: Job) -> Mapping[str, Any]:
         if name in components:
             cube += factor * to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))
     if "noise" in components:
-        cube += thermal_noise(cube.shape, found.noise_std, job.settings["noise_seed"])
+        cube += thermal_noise(cube.shape, found.noise, job.settings["noise_seed"])
     observation = Observation(template)
-    for place, effect in enumerate(job.settings.get("effects", ())):
-        cube = apply_effect(effect, cube, observation, read_truth(job.inputs[f"truth{place:03d}"]))
-    write_visibilities(from_cube(template, cube), job.output / DATA, single=True)
-    return {"rms_jy": rms(cube)}
+    flags = np.zeros(cube.shape, dtype=bool)
+    for place, effect in enumerate(job.settings.get("effects", job.settings.get("flagged_by", ()))):
+        truth = read_truth(job.inputs[f"truth{place:03d}"])
+        if "effects" in job.settings:
+            cube = apply_effect(effect, cube, observation, truth)
+        if (flagged := draw_flags(effect, observation, truth)) is not None:
+            flags |= flagged
+    data = from_cube(template, cube)
+    flag_cube(data)[:] = flags
+    write_visibilities(data, job.output / DATA, single=True)
+    notes: dict[str, Any] = {"rms_jy": rms(cube)}
+    if flags.any():
+        notes["flagged_fraction"] = float(flags.mean())
+    return notes
 
 
 def _cost_of_corruption(task: Task) -> Cost:
-    samples = size_of(task).samples
-    return Cost(1 + samples * 1e-7, LIBRARIES_MEMORY + 5 * samples * COMPLEX128, samples * COMPLEX64)
+    size = size_of(task)
+    effects = [effect.cost(size) for effect in task.settings.get("effects", ())]
+    seconds = 1 + size.samples * 1e-7 + sum(cost.seconds for cost in effects)
+    memory = LIBRARIES_MEMORY + 5 * size.samples * COMPLEX128 + max((cost.memory for cost in effects), default=0.0)
+    return Cost(seconds, memory, size.samples * COMPLEX64)
 
 
 def _cost_of_levels(task: Task) -> Cost:
-    return Cost(2, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e3)
+    noise = task.settings["corruption"].noise
+    beam = 10 if isinstance(noise, RadiometerNoise) and noise.effective_area is None else 0
+    return Cost(2 + beam, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e5)
 
 
-DRAW_EFFECT = Stage(name="effect", version=1, make=draw_effect, cost=lambda task: Cost(1, disk=1e6))
-MULTIPLY_GAINS = Stage(name="gains", version=2, make=multiply_gains, cost=lambda task: Cost(1, disk=1e6))
+def _cost_of_gains(task: Task) -> Cost:
+    """Return the cost of gains, which are as many as antennas, channels and, where they drift, integrations."""
+    size = size_of(task)
+    effects = (
+        [task.settings["effect"]] if "effect" in task.settings else [t.settings["effect"] for t in task.needs.values()]
+    )
+    times = size.times if any(getattr(effect, "drift", None) is not None for effect in effects) else 1
+    disk = size.antennas * size.channels.count * times * size.polarizations * COMPLEX128
+    return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, 1e6 + disk)
+
+
+DRAW_EFFECT = Stage(name="effect", version=1, make=draw_effect, cost=_cost_of_gains)
+MULTIPLY_GAINS = Stage(name="gains", version=2, make=multiply_gains, cost=_cost_of_gains)
 MEASURE_LEVELS = Stage(name="levels", version=2, make=measure_levels, cost=_cost_of_levels)
 CORRUPT = Stage(name="corrupt", version=2, make=corrupt, cost=_cost_of_corruption)

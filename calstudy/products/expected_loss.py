@@ -68,11 +68,15 @@ def expect(job: Job) -> Mapping[str, Any]:
     problem = make_problem(prepared, settings, slice(0, 1), 0)
     fitted = read_gains(job.inputs["calibration"])
     if isinstance(problem, str) or fitted.flags[index].any():
-        raise InputError(f"expected-loss: integration {index} was not calibrated in all antennas and channels")
+        raise InputError(
+            f"expected-loss: integration {index} was not calibrated in all antennas and channels, and flagged data are "
+            "not supported"
+        )
     model = to_cube(read_visibilities(job.inputs["calibration"] / MODEL))[index, ..., 0]
     frequency = np.asarray(data.freq_array, float)
     modes = DelayModes(frequency, power.taper)
-    expected = expected_transfer(problem, fitted.of(prepared.data.numbers)[index], model, modes, job.settings["probes"])
+    gains = fitted.at(index, prepared.data.numbers)
+    expected = expected_transfer(problem, gains, model, modes, job.settings["probes"])
     cosmology, centre = make_cosmology(power.cosmology), float(frequency.mean())
     lengths = prepared.data.lengths
     binned = bin_expected(

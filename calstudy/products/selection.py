@@ -10,7 +10,7 @@ import numpy as np
 from pyuvdata import UVCal, UVData
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import antenna_pairs, to_cube
+from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
 from calstudy.calibrate.degeneracy import align
 from calstudy.instrument import settings as section
 from calstudy.instrument.layouts import Layout, make_layout
@@ -28,7 +28,7 @@ class Gains:
     frequency
         Channel centres, Hz, (Nfreqs,).
     values
-        Complex, (Ntimes, Nants, Nfreqs); one time stands for all.
+        Complex, (Ntimes, Nants, Nfreqs), or (1, Nants, Nfreqs) for gains that hold for the whole run.
     flags
         Where there is no solution, of the same shape.
     """
@@ -38,9 +38,14 @@ class Gains:
     values: np.ndarray
     flags: np.ndarray
 
-    def of(self, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Return the gains of some antennas, (Ntimes, len(numbers), Nfreqs)."""
-        return self.values[:, np.searchsorted(self.numbers, numbers)]
+    def at(self, integration: int, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Return the gains of some antennas at one integration of the run, (len(numbers), Nfreqs)."""
+        time = 0 if len(self.values) == 1 else integration
+        return self.values[time, np.searchsorted(self.numbers, numbers)]
+
+    def over(self, n_times: int, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Return the gains of some antennas at all integrations of the run, (n_times, len(numbers), Nfreqs)."""
+        return np.stack([self.at(integration, numbers) for integration in range(n_times)])
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class AlignedGains:
     numbers, frequency
         Antenna numbers (Nants,) and channel centres (Nfreqs,), Hz.
     true, fitted
-        Complex, (Nants, Nfreqs).
+        Complex, (Nants, Nfreqs); zero where there is no solution.
     scale
         What the fitted gains were multiplied by; the fitted model is to be divided by its square.
     """
@@ -92,13 +97,11 @@ def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGai
         If this integration has no solution.
     """
     truth, fit = read_gains(true), read_gains(fitted)
-    if fit.flags[integration].any():
-        raise InputError(
-            f"outputs.inspect.integration = {integration}: it was not calibrated in all antennas and channels; "
-            "choose one that was"
-        )
-    reference = truth.of(fit.numbers)[0]
-    aligned, scale = align(fit.values[integration], reference)
+    used = ~fit.flags[integration]
+    if not used.any():
+        raise InputError(f"outputs.inspect.integration = {integration}: it was not calibrated; choose one that was")
+    reference = np.where(used, truth.at(integration, fit.numbers), 0)
+    aligned, scale = align(np.where(used, fit.values[integration], 0), reference)
     return AlignedGains(fit.numbers, fit.frequency, reference, aligned, scale)
 
 
@@ -120,6 +123,39 @@ def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
     found = [tuple(pair) for pair in antenna_pairs(uvd).tolist()]
     cube = to_cube(uvd)[..., 0]
     return np.stack([cube[:, found.index(tuple(pair))] for pair in pairs])
+
+
+def read_used(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Read which samples of single baselines are unflagged, bool, (len(pairs), Ntimes, Nfreqs); see `read_spectra`."""
+    uvd = UVData.from_file(path, file_type="uvh5", bls=list(pairs), run_check=False)
+    found = [tuple(pair) for pair in antenna_pairs(uvd).tolist()]
+    used = ~flag_cube(uvd)[..., 0]
+    return np.stack([used[:, found.index(tuple(pair))] for pair in pairs])
+
+
+def require_used(used: np.ndarray, numbers: Sequence[int], integration: int) -> None:
+    """Refuse to show what is flagged in all channels.
+
+    Parameters
+    ----------
+    used
+        Unflagged channels of an antenna or a baseline, bool, (Nfreqs,).
+    numbers
+        Its antenna numbers.
+    integration
+        Counted from 0.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    if not used.any():
+        named = " or ".join(map(str, numbers))
+        raise InputError(
+            f"outputs.inspect: integration {integration} has no data or no solution of antenna {named}; choose another "
+            "integration, or other antennas"
+        )
 
 
 def layout_of(settings: section.Layout) -> Layout:

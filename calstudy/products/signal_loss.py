@@ -109,9 +109,9 @@ def measure_flux_scale(job: Job) -> Mapping[str, Any]:
     ratios = []
     for parity in PARITIES:
         fitted = read_gains(job.inputs[parity])
-        true = np.ones(fitted.values.shape[1:])
+        true = np.ones(fitted.values.shape)
         if "gains" in job.inputs:
-            true = read_gains(job.inputs["gains"]).of(fitted.numbers)[0]
+            true = read_gains(job.inputs["gains"]).over(len(fitted.values), fitted.numbers)
         ratios.append(gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values)))
     scale = flux_scale(ratios[0], ratios[1], make_taper(job.settings["taper"], fitted.frequency.size) ** 2)
     write_json(job.output / SCALE, {"flux_scale": scale if math.isfinite(scale) else None})

@@ -22,8 +22,9 @@ from calstudy.calibrate.problem import FitStructure, gain_products
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import ForegroundFit
 from calstudy.products import corruption, simulation
-from calstudy.products.files import GAINS, VISIBILITIES, read_visibilities
+from calstudy.products.files import VISIBILITIES, read_visibilities
 from calstudy.products.graph import Graph
+from calstudy.products.selection import read_gains
 from calstudy.run.task import Task
 from calstudy.validation.measurement import Inputs, Measurement, required
 
@@ -48,7 +49,7 @@ class SingleIntegration:
     noise_std
         Of the complex noise of one sample, Jy.
     true_gains
-        (Nants, Nfreqs), in the order of the fit's antennas.
+        Of this integration, (Nants, Nfreqs), in the order of the fit's antennas.
     """
 
     foregrounds: UVData
@@ -67,14 +68,14 @@ class SingleIntegration:
         settings, frame = inputs.calibration(experiment), Observation(foregrounds)
         if not isinstance(settings, ForegroundFit):
             raise InputError(f"{settings.label}: the measurement needs a calibrator with foregrounds, such as calamity")
-        cal = UVCal.from_file(inputs.folder(experiment, "gains") / GAINS)
+        gains = read_gains(inputs.folder(experiment, "gains"))
         return cls(
             foregrounds=foregrounds,
             structure=make_structure(frame, settings),
             numbers=frame.numbers,
             settings=settings,
             noise_std=inputs.levels(experiment).noise_std,
-            true_gains=cal.gain_array[np.searchsorted(cal.ant_array, frame.numbers), :, 0, 0],
+            true_gains=gains.at(0, frame.numbers),
         )
 
     def first(self, antennas: int | None, channels: int | None) -> SingleIntegration:

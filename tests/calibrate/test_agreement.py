@@ -28,10 +28,13 @@ def smooth(rng, n_spectra, spread):
     return values / np.sqrt(np.mean(np.abs(values) ** 2, axis=1, keepdims=True))
 
 
-@pytest.fixture
-def truth() -> Truth:
+@pytest.fixture(params=["constant", "drifting"])
+def truth(request) -> Truth:
+    """A measurement whose gains are constant, or change by half their value and by radians during the run."""
     rng = np.random.default_rng(41)
-    gains = 1 + 0.1 * np.sqrt(2) * complex_normal(rng, len(ENU), FREQUENCY.size)
+    gains = np.repeat(1 + 0.1 * np.sqrt(2) * complex_normal(rng, 1, len(ENU), FREQUENCY.size), N_TIMES, axis=0)
+    if request.param == "drifting":
+        gains *= np.exp(np.cumsum(complex_normal(np.random.default_rng(40), N_TIMES, len(ENU), 1), axis=0) / 3)
     horizon = LENGTHS / 299792458.0
     foregrounds = np.stack([10 * smooth(rng, len(PAIRS), 0.8 * horizon) for _ in range(N_TIMES)])
     noise = 0.01 * complex_normal(rng, *foregrounds.shape)
@@ -40,7 +43,7 @@ def truth() -> Truth:
 
 def fit(truth: Truth, gains: np.ndarray | None = None, model: np.ndarray | None = None) -> Fit:
     """A fit with R = V / (g g*) - F for the given gains (Ntimes, Nants, Nfreqs) and model, the true ones by default."""
-    gains = np.repeat(truth.gains[None], N_TIMES, axis=0) if gains is None else gains
+    gains = truth.gains if gains is None else gains
     model = truth.foregrounds if model is None else model
     return Fit(gains, model, truth.data / BASELINES.gain_products(gains) - model)
 
@@ -88,7 +91,7 @@ def test_the_truth_agrees_with_itself_down_to_the_noise(truth):
 def test_phase_and_scale_of_a_fit_count_as_fitted_but_not_when_aligned(truth):
     rng = np.random.default_rng(43)
     turned = truth.gains * np.exp(1j * rng.uniform(0, 6, FREQUENCY.size)) * 1.2
-    found = values(truth, fit(truth, np.repeat(turned[None], N_TIMES, axis=0), truth.foregrounds / 1.44))
+    found = values(truth, fit(truth, turned, truth.foregrounds / 1.44))
     assert found["gains_raw"] > 0.5
     assert found["model_raw"] == pytest.approx(1 - 1 / 1.44)
     assert found["gains_aligned"] == pytest.approx(0, abs=1e-12)
@@ -98,7 +101,7 @@ def test_phase_and_scale_of_a_fit_count_as_fitted_but_not_when_aligned(truth):
 
 def test_white_gain_errors_are_measured_at_their_size_and_fill_the_correction(truth):
     rng = np.random.default_rng(44)
-    gains = truth.gains * (1 + 0.05 * complex_normal(rng, N_TIMES, *truth.gains.shape))
+    gains = truth.gains * (1 + 0.05 * complex_normal(rng, *truth.gains.shape))
     found = values(truth, fit(truth, gains))
     assert found["gains_aligned"] == pytest.approx(0.05, rel=0.1)
     # g g*/(ĝ ĝ*) - 1 = -(eta_a + eta_b*): sqrt(2) x 0.05, over a relative noise of 1e-3.
@@ -106,12 +109,43 @@ def test_white_gain_errors_are_measured_at_their_size_and_fill_the_correction(tr
     assert found["product_over_noise"] > 30
 
 
+def test_gaps_do_not_change_what_is_measured(truth):
+    """Flagged channels and integrations of an antenna are zero in all that is compared."""
+    known = np.ones(truth.gains.shape, bool)
+    known[:, :, [7, 100, 101, 250]] = False
+    known[2, 3] = False
+    used = known[:, PAIRS[:, 0]] & known[:, PAIRS[:, 1]]
+    gaps = Truth(known * truth.gains, used * truth.foregrounds, used * truth.noise, used * truth.data)
+    rng = np.random.default_rng(44)
+    gains = known * truth.gains * (1 + 0.05 * complex_normal(rng, *truth.gains.shape))
+    products = BASELINES.gain_products(gains)
+    residual = np.divide(gaps.data, products, out=np.zeros_like(gaps.data), where=used) - gaps.foregrounds
+    found = values(gaps, Fit(gains, gaps.foregrounds, residual))
+    assert np.isfinite(list(found.values())).all()
+    assert found["gains_aligned"] == pytest.approx(0.05, rel=0.1)
+    assert found["correction_over_noise_outside"] == pytest.approx(np.sqrt(2) * 0.05 / 1e-3, rel=0.1)
+    assert found["model_raw"] == 0
+
+
+def test_gains_that_stay_as_they_were_at_first_are_charged_with_the_drift():
+    """A phase of 0.1 t of every second antenna, seen against fits that know only the gains at the first time."""
+    rng = np.random.default_rng(46)
+    foregrounds, noise = complex_normal(rng, 2, N_TIMES, len(PAIRS), FREQUENCY.size)
+    turns = np.exp(0.1j * np.arange(N_TIMES)[:, None] * (-1.0) ** np.arange(len(ENU)))
+    gains = turns[..., None] * np.ones(FREQUENCY.size)
+    drifting = Truth(gains, foregrounds, noise, BASELINES.gain_products(gains) * (foregrounds + noise))
+    constant = Fit(np.ones_like(gains), foregrounds, noise)
+    # Every antenna is 0.1 t off the common phase, and the best real scale is cos(0.1 t).
+    expected = np.abs(np.cos(0.1 * np.arange(N_TIMES)) - np.exp(0.1j * np.arange(N_TIMES)))
+    assert values(drifting, constant)["gains_aligned"] == pytest.approx(np.median(expected), rel=1e-6)
+
+
 def test_smooth_errors_common_to_gains_and_model_cancel_in_the_product(truth):
     """The paper's degeneracy: 10 % errors of gains and model, none of their product."""
     rng = np.random.default_rng(45)
     error = 1 + 0.1 * smooth(rng, len(ENU), np.full(len(ENU), 30e-9)).real
     model = truth.foregrounds / BASELINES.gain_products(error)
-    found = values(truth, fit(truth, np.repeat((truth.gains * error)[None], N_TIMES, axis=0), model))
+    found = values(truth, fit(truth, truth.gains * error, model))
     assert 0.05 < found["gains_aligned"] < 0.15
     assert 0.05 < found["model_aligned"] < 0.3
     assert found["product_over_noise"] == pytest.approx(1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from observations import small_instrument
 from pydantic import ValidationError
 from pyuvdata.utils import uvcalibrate
 
@@ -187,11 +188,12 @@ def test_flagged_gains_of_a_file_count_as_unity(template, tmp_path):
     assert np.count_nonzero(gains != 5) == 1
 
 
-def test_gains_that_change_in_time_or_are_delays_are_refused(template, tmp_path):
+def test_gains_of_another_number_of_times_or_delays_are_refused(template, tmp_path):
     shape = (template.Nants_telescope, template.Nfreqs, template.Ntimes, template.Npols)
     make_uvcal(template, np.ones(shape, complex)).write_calh5(tmp_path / "g.calh5")
-    with pytest.raises(InputError, match="'file-gains': its gains vary in time, which is not supported yet"):
-        draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))
+    other = Observation(make_template(small_instrument(times={"count": 5})))
+    with pytest.raises(InputError, match="holds gains for 3 times; it must hold them for one, or for each of the 5"):
+        draw_truth(FileGains(path=tmp_path / "g.calh5"), other)
     delays = make_uvcal(template, np.ones((*shape[:2], 1, shape[3]), complex))
     delays.cal_type = "delay"
     with pytest.raises(InputError, match="holds delay solutions"):

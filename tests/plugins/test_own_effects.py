@@ -132,7 +132,7 @@ class Words(Effect):
 
 class Drifting(GainEffect):
     def gains(self, observation, random):
-        return np.ones((observation.n_antennas, observation.n_channels, observation.n_times, 1), complex)
+        return np.ones((observation.n_antennas, observation.n_channels, observation.n_times + 1, 1), complex)
 """
 
 
@@ -144,7 +144,10 @@ class Drifting(GainEffect):
         ("Short", r"effect 'Short': apply returned an array of complex128 of shape \(1, 2, 32, 1\), expected"),
         ("Spoiling", "effect 'Spoiling': apply returned visibilities that are not finite"),
         ("Words", "effect 'Words': 'note' of its truth is an array of <U6"),
-        ("Drifting", "effect 'Drifting': its gains vary in time, which is not supported yet"),
+        (
+            "Drifting",
+            r"effect 'Drifting': its gains are complex128 of shape \(7, 32, 3, 1\), expected complex of shape",
+        ),
     ],
 )
 def test_what_it_does_wrong_is_said_in_a_sentence(tmp_path, monkeypatch, name, told):

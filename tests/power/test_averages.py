@@ -82,6 +82,18 @@ def test_units_are_baselines_or_groups(estimated):
     np.testing.assert_allclose(spectra.k_parallel, estimated.get_kparas(0), rtol=1e-6)
 
 
+def test_gaps_in_frequency_leave_the_power_of_white_data_as_it_is(observe, white, beam):
+    """The estimator weighs flagged channels zero, and divides by the weights that are left."""
+    template = observe(MwaLayout(kind="mwa-compact-minredundant", count=24), n_channels=32)
+    data = white(template, np.random.default_rng(10))
+    whole = delay_spectra(estimate_power(data, data, beam, SETTINGS), SETTINGS)
+    data.flag_array[:, [3, 11, 12, 20]] = True
+    data.data_array[:, [3, 11, 12, 20]] = 1e6
+    gaps = delay_spectra(estimate_power(data, data, beam, SETTINGS), SETTINGS)
+    # 276 baselines of about 16 independent delays: the mean of a power is known to 1 / sqrt(4416) = 1.5 %.
+    assert gaps.power.real.mean() == pytest.approx(whole.power.real.mean(), rel=0.06)
+
+
 def test_flagged_baselines_are_left_out(observe, white, beam):
     template, rng = (
         observe(MwaLayout(kind="mwa-compact-minredundant", count=5), n_channels=16),

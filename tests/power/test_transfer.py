@@ -142,9 +142,11 @@ def test_the_flux_scale_is_what_gains_multiply_a_white_signal_by(rng):
 def test_the_flux_scale_is_that_of_the_gains_whatever_their_noise_phases_and_gaps(rng):
     antennas, times = 12, 5
     true = 1 + 0.1 * (rng.normal(size=(antennas, CHANNELS)) + 1j * rng.normal(size=(antennas, CHANNELS)))
+    # They drift by their own size and by radians during the run.
+    true = true * np.exp(np.cumsum(rng.normal(size=(times, antennas, 2)) @ [[1], [1j]], axis=0) / 2)
     ratios = []
     for _ in range(2):
-        fitted = np.repeat(true[None], times, axis=0) * np.sqrt(1.05)
+        fitted = true * np.sqrt(1.05)
         fitted *= np.exp(2j * np.pi * rng.random((times, 1, CHANNELS)))
         fitted *= 1 + 0.02 * (rng.normal(size=fitted.shape) + 1j * rng.normal(size=fitted.shape))
         fitted[2, 3], fitted[:, 5, :7], fitted[0, 0, 1] = np.nan, np.nan, 0

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class PerChannelGains(GainEffect):
-    """g = 1 + sigma (n + i n'), independent per antenna and channel, constant in time (paper §Simulations)."""
+    """g = 1 + sigma (n + i n'), independent per antenna and channel (paper §Simulations)."""
 
     sigma: float = Field(0.1, ge=0, le=10)
     seed: int = Field(5, ge=0)

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from calstudy.calibrate.settings import FirstOrderSettings, GainFit, Solver
 from calstudy.claims.paper import Paper
-from calstudy.corrupt.settings import NoNoise
+from calstudy.corrupt.settings import NoNoise, RadiometerNoise
 from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def _other_gains(role: str, experiment: Experiment) -> str | None:
 
 def _other_noise(role: str, experiment: Experiment) -> str | None:
     noise, wanted = experiment.corruption.noise, "times-foregrounds" if role == "low_snr" else "times-eor"
-    if isinstance(noise, NoNoise) or noise.kind != wanted:
+    if isinstance(noise, NoNoise | RadiometerNoise) or noise.kind != wanted:
         return f"corruption.noise is {noise.kind!r}, not {wanted!r}"
     papers = NOISE_FACTORS[wanted]
     averaged = noise.factor / papers * (PAPER_TIMES / experiment.instrument.times.count) ** 0.5

@@ -77,8 +77,8 @@ def noise_power(instrument: InstrumentSettings, power: PowerSettings, levels: Le
     channels = instrument.channels
     frequencies = channels.first + channels.width * np.arange(channels.count)
     omega_p, omega_pp = make_beam(instrument.beam, channels).solid_angles(frequencies, instrument.polarizations[0])
-    sigma = levels.noise_std / np.sqrt(instrument.times.count)
-    temperature = 1e3 * sigma * kelvin_per_jansky(frequencies, omega_p, None)
+    sigma = levels.noise if levels.noise_spectrum is None else np.array(levels.noise_spectrum)[:, 0]
+    temperature = 1e3 * sigma / np.sqrt(instrument.times.count) * kelvin_per_jansky(frequencies, omega_p, None)
     cosmology = make_cosmology(power.cosmology)
     redshifts = np.asarray(redshift(frequencies))
     volume = cosmology.h**3 * np.array(

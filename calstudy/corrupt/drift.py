@@ -1,0 +1,106 @@
+"""How gains change during a run: factors exp(u + i v) of each antenna, with u and v processes in time.
+
+u is the change of ln|g|, that is, the relative change of the amplitude while it is small, and v that of the phase.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.schema import Section, choice
+from calstudy.base.units import Phase, Time
+
+if TYPE_CHECKING:
+    from calstudy.base.observation import Observation
+
+SECONDS_PER_DAY = 86400
+
+
+class _Drift(Section, ABC):
+    """What all drifts have: two independent processes, of amplitude and phase, for every antenna and polarization."""
+
+    amplitude: float = Field(
+        0.01, ge=0, description="Of the relative change of the amplitude of the gains, see the kind."
+    )
+    phase: Phase = Field(0.01, ge=0, description="Of the change of their phase, see the kind.")
+    channels: Literal["common", "independent"] = Field(
+        "common", description="Whether all channels of an antenna change alike, or each by itself."
+    )
+    seed: int = Field(50, ge=0, description="Together with the seed of the effect.")
+
+    def factors(self, observation: Observation, effect_seed: int) -> np.ndarray:
+        """Return what the gains are multiplied by, complex128, shape (Nants, Nfreqs or 1, Ntimes, Npols).
+
+        Parameters
+        ----------
+        observation
+            Antennas, channels, times and polarizations.
+        effect_seed
+            Seed of the effect that drifts. Drifts of two effects are independent if either seed differs.
+        """
+        # A list of seeds gives another stream than any single number does.
+        random = np.random.default_rng([self.seed, effect_seed])
+        seconds = (observation.times - observation.times[0]) * SECONDS_PER_DAY
+        n_channels = observation.n_channels if self.channels == "independent" else 1
+        shape = (2, observation.n_antennas, n_channels, observation.n_polarizations)
+        amplitude, phase = np.moveaxis(self.unit_process(shape, seconds, random), -1, -2)
+        return np.exp(self.amplitude * amplitude + 1j * self.phase * phase)
+
+    @abstractmethod
+    def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Return independent processes of unit amplitude, float64, (*shape, Ntimes).
+
+        Parameters
+        ----------
+        shape
+            Of the processes.
+        seconds
+            Of each integration after the first, (Ntimes,).
+        random
+            Where random numbers come from.
+        """
+
+
+class RandomWalk(_Drift):
+    """A random walk from the drawn gains: normal steps, variances grow linearly in time."""
+
+    kind: Literal["random-walk"]
+    time: Time = Field(100.0, gt=0, description="Time after which the rms change is `amplitude` and `phase`.")
+
+    def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Return walks that start at zero, of variance t / time."""
+        steps = random.standard_normal((*shape, len(seconds)))
+        return np.cumsum(steps * np.sqrt(np.diff(seconds, prepend=seconds[0]) / self.time), axis=-1)
+
+
+class Sinusoid(_Drift):
+    """A sinusoid about the drawn gains, of amplitude `amplitude` and `phase`, with a random start for every antenna."""
+
+    kind: Literal["sinusoid"]
+    period: Time = Field(100.0, gt=0)
+
+    def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Return sinusoids of unit amplitude."""
+        start = random.uniform(0, 2 * np.pi, (*shape, 1))
+        return np.sin(2 * np.pi * seconds / self.period + start)
+
+
+class Jumps(_Drift):
+    """Jumps between integrations at random times, each normal with an rms of `amplitude` and `phase`; they add up."""
+
+    kind: Literal["jumps"]
+    interval: Time = Field(100.0, gt=0, description="Mean time between jumps of an antenna (a Poisson process).")
+
+    def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Return sums of the jumps so far: zero up to the first."""
+        waits = np.diff(seconds, prepend=seconds[0]) / self.interval
+        counts = random.poisson(waits, (*shape[1:], len(seconds)))
+        # The sum of n normal jumps is normal with variance n.
+        return np.cumsum(np.sqrt(counts) * random.standard_normal((*shape, len(seconds))), axis=-1)
+
+
+Drift = Annotated[RandomWalk | Sinusoid | Jumps, Field(discriminator="kind"), choice("kind")]

@@ -1,0 +1,50 @@
+"""Channels that an instrument does not deliver."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.units import Frequency
+from calstudy.corrupt.interface import Effect, Truth
+
+if TYPE_CHECKING:
+    from calstudy.base.observation import Observation
+
+
+class ChannelFlags(Effect):
+    """Flags of channels, of all baselines and times: the edges of the band, and of coarse channels and their centres.
+
+    The defaults are those of the MWA, whose coarse channels are centred at multiples of 1.28 MHz and lose 80 kHz at
+    either edge, and the central channel (Offringa et al. 2015).
+    """
+
+    band_edges: Frequency = Field(0.0, ge=0, description="Flagged at either end of the band.")
+    coarse_width: Frequency | None = Field(
+        1.28e6, gt=0, description="Width of coarse channels, which are centred at its multiples; null: there are none."
+    )
+    coarse_edges: Frequency = Field(80e3, ge=0, description="Flagged at either edge of a coarse channel.")
+    coarse_centres: bool = Field(True, description="Whether the channel at the centre of a coarse channel is flagged.")
+
+    def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
+        """Return which channels are flagged, (Nfreqs,)."""
+        del random
+        frequencies = observation.frequencies
+        # Half a channel lies between the outermost centres and the ends of the band. Frequencies are good to 1 Hz.
+        half = (frequencies[-1] - frequencies[0]) / (len(frequencies) - 1) / 2
+        low, high = frequencies[0] - half, frequencies[-1] + half
+        flagged = np.minimum(frequencies - low, high - frequencies) < self.band_edges - 1
+        if self.coarse_width is not None:
+            offset = (frequencies / self.coarse_width + 0.5) % 1 * self.coarse_width - self.coarse_width / 2
+            flagged |= self.coarse_width / 2 - np.abs(offset) < self.coarse_edges - 1
+            if self.coarse_centres:
+                # The upper one of two channels that meet at the centre.
+                flagged |= (offset - half <= 1) & (offset + half > 1)
+        return {"channels": flagged}
+
+    def flags(self, observation: Observation, truth: Truth) -> np.ndarray:
+        """Return the flags, (1, 1, Nfreqs, 1)."""
+        del observation
+        return truth["channels"][None, None, :, None]

@@ -1,0 +1,124 @@
+"""Coupling and crosstalk against their formulas, written out one visibility at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from observations import small_instrument
+from scipy.constants import Boltzmann, speed_of_light
+
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Observation
+from calstudy.corrupt.effects.crosstalk import Crosstalk
+from calstudy.corrupt.effects.mutual_coupling import MutualCoupling
+from calstudy.corrupt.interface import apply_effect, draw_truth
+from calstudy.instrument.telescope import make_template
+
+
+@pytest.fixture(scope="module")
+def observed() -> Observation:
+    """Seven antennas in a hexagon of 14 m, 16 channels, three integrations, two polarizations, without data."""
+    return Observation(make_template(small_instrument(polarizations=["xx", "yy"])))
+
+
+@pytest.fixture
+def cube(observed, rng) -> np.ndarray:
+    return rng.normal(size=observed.shape) + 1j * rng.normal(size=observed.shape)
+
+
+def corrupted(effect, cube, observed) -> np.ndarray:
+    return apply_effect(effect, cube.copy(), observed, draw_truth(effect, observed))
+
+
+@pytest.mark.parametrize("autos", [{}, None])
+def test_coupling_is_the_sum_over_all_third_antennas(observed, cube, autos):
+    effect = MutualCoupling(amplitude=0.03, falloff=1.5, autos=autos)
+    truth = draw_truth(effect, observed)
+    found = apply_effect(effect, cube.copy(), observed, truth)
+    index = {tuple(pair): row for row, pair in enumerate(observed.antennas.tolist())}
+    positions, nu = observed.positions, observed.frequencies
+
+    def coefficient(i, k, channel):
+        length = np.linalg.norm(positions[i] - positions[k])
+        phase = truth["phase"][i, k] - 2 * np.pi * nu[channel] * length / speed_of_light
+        return 0.03 * (14 / length) ** 1.5 * np.exp(1j * phase)
+
+    def visibility(i, j, time, channel, polarization):
+        if i == j:
+            kelvin = 50 + 180 * (nu[channel] / 180e6) ** -2.6
+            return 0 if autos is None else 1e26 * Boltzmann * kelvin / 21.5
+        value = cube[time, index[min(i, j), max(i, j)], channel, polarization]
+        return value if i < j else value.conjugate()
+
+    antennas = range(observed.n_antennas)
+    for place in ((0, 3, 0), (2, 15, 1)):
+        for i, j in index:
+            expected = (
+                visibility(i, j, place[0], *place[1:])
+                + sum(coefficient(i, k, place[1]) * visibility(k, j, *place) for k in antennas if k != i)
+                + sum(coefficient(j, k, place[1]).conjugate() * visibility(i, k, *place) for k in antennas if k != j)
+            )
+            assert found[place[0], index[i, j], place[1], place[2]] == pytest.approx(expected, rel=1e-10)
+
+
+def test_coupling_is_the_first_order_of_voltages_that_antennas_share(observed, rng):
+    """v_i + sum_k e_ik v_k correlated: what is left over is of second order in e."""
+    samples = 400
+    shape = (observed.n_channels, observed.n_antennas, samples)
+    voltages = rng.normal(size=shape) + 1j * rng.normal(size=shape) + 2 * rng.normal(size=(shape[0], 1, samples))
+    first, second = observed.antennas.T
+
+    def correlated(signals):
+        pairs = signals @ signals.conj().swapaxes(1, 2) / samples
+        return pairs, np.repeat(pairs[:, first, second].T[None, ..., None], observed.n_times, axis=0)
+
+    left = []
+    for amplitude in (1e-3, 1e-4):
+        effect = MutualCoupling(amplitude=amplitude, autos=None)
+        truth = draw_truth(effect, observed)
+        turns = truth["delay"] * observed.frequencies[:, None, None]
+        matrix = truth["modulus"] * np.exp(1j * (truth["phase"] - 2 * np.pi * turns))
+        pairs, cube = correlated(voltages)
+        cube = np.repeat(cube, 2, axis=-1)
+        found = apply_effect(effect, cube.copy(), observed, truth)[0, ..., 0]
+        # The autocorrelations that the data do not have.
+        power = np.einsum("faa->fa", pairs)
+        found += (matrix[:, first, second] * power[:, second]).T
+        found += (matrix[:, second, first].conj() * power[:, first]).T
+        exact = correlated(voltages + matrix @ voltages)[1][0, ..., 0]
+        left.append(abs(exact - found).max())
+        assert left[-1] < 1e-2 * abs(exact - cube[0, ..., 0]).max()
+    assert left[0] == pytest.approx(100 * left[1], rel=1e-3)
+
+
+def test_coefficients_are_reciprocal_and_arrive_with_the_delay_of_light(observed):
+    truth = draw_truth(MutualCoupling(), observed)
+    assert truth["phase"] == pytest.approx(truth["phase"].T)
+    neighbours = truth["delay"][0][truth["delay"][0] > 0].min()
+    assert neighbours == pytest.approx(14 / speed_of_light, rel=1e-6)
+    assert truth["modulus"].max() == pytest.approx(1e-3, rel=1e-6)
+    assert (truth["modulus"].diagonal() == 0).all()
+
+
+def test_coupling_needs_all_baselines(observed):
+    part = Observation(make_template(small_instrument()).select(ant_str="0_1,0_2,1_3", inplace=False))
+    with pytest.raises(InputError, match="mutual-coupling: needs the baselines of all pairs of antennas"):
+        corrupted(MutualCoupling(), np.zeros(part.shape, complex), part)
+
+
+def test_crosstalk_is_constant_in_time_with_its_delay_and_its_size():
+    instrument = small_instrument(layout={"kind": "hex", "side": 4}, channels={"count": 64, "width": "400 kHz"})
+    observed = Observation(make_template(instrument))
+    effect = Crosstalk(amplitude="0.2 Jy", delay="700 ns", delay_scatter="20 ns")
+    added = corrupted(effect, np.zeros(observed.shape, complex), observed)
+    assert (added == added[:1]).all()
+    # Each baseline has one size in all channels; 666 baselines.
+    size = abs(added[0, ..., 0])
+    assert np.ptp(size, axis=1) == pytest.approx(0, abs=1e-12)
+    assert np.sqrt(np.mean(size**2)) == pytest.approx(0.2, rel=0.08)
+    steps = np.angle(added[0, :, 1:, 0] * added[0, :, :-1, 0].conj()).mean(axis=1)
+    # One turn per channel is 2.5 us.
+    delays = -steps / (2 * np.pi * 400e3)
+    assert delays.mean() == pytest.approx(700e-9, abs=4e-9)
+    assert delays.std() == pytest.approx(20e-9, rel=0.12)
+    assert abs(np.mean(added[0, :, 0, 0])) < 4 * 0.2 / np.sqrt(len(size))

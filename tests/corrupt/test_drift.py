@@ -1,0 +1,152 @@
+"""Gains that change during a run do so with the statistics that are asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from observations import small_instrument
+from plugin_files import make
+from pydantic import ValidationError
+from tiny import tiny
+
+from calstudy.base.gains import make_uvcal
+from calstudy.base.observation import Observation
+from calstudy.base.visibilities import antenna_indices
+from calstudy.corrupt.effects.file_gains import FileGains
+from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
+from calstudy.corrupt.interface import Effect, apply_effect, draw_truth
+from calstudy.corrupt.settings import CorruptionSettings
+from calstudy.experiment.files import override, validate
+from calstudy.instrument.telescope import make_template
+from calstudy.products import agreement, corruption, signal_loss
+from calstudy.products.files import read_json
+from calstudy.products.graph import Graph
+from calstudy.products.selection import read_gains
+
+SECONDS = 5.0
+TIMES = 60
+
+
+@pytest.fixture(scope="module")
+def observed() -> Observation:
+    """Thirty antennas, twenty channels and sixty integrations of 5 s, two polarizations, without data."""
+    instrument = small_instrument(
+        layout={"kind": "linear", "count": 30},
+        channels={"count": 20},
+        times={"count": TIMES, "integration": f"{SECONDS} s"},
+        polarizations=["xx", "yy"],
+    )
+    return Observation(make_template(instrument))
+
+
+def drifted(observed: Observation, effect: str = "per-channel-gains", **drift: object) -> np.ndarray:
+    """Return u + i v, the logarithm of what gains are multiplied by, (Nants, Nfreqs, Ntimes, Npols)."""
+    block = {"kind": effect, "seed": 3}
+    gains = draw_truth(Effect.registry.make({**block, "drift": drift}), observed)["gains"]
+    return np.log(gains / draw_truth(Effect.registry.make(block), observed)["gains"])
+
+
+def test_the_variance_of_a_random_walk_grows_linearly_from_the_drawn_gains(observed):
+    change = drifted(
+        observed, kind="random-walk", amplitude=0.02, phase="0.04 rad", time="50 s", channels="independent"
+    )
+    assert change.shape == (30, 20, TIMES, 2)
+    assert change[:, :, 0] == pytest.approx(0, abs=1e-15)
+    for part, scale in ((change.real, 0.02), (change.imag, 0.04)):
+        variance = np.var(part, axis=(0, 1, 3))[1:] / (scale**2 * np.arange(1, TIMES) * SECONDS / 50)
+        # 1200 walks: the variance is known to sqrt(2 / 1200) = 4 %.
+        assert abs(variance - 1).max() < 0.17
+        steps = np.diff(part, axis=2)
+        assert abs(np.mean(steps[:, :, 1:] * steps[:, :, :-1])) < 5 * np.var(steps) / np.sqrt(steps.size)
+    assert abs(np.mean(change.real * change.imag)) < 0.15 * np.std(change.real) * np.std(change.imag)
+
+
+def test_channels_drift_alike_unless_they_are_independent(observed):
+    common = drifted(observed, kind="random-walk")
+    assert common == pytest.approx(np.broadcast_to(common[:, :1], common.shape), abs=1e-13)
+    last = drifted(observed, kind="random-walk", channels="independent")[:, :, -1].real
+    correlation = np.mean(last[:, 1:] * last[:, :-1]) / np.var(last)
+    assert abs(correlation) < 5 / np.sqrt(last.size)
+
+
+def test_a_sinusoid_has_its_amplitude_and_its_period(observed):
+    change = drifted(observed, kind="sinusoid", amplitude=0.03, phase="2 deg", period="40 s")[:, 0]
+    angle = 2 * np.pi * np.arange(TIMES) * SECONDS / 40
+    waves = np.stack([np.sin(angle), np.cos(angle)])
+    for part, amplitude in ((change.real, 0.03), (change.imag, np.deg2rad(2))):
+        rows = np.moveaxis(part, 1, -1).reshape(-1, TIMES)
+        fitted, misfit, *_ = np.linalg.lstsq(waves.T, rows.T, rcond=None)
+        # Times are Julian dates, which are good to 4e-5 s.
+        assert np.sqrt(misfit) == pytest.approx(0, abs=1e-4 * amplitude)
+        assert np.hypot(*fitted) == pytest.approx(amplitude, rel=1e-4)
+        starts = np.exp(1j * np.arctan2(*fitted))
+        assert abs(starts.mean()) < 4 / np.sqrt(len(starts))
+
+
+def test_jumps_come_at_their_rate_with_their_size(observed):
+    change = drifted(observed, kind="jumps", amplitude=0.05, phase="0.1 rad", interval="100 s", channels="independent")
+    steps = np.diff(change, axis=2)
+    moved = abs(steps) > 1e-12
+    # The chance of at least one jump in an integration is 1 - exp(-5/100).
+    expected = -np.expm1(-SECONDS / 100)
+    assert moved.mean() == pytest.approx(expected, abs=5 * np.sqrt(expected / moved.size))
+    # The mean number of jumps where there is one is (5 / 100) / expected, and variances add up.
+    crowd = SECONDS / 100 / expected
+    assert np.var(steps.real[moved]) == pytest.approx(0.05**2 * crowd, rel=0.1)
+    assert np.var(steps.imag[moved]) == pytest.approx(0.1**2 * crowd, rel=0.1)
+    assert change[:, :, 0] == pytest.approx(0, abs=1e-15)
+
+
+def test_a_drift_follows_both_seeds_and_every_effect_on_gains_can_have_one(observed):
+    first = drifted(observed, kind="random-walk", seed=1)
+    assert np.array_equal(first, drifted(observed, kind="random-walk", seed=1))
+    assert not np.allclose(first, drifted(observed, kind="random-walk", seed=2))
+    other = drifted(observed, "reflection-gains", kind="random-walk", seed=1)
+    # The same seeds, and another effect: the logarithm of the gains divided by themselves.
+    assert other == pytest.approx(first, abs=1e-12)
+
+
+def test_two_drifts_with_the_same_seeds_are_refused():
+    drifting = {"kind": "file-gains", "path": "x.calh5", "drift": "jumps"}
+    with pytest.raises(ValidationError, match="as that of item 0: what they draw would not be independent"):
+        CorruptionSettings.model_validate({"effects": [drifting, drifting]})
+    channel = {"kind": "per-channel-gains", "drift": "sinusoid"}
+    assert CorruptionSettings.model_validate({"effects": [channel, {"kind": "bandpass", "drift": "sinusoid"}]})
+
+
+def test_visibilities_are_multiplied_by_the_gains_of_their_integration(template, rng):
+    observed = Observation(template)
+    effect = PerChannelGains(drift={"kind": "random-walk", "amplitude": 0.5, "phase": "1 rad", "time": "2 s"})
+    truth = draw_truth(effect, observed)
+    cube = rng.normal(size=observed.shape) + 1j * rng.normal(size=observed.shape)
+    a, b = antenna_indices(template).T
+    expected = np.einsum("bftp,bftp,tbfp->tbfp", truth["gains"][a], truth["gains"][b].conj(), cube)
+    assert abs(np.diff(truth["gains"], axis=2)).min() > 0
+    assert apply_effect(effect, cube.copy(), observed, truth) == pytest.approx(expected, rel=1e-13)
+
+
+def test_a_file_may_hold_gains_for_every_integration(template, rng, tmp_path):
+    shape = (template.Nants_telescope, template.Nfreqs, template.Ntimes, template.Npols)
+    gains = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    make_uvcal(template, gains).write_calh5(tmp_path / "g.calh5")
+    assert np.array_equal(draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))["gains"], gains)
+
+
+def test_a_run_with_drifting_gains_is_compared_with_the_gains_of_each_integration(tmp_path):
+    """The complete sky model recovers gains that change by a third between two integrations, and the flux scale.
+
+    CALAMITY would not: amplitudes that all channels share are in its foreground models as well.
+    """
+    drift = {"kind": "random-walk", "amplitude": 0.4, "phase": "0.5 rad", "time": "10 s"}
+    effects = [{"kind": "per-channel-gains"}, {"kind": "bandpass", "drift": drift}]
+    data = override(override(tiny(tmp_path), "corruption.effects", effects), "calibration.calibrator", "sky-based")
+    graph = Graph(validate(data, tmp_path))
+    tasks = [agreement.agreement(graph), signal_loss._flux_scale(graph), corruption.gains(graph)]
+    products = [make([task], tmp_path)[task.key].path for task in tasks]
+    true = read_gains(products[2])
+    assert len(true.values) == 2
+    assert np.median(abs(true.values[1] / true.values[0] - 1)) > 0.3
+    found = read_json(products[0] / agreement.AGREEMENT)["measurements"]
+    # EoR and noise are 1e-4 and 2e-4 of the data.
+    assert found["gains_aligned"]["value"] < 1e-3
+    assert read_json(products[1] / signal_loss.SCALE)["flux_scale"] == pytest.approx(1, abs=1e-3)
