@@ -9,11 +9,11 @@ from astropy.utils import iers
 from pyuvdata import Telescope, UVData
 from pyuvdata import utils as uvutils
 
-from calstudy.instrument.layouts import Layout, make_layout
+from calstudy.instrument.layouts import Layout, make_array
 from calstudy.instrument.settings import InstrumentSettings
 
-# Noon UTC of 2016 November 15; the observation starts within the sidereal day after it. At the MWA the field of the
-# paper (LST 1.8 h) is then up at night, and the Earth's orientation is known, not predicted.
+# Noon UTC of 2016 November 15; the observation starts within the sidereal day after it, wherever the array is. At the
+# MWA the field of the paper (LST 1.8 h) is then up at night, and the Earth's orientation is known, not predicted.
 REFERENCE_JD = 2457708.0
 SECONDS_PER_DAY = 86400.0
 SIDEREAL_DAY = 0.99726956633
@@ -52,7 +52,7 @@ def make_template(settings: InstrumentSettings, autos: bool = False) -> UVData:
     InputError
         If the layout's file cannot be used.
     """
-    layout = make_layout(settings.layout)
+    layout = make_array(settings)
     first, second = np.triu_indices(len(layout.numbers), 0 if autos else 1)
     times, channels = settings.times, settings.channels
     start = time_of_lst(times.start_lst, layout.location)

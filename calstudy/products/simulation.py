@@ -11,6 +11,7 @@ from calstudy.products.files import VISIBILITIES, read_visibilities, write_json,
 from calstudy.products.graph import Graph, once
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
+from calstudy.simulate.nodes import node_counts
 from calstudy.sky.settings import Eor
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ TOLERATED = 100
 """Interpolation errors up to this times the tolerance, which bounds a typical one, go without a warning."""
 
 SOURCES = 546_000
-TIME_NODES, FREQUENCY_NODES = 16, 96
 
 
 @once
@@ -135,15 +135,14 @@ def _as_json(floor: DelayFloor) -> dict[str, Any]:
 
 def _cost_of_chunk(task: Task) -> Cost:
     instrument, simulation, sky = (task.settings[name] for name in ("instrument", "simulation", "sky"))
-    size, nodes = Size.of(instrument), simulation.nodes.enabled
-    channels = size.channels.count
+    size, channels = Size.of(instrument), instrument.channels.count
     pieces = min(simulation.chunks, channels)
-    times = min(size.times, TIME_NODES) if nodes else size.times
+    times, frequencies = node_counts(instrument, simulation.nodes)
     if isinstance(sky, Eor):
         sources, spectral = 12 * sky.nside**2, channels / simulation.chunks
     else:
         sources, spectral = min(getattr(sky, "count", None) or SOURCES, SOURCES), 0.0
-        channels = min(channels, FREQUENCY_NODES) if nodes else channels
+        channels = frequencies
     work = SimulationSize(sources, times * channels / pieces, size.antennas, 1 + len(instrument.antenna_beams))
     engine = simulation.engine.cost(work)
     disk = size.samples / size.channels.count * channels / pieces * COMPLEX128
