@@ -100,6 +100,18 @@ def parse_wavenumber(value: Any) -> float:
     return float(match[1])
 
 
+def parse_fraction(value: Any) -> float:
+    """Turn ``"15 %"`` or the number 0.15 into the float 0.15; raises PydanticCustomError for anything else."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if not math.isfinite(value):
+            raise _fail(value, "is not finite")
+        return float(f"{value:.15g}")
+    match = NUMBER.match(value) if isinstance(value, str) else None
+    if match is None or match[2] not in ("", "%"):
+        raise _fail(value, 'is not a fraction: write for example "15 %" or 0.15')
+    return float(f"{float(match[1]) / (100 if match[2] else 1):.15g}")
+
+
 def _field(validate: Callable[[Any], float], unit: str, example: str) -> Any:
     return Annotated[
         float,
@@ -123,4 +135,5 @@ Angle = _quantity("deg", "0.5 deg")
 Memory = _quantity("byte", "6 GB")
 HourAngle = _field(parse_hour_angle, "h", "1.8 h")
 Wavenumber = _field(parse_wavenumber, "h/Mpc", "0.2 h/Mpc")
+Fraction = Annotated[float, BeforeValidator(parse_fraction, json_schema_input_type=str)]
 Decibel = _field(parse_decibel, "dB", "-40 dB")

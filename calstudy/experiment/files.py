@@ -16,6 +16,8 @@ from calstudy.base.plugins import load_function
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
+from calstudy.instrument.distinct_beams import nominal_beams
+from calstudy.instrument.interface import model_of
 from calstudy.instrument.size import antenna_count
 
 
@@ -240,13 +242,23 @@ def _require_function(experiment: Experiment) -> None:
 def _require_known_antennas(experiment: Experiment) -> None:
     count = antenna_count(experiment.instrument.layout)
     named = {"outputs.inspect": [place for pair in experiment.outputs.inspect.pairs for place in pair]}
-    for name, group in experiment.instrument.antenna_beams.items():
+    instrument = experiment.instrument
+    for name, group in instrument.antenna_beams.items():
         named[f"instrument.antenna_beams.{name}.antennas"] = list(group.antennas)
+    for name, tiles in instrument.as_built.dipoles.dead.items():
+        named[f"instrument.as_built.dipoles.dead.{name}.antennas"] = list(tiles.antennas)
+    if instrument.as_built.beams.swapped:
+        named["instrument.as_built.beams.swapped"] = list(instrument.as_built.beams.swapped)
     faults = [
         f"{field}: names antenna {max(places)}, but the layout has {count} antennas, counted from 0"
         for field, places in named.items()
         if max(places) >= count
     ]
+    without = [model_of(beam) for beam in nominal_beams(instrument) if not model_of(beam).dipoles]
+    if instrument.as_built.dipoles.differ and without:
+        faults.append(
+            f"instrument.as_built.dipoles: the beam {without[0].label!r} has no dipoles; use 'mwa-embedded-element'"
+        )
     if faults:
         raise ExperimentError(faults)
 

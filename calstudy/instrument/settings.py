@@ -11,6 +11,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
+from calstudy.instrument.as_built import AsBuilt
 
 
 class Site(Section):
@@ -219,14 +220,20 @@ class InstrumentSettings(Section):
         ("xx",), description="Linear polarizations, calibrated independently: xx (east-west dipoles), yy, or both."
     )
 
+    as_built: AsBuilt = AsBuilt()
+
     @property
     def site(self) -> Site | Coordinates:
         """Where the array is."""
         return Site(kind=self.layout.site) if self.location is None else self.location
 
+    def nominal(self) -> InstrumentSettings:
+        """Return the instrument as designed: what calibrators and figures take it for."""
+        return self.reset("as_built")
+
     def without_beams(self) -> InstrumentSettings:
-        """Return the instrument with the default beam: for what reads antennas, channels and times only."""
-        return self.reset("beam", "antenna_beams")
+        """Return the nominal instrument with the default beam: for what reads antennas, channels and times only."""
+        return self.reset("beam", "antenna_beams", "as_built")
 
     @model_validator(mode="after")
     def _polarizations_are_unique(self) -> InstrumentSettings:
