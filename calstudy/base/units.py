@@ -101,15 +101,11 @@ def parse_wavenumber(value: Any) -> float:
 
 
 def parse_fraction(value: Any) -> float:
-    """Turn ``"15 %"`` or the number 0.15 into the float 0.15; raises PydanticCustomError for anything else."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if not math.isfinite(value):
-            raise _fail(value, "is not finite")
-        return float(f"{value:.15g}")
+    """Turn ``"5 %"`` into the fraction 0.05; a number without the percent sign is refused."""
     match = NUMBER.match(value) if isinstance(value, str) else None
-    if match is None or match[2] not in ("", "%"):
-        raise _fail(value, 'is not a fraction: write for example "15 %" or 0.15')
-    return float(f"{float(match[1]) / (100 if match[2] else 1):.15g}")
+    if match is None or match[2] != "%":
+        raise _fail(value, 'is not a percentage: write for example "5 %"')
+    return float(f"{float(match[1]) / 100:.15g}")
 
 
 def _field(validate: Callable[[Any], float], unit: str, example: str) -> Any:
@@ -131,9 +127,15 @@ Delay = _quantity("s", "100 ns")
 Length = _quantity("m", "14 m")
 FluxDensity = _quantity("Jy", "50 mJy")
 PowerDensity = _quantity("K2 Mpc3", "12482.356 K2 Mpc3")
-Angle = _quantity("deg", "0.5 deg")
 Memory = _quantity("byte", "6 GB")
 HourAngle = _field(parse_hour_angle, "h", "1.8 h")
+Angle = _quantity("rad", "10 arcsec")
+Degrees = _quantity("deg", "0.5 deg")
+Fraction = Annotated[
+    float,
+    BeforeValidator(parse_fraction, json_schema_input_type=str),
+    PlainSerializer(lambda value: f"{100 * value:.15g} %", return_type=str),
+    Field(json_schema_extra={"unit": "%", "example": "5 %"}),
+]
 Wavenumber = _field(parse_wavenumber, "h/Mpc", "0.2 h/Mpc")
-Fraction = Annotated[float, BeforeValidator(parse_fraction, json_schema_input_type=str)]
 Decibel = _field(parse_decibel, "dB", "-40 dB")

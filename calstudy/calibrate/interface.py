@@ -150,6 +150,12 @@ class Calibrator(Plugin):
     chunks: int = Field(
         4, ge=1, description="Pieces of consecutive integrations; the unit of resuming and of work sharing."
     )
+    assumed: dict[str, Any] = Field(
+        default_factory=dict,
+        description="What the calibrator takes for granted that is not true: fields of `sky.foregrounds` and "
+        "`instrument` (dotted path: value), from which its sky model is simulated; or `sky_model: PATH`, a file of "
+        "visibilities. Empty: the sky model is the true foregrounds.",
+    )
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return in one sentence why data cannot be calibrated, or None if they can.

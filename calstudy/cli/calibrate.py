@@ -175,7 +175,8 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
 
 
 def _load(paths: list[Path], sky_path: Path | None, selection: Any) -> tuple[UVData, UVData | None, list[str]]:
-    from calstudy.observed.reading import match_sky_model, prepare, read_visibilities
+    from calstudy.calibrate.sky_model import match_sky_model
+    from calstudy.observed.reading import prepare, read_visibilities
     from calstudy.observed.selection import Selection
 
     data, notes = prepare(read_visibilities(paths), selection)

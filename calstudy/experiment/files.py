@@ -14,11 +14,14 @@ from pydantic import BaseModel, ValidationError
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.plugins import load_function
 from calstudy.calibrate.interface import CALIBRATORS
+from calstudy.experiment.assumed import FIELD, SKY_MODEL, AssumedWorld, assumed_changes, assumed_world, value_at
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.distinct_beams import nominal_beams
 from calstudy.instrument.interface import model_of
+from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.size import antenna_count
+from calstudy.sky.settings import SkySettings
 
 
 class _Loader(yaml.SafeLoader):
@@ -94,7 +97,7 @@ def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     """Return a copy of `data` with the field at the dotted path set to `value`.
 
     Items of a list are counted from 0: ``corruption.effects.0.sigma``. A list that the data do not have starts as the
-    default of an experiment.
+    default of an experiment. Keys of the data may themselves be dotted paths, as those of ``calibration.assumed`` are.
 
     Parameters
     ----------
@@ -107,20 +110,33 @@ def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     """
     result = deepcopy(dict(data))
     block: dict | list = result
-    *parents, last = path.split(".")
-    for place, step in enumerate(parents):
+    above: list[str] = []
+    rest = path.split(".")
+    while True:
+        step, rest = _split(block, rest)
         key = _key(block, step, path)
+        if not rest:
+            block[key] = value
+            return result
+        above += step.split(".")
         inner = block.get(key) if isinstance(block, dict) else block[key]
         if isinstance(inner, str):
-            inner = {TAGS.get(step, "kind"): inner}
+            inner = {TAGS.get(above[-1], "kind"): inner}
         elif inner is None:
-            inner = (_default_items(parents[: place + 1]) if path.split(".")[place + 1].isdigit() else None) or {}
+            inner = (_default_items(above) if rest[0].isdigit() else None) or {}
         elif not isinstance(inner, dict | list):
             raise InputError(f"{path}: cannot be set, for {step!r} is {inner!r} and not a block of keys")
         block[key] = inner
         block = inner
-    block[_key(block, last, path)] = value
-    return result
+
+
+def _split(block: dict | list, steps: list[str]) -> tuple[str, list[str]]:
+    """Split the steps of a path after the first; or, where a block has a dotted key of several steps, after them."""
+    if isinstance(block, dict):
+        for count in range(len(steps), 1, -1):
+            if ".".join(steps[:count]) in block:
+                return ".".join(steps[:count]), steps[count:]
+    return steps[0], steps[1:]
 
 
 def _key(block: dict | list, step: str, path: str) -> Any:
@@ -202,65 +218,116 @@ def expand_user(path: Path, field: str) -> Path:
 
 def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> Experiment:
     """Make the paths of input files absolute, relative ones from `base`, and check that they can be read."""
+    resolved = _absolute(data, experiment, experiment.sky, base)
+    resolved_experiment = Experiment.model_validate(resolved, context={"folder": base})
+    _require_function(resolved_experiment.sky)
+    for name in ("store", "runs"):
+        expand_user(getattr(experiment.outputs, name), f"outputs.{name}")
+    inspected = [place for pair in experiment.outputs.inspect.pairs for place in pair]
+    _require_known_antennas(resolved_experiment.instrument, {"outputs.inspect": inspected})
+    return resolved_experiment
+
+
+def _absolute(
+    data: dict[str, Any], section: BaseModel, sky: SkySettings, base: Path, prefix: str = ""
+) -> dict[str, Any]:
+    """Return data with absolute paths of input files; raises ExperimentError if one is not there.
+
+    Parameters
+    ----------
+    data
+        Plain values.
+    section
+        The same, validated.
+    sky
+        The sky that belongs to it.
+    base
+        Where relative paths start.
+    prefix
+        Path of the section in the experiment file, with a dot at the end, or empty.
+    """
     faults, resolved = [], data
-    if experiment.sky.foregrounds.kind == "gleam" and experiment.sky.foregrounds.path is None:
+    if sky.foregrounds.kind == "gleam" and sky.foregrounds.path is None:
         from calstudy.sky.gleam import default_path
 
         resolved = override(resolved, "sky.foregrounds.path", str(default_path()))
         if not default_path().is_file():
             raise ExperimentError(
                 [
-                    f"sky.foregrounds: GLEAM is not on this machine (looked for {default_path()}); get it with "
+                    f"{prefix}sky.foregrounds: GLEAM is not on this machine (looked for {default_path()}); get it with "
                     "'calstudy data fetch gleam', give a file under sky.foregrounds.path, or use 'g4jy-and-counts'"
                 ]
             )
-    for path, section, field in input_files(experiment):
-        target = getattr(section, field)
-        file = base / expand_user(target, path)
+    for path, block, field in input_files(section):
+        target = getattr(block, field)
+        file = base / expand_user(target, f"{prefix}{path}")
         resolved = override(resolved, path, str(file.resolve()))
         if not file.is_file():
-            faults.append(f"{path} = {str(target)!r}: no such file (looked for {file})")
+            faults.append(_no_file(f"{prefix}{path}", target, file))
     if faults:
         raise ExperimentError(faults)
-    resolved_experiment = Experiment.model_validate(resolved, context={"folder": base})
-    _require_function(resolved_experiment)
-    for name in ("store", "runs"):
-        expand_user(getattr(experiment.outputs, name), f"outputs.{name}")
-    _require_known_antennas(resolved_experiment)
-    return resolved_experiment
+    return resolved
 
 
-def _require_function(experiment: Experiment) -> None:
-    foregrounds = experiment.sky.foregrounds
-    if foregrounds.kind == "code":
+def _no_file(field: str, given: Any, file: Path) -> str:
+    return f"{field} = {str(given)!r}: no such file (looked for {file})"
+
+
+def _require_function(sky: SkySettings, prefix: str = "") -> None:
+    if sky.foregrounds.kind == "code":
         try:
-            load_function(foregrounds.path, foregrounds.function)
+            load_function(sky.foregrounds.path, sky.foregrounds.function)
         except InputError as error:
-            raise ExperimentError([f"sky.foregrounds: {error}"]) from None
+            raise ExperimentError([f"{prefix}sky.foregrounds: {error}"]) from None
 
 
-def _require_known_antennas(experiment: Experiment) -> None:
-    count = antenna_count(experiment.instrument.layout)
-    named = {"outputs.inspect": [place for pair in experiment.outputs.inspect.pairs for place in pair]}
-    instrument = experiment.instrument
-    for name, group in instrument.antenna_beams.items():
-        named[f"instrument.antenna_beams.{name}.antennas"] = list(group.antennas)
-    for name, tiles in instrument.as_built.dipoles.dead.items():
-        named[f"instrument.as_built.dipoles.dead.{name}.antennas"] = list(tiles.antennas)
+def _require_known_antennas(
+    instrument: InstrumentSettings, named: Mapping[str, Sequence[int]], prefix: str = ""
+) -> None:
+    """Raise ExperimentError if `named`, or a set of antennas with another beam, names one that is not there."""
+    count = antenna_count(instrument.layout)
+    groups = {
+        f"{prefix}instrument.antenna_beams.{name}.antennas": group.antennas
+        for name, group in instrument.antenna_beams.items()
+    } | {
+        f"{prefix}instrument.as_built.dipoles.dead.{name}.antennas": tiles.antennas
+        for name, tiles in instrument.as_built.dipoles.dead.items()
+    }
     if instrument.as_built.beams.swapped:
-        named["instrument.as_built.beams.swapped"] = list(instrument.as_built.beams.swapped)
+        groups[f"{prefix}instrument.as_built.beams.swapped"] = instrument.as_built.beams.swapped
     faults = [
         f"{field}: names antenna {max(places)}, but the layout has {count} antennas, counted from 0"
-        for field, places in named.items()
+        for field, places in {**named, **groups}.items()
         if max(places) >= count
     ]
     without = [model_of(beam) for beam in nominal_beams(instrument) if not model_of(beam).dipoles]
     if instrument.as_built.dipoles.differ and without:
-        faults.append(
-            f"instrument.as_built.dipoles: the beam {without[0].label!r} has no dipoles; use 'mwa-embedded-element'"
-        )
+        field = f"{prefix}instrument.as_built.dipoles"
+        faults.append(f"{field}: the beam {without[0].label!r} has no dipoles; use 'mwa-embedded-element'")
     if faults:
         raise ExperimentError(faults)
+
+
+def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
+    """Check what the calibrator assumes, and make the paths of input files in it absolute."""
+    changes = assumed_changes(experiment.calibration.assumed)
+    if not changes:
+        return experiment
+    prefix = f"{FIELD}."
+    if SKY_MODEL in changes:
+        file = base / expand_user(Path(changes[SKY_MODEL]), f"{prefix}{SKY_MODEL}")
+        if not file.exists():
+            raise ExperimentError([_no_file(f"{prefix}{SKY_MODEL}", changes[SKY_MODEL], file)])
+        resolved = {SKY_MODEL: file.resolve()}
+    else:
+        world = assumed_world(experiment, base)
+        content = _absolute(world.model_dump(mode="json"), world, world.sky, base, prefix)
+        resolved_world = AssumedWorld.model_validate(content)
+        _require_known_antennas(resolved_world.instrument, {}, prefix)
+        _require_function(resolved_world.sky, prefix)
+        resolved = {path: value_at(content, path) for path in changes}
+    calibration = experiment.calibration.model_copy(update={"assumed": resolved})
+    return experiment.model_copy(update={"calibration": calibration})
 
 
 def validate(data: Mapping[str, Any], base: Path) -> Experiment:
@@ -283,7 +350,7 @@ def validate(data: Mapping[str, Any], base: Path) -> Experiment:
         experiment = Experiment.model_validate(plain, context={"folder": base})
     except ValidationError as error:
         raise ExperimentError(sentences(error, Experiment, plain)) from None
-    return _resolve_files(plain, experiment, base)
+    return _resolve_assumed(_resolve_files(plain, experiment, base), base)
 
 
 def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Experiment:

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.schema import Section, fault
-from calstudy.base.units import Angle, Fraction, Length
+from calstudy.base.units import Degrees, Fraction, Length
 
 DIPOLES = 16
 FEEDS = ("x", "y")
@@ -79,10 +79,10 @@ class BeamErrors(Section):
     turned without it.
     """
 
-    pointing_scatter: Angle = Field(
+    pointing_scatter: Degrees = Field(
         0.0, ge=0, lt=45, description="Standard deviation of the tilt of an antenna towards east, and towards north."
     )
-    rotation_scatter: Angle = Field(
+    rotation_scatter: Degrees = Field(
         0.0, ge=0, lt=45, description="Standard deviation of the rotation of an antenna about the vertical."
     )
     width_scatter: Fraction = Field(

@@ -10,7 +10,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, choice, fault
-from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
+from calstudy.base.units import Degrees, Frequency, HourAngle, Length, Time
 from calstudy.instrument.as_built import AsBuilt
 
 
@@ -24,8 +24,8 @@ class Coordinates(Section):
     """A site by its coordinates on the WGS84 ellipsoid."""
 
     kind: Literal["coordinates"]
-    latitude: Angle = Field(ge=-90, le=90, description="North is positive.")
-    longitude: Angle = Field(ge=-180, le=360, description="East is positive.")
+    latitude: Degrees = Field(ge=-90, le=90, description="North is positive.")
+    longitude: Degrees = Field(ge=-180, le=360, description="East is positive.")
     height: Length = Field(0.0, gt=-1e4, lt=1e5, description="Above the ellipsoid.")
 
 

@@ -49,6 +49,10 @@ def read_calibrator(
         calibrator = CALIBRATORS.make(content, DEFAULT)
     except ValidationError as error:
         raise ExperimentError([f"calibration.{sentence}" for sentence in sentences(error, found, content)]) from None
+    if calibrator.assumed:
+        raise InputError(
+            "calibration.assumed: is for simulated data; give the sky model of measured ones by --sky-model"
+        )
     for field, section, name in input_files(calibrator):
         if not (file := getattr(section, name)).exists():
             raise InputError(f"calibration.{field} = {str(file)!r}: no such file")

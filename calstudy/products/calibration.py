@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of
 from calstudy.experiment.model import Variant
-from calstudy.products import corruption, simulation
+from calstudy.products import corruption, sky_model
 from calstudy.products.files import (
     DATA,
     GAINS,
@@ -43,12 +43,13 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
         "even" or "odd".
     """
     data = corruption.data(graph, variant, parity)
-    settings = graph.experiment.calibration
+    # What is assumed decides the sky model, which is an input, and nothing else.
+    settings = graph.experiment.calibration.reset("assumed")
     solves = -(-graph.experiment.instrument.times.count // settings.integrations_per_solve)
     count = min(settings.chunks, solves)
     inputs = {"data": data}
-    if (foregrounds := simulation.foregrounds(graph)) is not None:
-        inputs["sky_model"] = foregrounds
+    if (model := sky_model.sky_model(graph)) is not None:
+        inputs["sky_model"] = model
     chunks = {
         f"chunk{index:03d}": Task(
             CALIBRATE_CHUNK,
@@ -83,11 +84,10 @@ def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     index, count, settings = (job.settings[name] for name in ("index", "count", "calibration"))
     together = settings.integrations_per_solve
     data = _integrations(read_visibilities(job.inputs["data"] / DATA), index, count, together)
-    sky_model = None
+    sky = None
     if "sky_model" in job.inputs:
-        sky_model = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
-        sky_model = _integrations(sky_model, index, count, together)
-    result = run_calibrator(settings, data, sky_model)
+        sky = _integrations(read_visibilities(job.inputs["sky_model"] / VISIBILITIES), index, count, together)
+    result = run_calibrator(settings, data, sky)
     result.gains.write_calh5(job.output / GAINS)
     for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
         write_visibilities(uvd, job.output / name, single=True)

@@ -9,7 +9,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.cost import FIRST_ORDER_STEP, PAPER_SAMPLES
 from calstudy.experiment.model import Variant
-from calstudy.products import corruption, simulation
+from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA, VISIBILITIES, read_visibilities, write_json
 from calstudy.products.graph import Graph, size_of
@@ -49,10 +49,10 @@ def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
     inputs["eor"] = corruption.data(graph, Variant(components=("eor",)), "even")
     if variant.effects:
         inputs["gains"] = corruption.gains(graph)
-    if (foregrounds := simulation.foregrounds(graph)) is not None:
-        inputs["sky_model"] = foregrounds
+    if (model := sky_model.sky_model(graph)) is not None:
+        inputs["sky_model"] = model
     settings = {
-        "calibration": experiment.calibration.model_copy(update={"solver": solver}),
+        "calibration": experiment.calibration.reset("assumed").model_copy(update={"solver": solver}),
         "integration": integration,
         "steps": list(experiment.outputs.convergence.steps),
         "buffer": experiment.power.wedge_buffer,

@@ -9,7 +9,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
-from calstudy.products import calibration, corruption, simulation
+from calstudy.products import calibration, corruption, sky_model
 from calstudy.products.files import DATA, MODEL, VISIBILITIES, read_visibilities
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
@@ -28,10 +28,10 @@ def expected_loss(graph: Graph) -> Task:
         "data": corruption.data(graph, residual, "even"),
         "calibration": calibration.calibration(graph, residual, "even"),
     }
-    if (foregrounds := simulation.foregrounds(graph)) is not None:
-        inputs["sky_model"] = foregrounds
+    if (model := sky_model.sky_model(graph)) is not None:
+        inputs["sky_model"] = model
     settings = {
-        "calibration": graph.experiment.calibration,
+        "calibration": graph.experiment.calibration.reset("assumed"),
         "power": graph.experiment.power.reset("pairs", "redundancy_tolerance"),
         "integration": graph.experiment.instrument.times.count // 2,
         "probes": PROBES,

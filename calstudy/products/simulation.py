@@ -13,14 +13,16 @@ from calstudy.products.graph import Graph, once
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
 from calstudy.simulate.nodes import node_counts
-from calstudy.sky.settings import Eor
+from calstudy.sky.counts import FAINTEST, expected_sources
+from calstudy.sky.settings import Eor, PointSources
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
+    from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.component import Component
     from calstudy.simulate.floor import DelayFloor
-    from calstudy.sky.settings import Foregrounds
+    from calstudy.sky.settings import Foregrounds, SkySettings
 
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
@@ -37,21 +39,37 @@ DIPOLE_SECONDS, DIPOLE_MEMORY = 20.0, 1.0e9
 @once
 def foregrounds(graph: Graph) -> Task | None:
     """Return the task of the foreground visibilities F, or None if the sky has none."""
-    settings = graph.experiment.sky.foregrounds
-    return None if settings.kind == "none" else _simulation(graph, "foregrounds", settings)
+    return foregrounds_of(graph, "foregrounds", graph.experiment.sky, graph.experiment.instrument)
+
+
+def foregrounds_of(graph: Graph, label: str, sky: SkySettings, instrument: InstrumentSettings) -> Task | None:
+    """Return the task of the foregrounds of any sky through any instrument, or None if the sky has none.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment whose section `simulation` is used.
+    label
+        What the product is.
+    sky, instrument
+        In place of the experiment's own.
+    """
+    if sky.foregrounds.kind == "none":
+        return None
+    return _simulation(graph, label, {"instrument": instrument, "sky": sky.foregrounds})
 
 
 @once
 def eor(graph: Graph) -> Task:
     """Return the task of the EoR visibilities S, in absolute units."""
-    return _simulation(graph, "eor", graph.experiment.sky.eor)
-
-
-def _simulation(graph: Graph, component: str, sky: Foregrounds | Eor) -> Task:
     experiment = graph.experiment
-    settings: dict[str, Any] = {"instrument": experiment.instrument, "simulation": experiment.simulation, "sky": sky}
-    if isinstance(sky, Eor):
-        settings["cosmology"] = experiment.power.cosmology
+    settings = {"instrument": experiment.instrument, "sky": experiment.sky.eor, "cosmology": experiment.power.cosmology}
+    return _simulation(graph, "eor", settings)
+
+
+def _simulation(graph: Graph, component: str, settings: Mapping[str, Any]) -> Task:
+    experiment = graph.experiment
+    settings = {**settings, "simulation": experiment.simulation}
     count = min(experiment.simulation.chunks, experiment.instrument.channels.count)
     pieces = {
         f"chunk{index:03d}": Task(
@@ -146,7 +164,7 @@ def _cost_of_chunk(task: Task) -> Cost:
     if isinstance(sky, Eor):
         sources, spectral = 12 * sky.nside**2, channels / simulation.chunks
     else:
-        sources, spectral = min(getattr(sky, "count", None) or SOURCES, SOURCES), 0.0
+        sources, spectral = _sources(sky), 0.0
         channels = frequencies
     beams = len(set(assigned_beams(instrument, size.antennas)))
     engine = simulation.engine.cost(SimulationSize(sources, times * channels / pieces, size.antennas, beams))
@@ -161,6 +179,14 @@ def _cost_of_chunk(task: Task) -> Cost:
         seconds += DIPOLE_SECONDS
         memory += DIPOLE_MEMORY
     return Cost(seconds, memory, disk)
+
+
+def _sources(sky: Foregrounds) -> int:
+    """Estimate the number of sources of the foregrounds, from the counts of sources above the flux limit."""
+    if not isinstance(sky, PointSources):
+        return SOURCES
+    expected = int(expected_sources(max(sky.flux_limit, FAINTEST)))
+    return max(min(sky.count or expected, expected), 1)
 
 
 def _cost(task: Task) -> Cost:

@@ -100,12 +100,13 @@ def read_contents(folder: Path) -> Contents:
     products = manifest.get("products", [])
     experiment = folder / EXPERIMENT
     text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
+    sky_model = f" Sky model: {manifest['sky_model']}." if "sky_model" in manifest else ""
     tables = [
         _claims(folder, products),
         _summary(folder),
         _realizations(folder),
-        _signal_loss(folder),
-        _convergence(products),
+        _signal_loss(folder, sky_model),
+        _convergence(products, sky_model),
         _simulation(products),
         _stages(products),
     ]
@@ -143,6 +144,7 @@ def _description(experiment: str) -> str:
 
 def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
     facts = {"finished": manifest.get("finished"), "commit": manifest.get("git_commit")}
+    facts["sky model of the calibrator"] = manifest.get("sky_model")
     machine = manifest.get("machine", {})
     if machine:
         facts["machine"] = f"{machine['cores']} cores, {machine['memory_gb']} GB, {machine['system']}"
@@ -227,7 +229,7 @@ def _cell(row: Mapping[str, str], name: str) -> str:
     return "no modes" if value != value else f"{value:.3f} ± {error:.3f}"
 
 
-def _signal_loss(folder: Path) -> Table | None:
+def _signal_loss(folder: Path, sky_model: str) -> Table | None:
     paths = {region: folder / "tables" / f"transfer-bands.{region}.csv" for region in REGIONS}
     if not all(path.is_file() for path in paths.values()):
         return None
@@ -242,7 +244,7 @@ def _signal_loss(folder: Path) -> Table | None:
         "of each baseline with itself it is the fraction of the power that is retained. One standard deviation."
     )
     columns = ("k (h/Mpc)", "T outside the wedge", "squared coherence outside", "T inside the wedge")
-    return Table("Signal loss", columns, rows, note)
+    return Table("Signal loss", columns, rows, note + sky_model)
 
 
 def _summary(folder: Path) -> Table | None:
@@ -281,7 +283,7 @@ def _realizations(folder: Path) -> Table | None:
     return Table("Realizations", columns, rows, note, verdicts=4)
 
 
-def _convergence(products: Sequence[Mapping[str, Any]]) -> Table | None:
+def _convergence(products: Sequence[Mapping[str, Any]], sky_model: str) -> Table | None:
     found = [item for item in products if item["stage"] == "calibrate"]
     rows = [
         (
@@ -293,7 +295,7 @@ def _convergence(products: Sequence[Mapping[str, Any]]) -> Table | None:
         for item in found
     ]
     columns = ("calibration of", "solves", "median steps", "median time per solve")
-    return Table("Solver convergence", columns, rows) if rows else None
+    return Table("Solver convergence", columns, rows, sky_model.strip()) if rows else None
 
 
 def _simulation(products: Sequence[Mapping[str, Any]]) -> Table | None:

@@ -16,7 +16,7 @@ from pyradiosky import SkyModel
 
 from calstudy.base.errors import InputError
 from calstudy.sky.counts import FREQUENCY, SPECTRAL_INDEX
-from calstudy.sky.settings import PointSources
+from calstudy.sky.settings import CatalogueErrors, PointSources
 
 LOG = logging.getLogger(__name__)
 
@@ -128,6 +128,26 @@ def read_gleam_table(path: Path) -> Catalogue:
     measured = np.isfinite(catalogue.flux)
     LOG.info("%s: %d sources, %d of them with a wide-band flux", path, len(catalogue), measured.sum())
     return catalogue.select(measured)
+
+
+def with_errors(sky: SkyModel, errors: CatalogueErrors) -> SkyModel:
+    """Return point sources with errors of flux and position, drawn for one source after the other.
+
+    Parameters
+    ----------
+    sky
+        Points, brightest first; not changed.
+    errors
+        The `errors` block of a catalogue.
+    """
+    flux, offset = (np.random.default_rng(stream) for stream in np.random.SeedSequence(errors.seed).spawn(2))
+    found = sky.copy()
+    factor = errors.flux_scale * (1 + errors.flux_scatter * flux.standard_normal(sky.Ncomponents))
+    found.stokes = sky.stokes * factor
+    if errors.position_scatter:
+        east, north = errors.position_scatter * offset.standard_normal((sky.Ncomponents, 2)).T * units.rad
+        found.skycoord = sky.skycoord.spherical_offsets_by(east, north)
+    return found
 
 
 def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:

@@ -24,6 +24,12 @@ def differential_counts(flux: np.ndarray) -> np.ndarray:
     return scale * 10 ** np.polyval(COEFFICIENTS[::-1], np.log10(flux_then)) * flux_then**-2.5
 
 
+def expected_sources(faint: float, bright: float = BRIGHTEST) -> float:
+    """Return how many sources between two fluxes at 200 MHz, in Jy, the whole sky has on average."""
+    edges = np.geomspace(faint, max(bright, faint), 500)
+    return float(FULL_SKY * np.trapezoid(differential_counts(edges), edges))
+
+
 def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray, np.random.Generator]]:
     """Draw the fluxes of an all-sky population, in bins of flux.
 

@@ -17,7 +17,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.plugins import load_function, user_code
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
-from calstudy.sky.catalogue import Catalogue, brightest, concatenate, read_gleam_table, to_sky_model
+from calstudy.sky.catalogue import Catalogue, brightest, concatenate, read_gleam_table, to_sky_model, with_errors
 from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL_INDEX, draw_population
 from calstudy.sky.csv_catalogue import read_csv_catalogue
 
@@ -25,6 +25,8 @@ LOG = logging.getLogger(__name__)
 
 # G4Jy (White et al. 2020) is complete above about this flux at 200 MHz, south of +30° and away from the Galactic plane.
 COMPLETE_FLUX = 4.0
+# With any higher flux limit the same sources are drawn, so that G4Jy components replace the same ones.
+FAINTEST_DRAWN = 2.0
 COMPLETE_DECLINATION = np.deg2rad(30.0)
 COMPLETE_LATITUDE = np.deg2rad(10.0)
 BRIGHTEST_NOW = BRIGHTEST * (FREQUENCY / COUNTS_FREQUENCY) ** SPECTRAL_INDEX
@@ -63,6 +65,15 @@ def make_foregrounds(settings: section.Foregrounds, frequencies: np.ndarray) -> 
     InputError
         If a catalogue is missing or cannot be used.
     """
+    made = _make(settings, frequencies)
+    if not isinstance(settings, section.PointSources) or settings.errors == section.CatalogueErrors():
+        return made
+    errors = ", ".join(f"{name} {value}" for name, value in settings.errors.model_dump(mode="json").items())
+    stand_in = f"{made.stand_in or 'foregrounds: GLEAM'}; errors: {errors}"
+    return Foregrounds(with_errors(made.sky, settings.errors), stand_in)
+
+
+def _make(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds:
     if isinstance(settings, section.NoSources):
         return Foregrounds(to_sky_model(NOTHING, section.PointSources()), "foregrounds: none")
     if isinstance(settings, section.GleamSources):
@@ -118,7 +129,7 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
 
 def _population(settings: section.SyntheticSources) -> Catalogue:
     right_ascension, declination, flux = draw_population(
-        min(settings.flux_limit, COMPLETE_FLUX), BRIGHTEST_NOW, settings.seed
+        min(settings.flux_limit, FAINTEST_DRAWN), BRIGHTEST_NOW, settings.seed
     )
     order = np.argsort(-flux, kind="stable")
     names = np.char.add("synthetic", np.arange(len(flux)).astype(str))

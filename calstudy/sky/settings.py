@@ -8,9 +8,27 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from calstudy.base.schema import Section, choice, fault
-from calstudy.base.units import FluxDensity, Frequency, PowerDensity
+from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity
 
 VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
+
+
+class CatalogueErrors(Section):
+    """How the sources differ from those of the catalogue: a catalogue with errors, for a calibrator to assume.
+
+    Which sources are kept is decided before. The errors of a source do not depend on how many fainter ones are kept.
+    """
+
+    flux_scale: float = Field(1.0, gt=0, description="All fluxes are multiplied by this.")
+    flux_scatter: Fraction = Field(
+        0.0, ge=0, description="Standard deviation of the relative error of each flux, constant over the band."
+    )
+    position_scatter: Angle = Field(
+        0.0,
+        ge=0,
+        description="Standard deviation of the error of each position, in each of two directions.",
+    )
+    seed: int = Field(31, ge=0, description="Seed of the errors of fluxes and positions.")
 
 
 class PointSources(Section):
@@ -21,6 +39,7 @@ class PointSources(Section):
         "flat", description="The same flux in all channels, as in the paper, or the spectral indices of the catalogue."
     )
     count: int | None = Field(None, ge=1, description="Keep only the brightest `count` sources (all by default).")
+    errors: CatalogueErrors = CatalogueErrors()
 
 
 class GleamSources(PointSources):

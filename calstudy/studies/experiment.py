@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from functools import cached_property
 from pathlib import Path
 from typing import Self
@@ -12,6 +14,7 @@ from calstudy.claims.product import claims
 from calstudy.experiment.files import dump
 from calstudy.experiment.model import Experiment, Outputs
 from calstudy.figures import figure_task, figures_of
+from calstudy.products import sky_model
 from calstudy.products.agreement import agreement
 from calstudy.products.graph import Graph
 from calstudy.products.signal_loss import transfer
@@ -22,6 +25,8 @@ from calstudy.studies.capacity import fit
 from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
 from calstudy.studies.preflight import require_calibration
 from calstudy.studies.study import Budget, Made, Study
+
+SKY_MODEL_TABLE = "sky-model.csv"
 
 
 class ExperimentStudy(Study):
@@ -70,8 +75,17 @@ class ExperimentStudy(Study):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        found = (spectra(self.graph), agreement(self.graph), transfer(self.graph))
+        found = (spectra(self.graph), agreement(self.graph), transfer(self.graph), self._sky_model_error)
         return [task for task in found if task is not None]
+
+    @cached_property
+    def calibrates(self) -> bool:
+        """Whether any variant is calibrated."""
+        return any(variant.calibrate for variant in self.experiment.variants.values())
+
+    @property
+    def _sky_model_error(self) -> Task | None:
+        return sky_model.error(self.graph) if self.calibrates else None
 
     @cached_property
     def claims(self) -> Task | None:
@@ -90,14 +104,25 @@ class ExperimentStudy(Study):
         publish([products[task.key] for task in self.tables], folder / "tables")
         if self.claims is not None:
             publish([products[self.claims.key]], folder)
+        if self.calibrates:
+            write(folder / "tables" / SKY_MODEL_TABLE, self._sky_model_table())
         write(folder / EXPERIMENT, dump(self.experiment))
         fields = {
             "stand_ins": list(self.stand_ins),
+            **({"sky_model": sky_model.described(self.graph)} if self.calibrates else {}),
             "captions": {figure.label: figure.caption for figure in figures_of(self.experiment)},
             "seeds": seeds(self.experiment.model_dump(mode="json")),
             "products": product_entries(self.tasks, made.products, made.tasks),
         }
         write_manifest(folder, self.name, fields)
+
+    def _sky_model_table(self) -> str:
+        """Return as CSV what the calibrator assumes that is not true, below a line that says it in a sentence."""
+        table = io.StringIO()
+        table.write(f"# sky model: {sky_model.described(self.graph)}\n")
+        rows = csv.writer(table, lineterminator="\n")
+        rows.writerows([("field", "true", "assumed"), *sky_model.differences(self.graph)])
+        return table.getvalue()
 
 
 def targets_of(experiment: Experiment) -> list[Task]:

@@ -4,18 +4,41 @@ from __future__ import annotations
 
 import numpy as np
 
+from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.calibrate.execution import require_calibratable
+from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.layouts import make_layout
+from calstudy.instrument.layouts import Layout, make_array, make_layout
 from calstudy.instrument.settings import InstrumentSettings
 
 
 def require_calibration(experiment: Experiment) -> None:
     """Raise InputError if the calibrator refuses the antennas, baselines and channels of an experiment."""
     if any(variant.calibrate for variant in experiment.variants.values()):
-        has_sky_model = experiment.sky.foregrounds.kind != "none"
+        changes, world = assumed_changes(experiment.calibration.assumed), assumed_world(experiment)
+        has_sky_model = SKY_MODEL in changes or world.sky.foregrounds.kind != "none"
         require_calibratable(experiment.calibration, frame_of(experiment.instrument), has_sky_model)
+        places = [(instrument.layout, instrument.site) for instrument in (experiment.instrument, world.instrument)]
+        if places[0] != places[1]:
+            _require_same_antennas(make_array(experiment.instrument), make_array(world.instrument))
+
+
+def _require_same_antennas(true: Layout, assumed: Layout) -> None:
+    """Raise InputError unless an assumed layout has the antennas of the true one at the same site."""
+    field = f"{FIELD}.instrument.layout"
+    if len(true.numbers) != len(assumed.numbers):
+        raise InputError(
+            f"{field}: has {len(assumed.numbers)} antennas; it must have the {len(true.numbers)} of the data"
+        )
+    different = true.numbers != assumed.numbers
+    if different.any():
+        raise InputError(
+            f"{field}: has antenna {assumed.numbers[different][0]} where the data have {true.numbers[different][0]}; "
+            "numbers and their order must be those of the data"
+        )
+    if any(getattr(true.location, axis) != getattr(assumed.location, axis) for axis in "xyz"):
+        raise InputError(f"{field}: is at another site than the data, where the sky is another at the same time")
 
 
 def frame_of(instrument: InstrumentSettings) -> Frame:

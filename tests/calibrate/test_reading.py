@@ -9,7 +9,8 @@ from test_calamity import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
-from calstudy.observed.reading import match_sky_model, prepare, read_visibilities
+from calstudy.calibrate.sky_model import match_sky_model
+from calstudy.observed.reading import prepare, read_visibilities
 from calstudy.observed.selection import Selection, parse_selection, select
 
 

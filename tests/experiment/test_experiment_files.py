@@ -142,7 +142,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ),
         (
             "{name: a, calibration: {calibrator: sky-based, basis: {buffer: 10 ns}}}",
-            "calibration.basis: unknown key (allowed: autos, calibrator,",
+            "calibration.basis: unknown key (allowed: assumed, autos, calibrator,",
         ),
     ],
 )

@@ -49,7 +49,7 @@ def test_draws_have_their_scatter_and_scale_with_it():
 
 def test_dipoles_die_as_often_as_they_should_and_stay_dead_at_higher_fractions():
     tiles = 2000
-    few, more = (dipole_amplitudes(section.DipoleErrors(dead_fraction=fraction), tiles) for fraction in ("5 %", 0.15))
+    few, more = (dipole_amplitudes(section.DipoleErrors(dead_fraction=fraction), tiles) for fraction in ("5 %", "15 %"))
     for amplitudes, fraction in ((few, 0.05), (more, 0.15)):
         low, high = binom.interval(1 - 1e-6, amplitudes.size, fraction)
         assert low <= (amplitudes == 0).sum() <= high

@@ -64,7 +64,7 @@ def faults(path: Path) -> list[str]:
         ({"max_length": "3 Jy"}, "calibration.max_length: '3 Jy' has a unit that cannot be converted to m"),
         ({"max_length": 3}, "calibration.max_length: 3 has no unit"),
         ({"max_length": "-1 m"}, "calibration.max_length = '-1 m': must be greater than 0 m"),
-        ({"factr": 2.0}, "calibration.factr: unknown key, did you mean 'factor'? (allowed: calibrator, chunks, factor"),
+        ({"factr": 2.0}, "calibration.factr: unknown key, did you mean 'factor'? (allowed: assumed, calibrator"),
         ({"chunks": 0}, "calibration.chunks = 0: must be at least 1"),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from calstudy.sky.counts import differential_counts, draw_population
+from calstudy.sky.counts import differential_counts, draw_population, expected_sources
 
 
 def expected(faint, bright):
@@ -65,3 +65,10 @@ def test_flux_limit_only_removes_sources(population):
 def test_seed_decides(population):
     np.testing.assert_array_equal(population[2], draw_population(0.1, 60.0, seed=1)[2])
     assert len(population[2]) != len(draw_population(0.1, 60.0, seed=2)[2])
+
+
+@pytest.mark.parametrize("faint", [0.1, 0.5, 3.0])
+def test_the_expected_number_of_sources_is_that_of_the_drawn_ones(population, faint):
+    """Plans estimate simulations by it. Five standard deviations of a Poisson number, 3 % at most."""
+    drawn = int((population[2] >= faint).sum())
+    assert drawn == pytest.approx(expected_sources(faint), abs=5 * np.sqrt(drawn))

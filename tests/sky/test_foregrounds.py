@@ -263,3 +263,50 @@ def test_failed_download_is_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(downloads.pooch, "retrieve", download)
     with pytest.raises(InputError, match=r"no connection to vizier.*sky\.foregrounds\.path"):
         gleam.fetch_gleam(tmp_path)
+
+
+@pytest.mark.parametrize("limit", ["3.5 Jy", "10 Jy"])
+def test_a_higher_flux_limit_leaves_the_brighter_sources_as_they_are(synthetic, limit):
+    """Also above 2 Jy, where real components replace synthetic sources, and above 4 Jy, where they do no more."""
+    few = make_foregrounds(section.SyntheticSources(flux_limit=limit), FREQUENCIES).sky
+    assert few.Ncomponents > 100
+    np.testing.assert_array_equal(few.name, synthetic.sky.name[: few.Ncomponents])
+    np.testing.assert_array_equal(few.skycoord.ra.deg, synthetic.sky.skycoord.ra.deg[: few.Ncomponents])
+    np.testing.assert_array_equal(flux(few), flux(synthetic.sky)[: few.Ncomponents])
+    assert flux(synthetic.sky)[few.Ncomponents] < float(limit.split()[0])
+
+
+def test_catalogue_errors_have_the_size_that_is_asked_for(synthetic):
+    """Of 20,000 sources: standard deviations are known to 0.5 %, so that 3 % is six of them."""
+    few = section.SyntheticSources(flux_limit="100 mJy", count=20_000)
+    true = make_foregrounds(few, FREQUENCIES).sky
+    errors = section.CatalogueErrors(flux_scale=1.02, flux_scatter="5 %", position_scatter="10 arcsec")
+    wrong = make_foregrounds(few.model_copy(update={"errors": errors}), FREQUENCIES)
+    ratio = flux(wrong.sky) / flux(true)
+    assert ratio.mean() == pytest.approx(1.02, abs=6 * 0.051 / np.sqrt(20_000))
+    assert ratio.std() == pytest.approx(1.02 * 0.05, rel=0.03)
+    east, north = true.skycoord.spherical_offsets_to(wrong.sky.skycoord)
+    for offset in (east, north):
+        assert offset.to_value("arcsec").std() == pytest.approx(10, rel=0.03)
+    assert abs(np.corrcoef(east.deg, north.deg)[0, 1]) < 0.05
+    assert "flux_scatter 5 %" in wrong.stand_in
+    np.testing.assert_array_equal(true.name, wrong.sky.name)
+
+
+def test_errors_of_a_source_do_not_depend_on_the_fainter_ones():
+    errors = section.CatalogueErrors(flux_scatter="5 %", position_scatter="10 arcsec")
+    many, few = (
+        make_foregrounds(section.SyntheticSources(flux_limit="2 Jy", count=count, errors=errors), FREQUENCIES).sky
+        for count in (500, 50)
+    )
+    np.testing.assert_array_equal(flux(few), flux(many)[:50])
+    np.testing.assert_array_equal(few.skycoord.dec.deg, many.skycoord.dec.deg[:50])
+
+
+def test_a_flux_scale_alone_moves_nothing():
+    right, wrong = (
+        make_foregrounds(section.SyntheticSources(flux_limit="5 Jy", errors=errors), FREQUENCIES).sky
+        for errors in (section.CatalogueErrors(), section.CatalogueErrors(flux_scale=1.5))
+    )
+    np.testing.assert_allclose(flux(wrong), 1.5 * flux(right), rtol=1e-14)
+    np.testing.assert_array_equal(wrong.skycoord.ra.deg, right.skycoord.ra.deg)

@@ -116,7 +116,7 @@ def _changed(section: BaseModel, path: str, free: tuple[str, ...] = ()) -> str |
         value, papers = getattr(section, name), field.get_default(call_default_factory=True)
         if name in free or value == papers:
             continue
-        if type(value) is type(papers) and name in written and isinstance(written[name], dict):
+        if isinstance(value, BaseModel) and type(value) is type(papers) and name in written:
             return _changed(value, f"{path}.{name}")
         return f"{path}.{name} is {written[name]}, not the paper's"
     return None

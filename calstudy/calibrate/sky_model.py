@@ -1,0 +1,104 @@
+"""Visibilities of the sky as far as it is known, from a file: brought to the samples and the order of the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import from_cube, to_cube
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+
+def read_sky_model(path: Path, template: UVData) -> UVData:
+    """Return the visibilities of a file at the samples of an observation.
+
+    Parameters
+    ----------
+    path
+        A file or folder in any format of visibilities that pyuvdata reads, in Jy. Antennas are told by their numbers;
+        their positions do not have to be those of the template.
+    template
+        Metadata of the observation: rectangular, time-major, a drift scan.
+
+    Returns
+    -------
+    UVData
+        The template's metadata with the visibilities of the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, lacks baselines, integrations, channels or polarizations of the observation, or has
+        flagged samples or values that are not finite among them.
+    """
+    from pyuvdata import UVData
+
+    try:
+        sky = UVData.from_file(str(path))
+    # Readers of eight formats raise whatever their libraries do; a file that cannot be read is the user's to mend.
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError) as error:
+        raise InputError(f"{path}: cannot be read as visibilities ({type(error).__name__}: {error})") from None
+    if sky.data_array is None:
+        raise InputError(f"{path}: holds no visibilities")
+    if any(entry["cat_type"] != "unprojected" for entry in sky.phase_center_catalog.values()):
+        sky.unproject_phase()
+    sky = match_sky_model(sky, template)
+    if sky.Nblts != template.Nblts:
+        raise InputError(f"{path}: lacks some baselines at some times")
+    bad = sky.flag_array | ~np.isfinite(sky.data_array)
+    if bad.any():
+        raise InputError(f"{path}: {bad.sum()} samples are flagged or not finite; a sky model needs a value in each")
+    order = np.argsort(template.baseline_array[: template.Nbls])
+    cube = np.empty((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), complex)
+    cube[:, order] = to_cube(sky)  # Which is in the order of the baselines' numbers.
+    return from_cube(template, cube)
+
+
+def match_sky_model(sky: UVData, data: UVData) -> UVData:
+    """Return the part of a prepared sky model that belongs to prepared data, in their order.
+
+    Raises
+    ------
+    InputError
+        If baselines, integrations, channels or polarizations of the data are missing from the sky model.
+    """
+    sky = sky.copy()
+    wanted = set(np.unique(data.baseline_array).tolist())
+    reverse = np.array(
+        [data.antnums_to_baseline(int(b), int(a)) for a, b in zip(sky.ant_1_array, sky.ant_2_array, strict=True)]
+    )
+    turned = np.flatnonzero(~np.isin(sky.baseline_array, list(wanted)) & np.isin(reverse, list(wanted)))
+    if turned.size:
+        sky.conjugate_bls(turned)
+    missing = wanted - set(sky.baseline_array.tolist())
+    if missing:
+        a, b = data.baseline_to_antnums(min(missing))
+        raise InputError(f"sky model: lacks {len(missing)} baseline(s) of the data, such as ({a}, {b})")
+    times = [_closest(sky.time_array, time, 1e-6) for time in np.unique(data.time_array)]
+    if None in times:
+        raise InputError("sky model: lacks integrations of the data (times must agree within 0.1 s)")
+    width = float(np.min(data.channel_width))
+    channels = [_closest(sky.freq_array, frequency, 0.1 * width) for frequency in data.freq_array]
+    if None in channels:
+        raise InputError("sky model: lacks channels of the data")
+    if not np.isin(data.polarization_array, sky.polarization_array).all():
+        raise InputError(f"sky model: has polarizations {', '.join(sky.get_pols())}, data {', '.join(data.get_pols())}")
+    rows = np.isin(sky.baseline_array, list(wanted)) & np.isin(sky.time_array, sky.time_array[times])
+    sky.select(blt_inds=np.flatnonzero(rows), freq_chans=channels, polarizations=data.polarization_array)
+    sky.reorder_pols(order=np.argsort(sky.polarization_array)[_ranks(data.polarization_array)], run_check=False)
+    sky.reorder_blts(order="time", minor_order="baseline", run_check=False)
+    return sky
+
+
+def _closest(values: np.ndarray, wanted: float, tolerance: float) -> int | None:
+    index = int(np.abs(values - wanted).argmin())
+    return index if abs(values[index] - wanted) <= tolerance else None
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    return np.argsort(np.argsort(values))

@@ -1,0 +1,128 @@
+"""The sky model that the calibrator is given: the true foregrounds, or what the experiment assumes in their place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.experiment.assumed import SKY_MODEL, assumed_changes, assumed_content, assumed_world, value_at
+from calstudy.experiment.model import Experiment
+from calstudy.instrument.size import Size
+from calstudy.products import simulation
+from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+ERROR = "sky-model.json"
+
+
+@once
+def sky_model(graph: Graph) -> Task | None:
+    """Return the task of the visibilities that the calibrator is given as sky model, or None if it is given none.
+
+    Where the experiment assumes nothing but the truth, it is that of the true foregrounds.
+    """
+    changes = assumed_changes(graph.experiment.calibration.assumed)
+    if SKY_MODEL in changes:
+        path = Path(changes[SKY_MODEL])
+        return Task(READ, path.name, {"path": path, "instrument": graph.experiment.instrument.without_beams()})
+    world, true = assumed_world(graph.experiment), simulation.foregrounds(graph)
+    assumed = simulation.foregrounds_of(graph, "assumed foregrounds", world.sky, world.instrument)
+    return true if assumed is not None and true is not None and assumed.key == true.key else assumed
+
+
+def is_perfect(graph: Graph) -> bool:
+    """Whether the sky model of the calibrator is the true foregrounds."""
+    model = sky_model(graph)
+    return model is not None and model is simulation.foregrounds(graph)
+
+
+@once
+def error(graph: Graph) -> Task | None:
+    """Return the task that measures how far the sky model is from the true foregrounds, or None if it is not."""
+    model, true = sky_model(graph), simulation.foregrounds(graph)
+    if model is None or true is None or is_perfect(graph):
+        return None
+    return Task(MEASURE_ERROR, "sky model against truth", {}, {"foregrounds": true, "sky_model": model})
+
+
+def differences(graph: Graph) -> list[tuple[str, str, str]]:
+    """Return what the calibrator assumes that is not true: field, true value and assumed value as texts."""
+    experiment = graph.experiment
+    changes = assumed_changes(experiment.calibration.assumed)
+    if SKY_MODEL in changes:
+        return [(SKY_MODEL, "the true foregrounds", str(changes[SKY_MODEL]))]
+    true, assumed = assumed_content(experiment, {}), assumed_content(experiment, changes)
+    rows = [
+        (path, _text(value_at(true, path)), _text(value_at(assumed, path)))
+        for path in changes
+        if not path.startswith("instrument.as_built")
+    ]
+    return [row for row in rows if row[1] != row[2]] + _differences_as_built(experiment)
+
+
+def _differences_as_built(experiment: Experiment) -> list[tuple[str, str, str]]:
+    """Return the row of `differences` for the errors of the antennas, which the calibrator does not know by default."""
+    built = [found.as_built for found in (experiment.instrument, assumed_world(experiment).instrument)]
+    true, assumed = ((found.note or "nominal").removeprefix("as built: ") for found in built)
+    return [("instrument.as_built", true, assumed)] if built[0] != built[1] else []
+
+
+def described(graph: Graph) -> str:
+    """Return in a sentence what sky model the calibrator is given."""
+    if sky_model(graph) is None:
+        return "none: the calibrator is given no sky model"
+    if is_perfect(graph):
+        return "perfect: the calibrator is given the true foregrounds"
+    rows = differences(graph)
+    if rows[0][0] == SKY_MODEL:
+        return f"visibilities of {Path(rows[0][2]).name} in place of the true foregrounds"
+    return f"assumed: {'; '.join(f'{path} = {assumed}, where {true} is true' for path, true, assumed in rows)}"
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def read(job: Job) -> Mapping[str, Any]:
+    """Write the visibilities of a file, at the samples of the data, to visibilities.uvh5."""
+    from calstudy.calibrate.sky_model import read_sky_model
+    from calstudy.instrument.telescope import make_template
+
+    sky = read_sky_model(job.settings["path"], make_template(job.settings["instrument"]))
+    write_visibilities(sky, job.output / VISIBILITIES)
+    return {"file": str(job.settings["path"])}
+
+
+def measure_error(job: Job) -> Mapping[str, Any]:
+    """Write the rms of the true foregrounds, of the sky model, and of their difference to sky-model.json, Jy."""
+    from calstudy.base.visibilities import to_cube
+    from calstudy.corrupt.levels import rms
+
+    true, model = (to_cube(read_visibilities(job.inputs[name] / VISIBILITIES)) for name in ("foregrounds", "sky_model"))
+    true_rms, difference = rms(true), rms(model - true)
+    found = {
+        "true_rms_jy": true_rms,
+        "sky_model_rms_jy": rms(model),
+        "difference_rms_jy": difference,
+        "relative_error": difference / true_rms if true_rms else None,
+    }
+    write_json(job.output / ERROR, found)
+    return found
+
+
+def _cost_of_reading(task: Task) -> Cost:
+    disk = Size.of(task.settings["instrument"]).samples * COMPLEX128
+    return Cost(3 + disk * 4e-9, LIBRARIES_MEMORY + 5 * disk, disk)
+
+
+def _cost_of_error(task: Task) -> Cost:
+    samples = size_of(task).samples
+    return Cost(2 + samples * 1e-7, LIBRARIES_MEMORY + 4 * samples * COMPLEX128, 1e3)
+
+
+READ = Stage(name="sky-model", version=1, make=read, cost=_cost_of_reading)
+MEASURE_ERROR = Stage(name="sky-model-error", version=1, make=measure_error, cost=_cost_of_error)
