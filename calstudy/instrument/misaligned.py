@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calstudy.base.errors import InputError
 from calstudy.instrument.as_built import Misalignment
+from calstudy.instrument.beam_grid import fixed_components, polar_components
 from calstudy.instrument.interface import AntennaBeam
 from calstudy.instrument.splines import bspline_coefficients, cells, spline_fields
 from calstudy.instrument.tabulated import tabulate
@@ -136,14 +137,14 @@ def _turned_table(beam: UVBeam, misalignment: Misalignment) -> np.ndarray:
         raise InputError("instrument.as_built.beams: the table of the beam must go all around, from the zenith")
     frame = AntennaFrame(misalignment, *(axis.ravel() for axis in np.meshgrid(azimuth, zenith_angle)))
     # Components in azimuth and zenith angle jump at the zenith; along two fixed directions they are smooth there.
-    table = _spline_table(_fixed_components(beam.data_array, azimuth))
+    table = _spline_table(fixed_components(beam.data_array, azimuth))
     rows = cells(frame.nominal_zenith_angle, np.concatenate([-zenith_angle[MARGIN:0:-1], zenith_angle]))
     columns = cells((frame.azimuth - azimuth[0]) % (2 * np.pi), step * np.arange(len(azimuth) + 1))
     values = np.empty((len(frame.azimuth), table.shape[2]))
     spline_fields(table, *rows, *columns, values)
     shape = (len(frame.azimuth), *beam.data_array.shape[:3])
     fixed = np.moveaxis(values.view(np.complex128).reshape(shape), 0, -1)
-    jones = frame.to_ground(_polar_components(fixed, frame.azimuth)).reshape(beam.data_array.shape)
+    jones = frame.to_ground(polar_components(fixed, frame.azimuth)).reshape(beam.data_array.shape)
     return jones[:, ::-1] if misalignment.swapped else jones
 
 
@@ -159,15 +160,3 @@ def _spline_table(values: np.ndarray) -> np.ndarray:
     along_rows = np.tensordot(bspline_coefficients(len(flat)), flat, axes=1)
     coefficients = spline_filter1d(along_rows, order=3, axis=1, mode="grid-wrap")
     return np.take(coefficients, np.arange(-1, n_columns + 2) % n_columns, axis=1)
-
-
-def _fixed_components(jones: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    """Return the components of J along and across the x feed (Ludwig's third definition), (2, ...)."""
-    sine, cosine = np.sin(azimuth), np.cos(azimuth)
-    return np.stack([cosine * jones[1] - sine * jones[0], sine * jones[1] + cosine * jones[0]])
-
-
-def _polar_components(fixed: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    """Return the azimuth and zenith angle components of what `_fixed_components` returned, (2, ...)."""
-    sine, cosine = np.sin(azimuth), np.cos(azimuth)
-    return np.stack([cosine * fixed[1] - sine * fixed[0], cosine * fixed[0] + sine * fixed[1]])

@@ -53,30 +53,6 @@ def _read_mwa(path: Path, low: float, high: float) -> UVBeam:
         raise InputError(f"instrument.beam.path: {path} cannot be read as an MWA beam file ({error})") from error
 
 
-def read_beamfits(path: Path) -> UVBeam:
-    """Read an E-field beam on a grid of azimuth and zenith angle from a beamfits file.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, cannot be read, or holds another kind of beam.
-    """
-    if not path.is_file():
-        raise InputError(f"instrument.beam.path: there is no file {path}")
-    try:
-        beam = UVBeam.from_file(path, file_type="beamfits")
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"instrument.beam.path: {path} cannot be read as beamfits ({error})") from error
-    usable = beam.beam_type == "efield" and beam.pixel_coordinate_system == "az_za"
-    if not usable or list(beam.feed_array) not in (["x", "y"], ["x"]) or beam.axis2_array[0] != 0:
-        raise InputError(
-            f"instrument.beam.path: {path} must contain an efield beam of feeds x and y on a grid of azimuth and "
-            f"zenith angle from the zenith; it contains a {beam.beam_type} beam of feeds {beam.feed_array} on "
-            f"{beam.pixel_coordinate_system}"
-        )
-    return beam
-
-
 def fit_range(band: tuple[float, float]) -> tuple[float, float]:
     """Return the lowest and highest frequency (Hz) from which a beam is interpolated in a band."""
     low, high = band[0] - FIT_MARGIN, band[1] + FIT_MARGIN
@@ -109,10 +85,13 @@ class TabulatedBeam:
     """
 
     def __init__(self, table: UVBeam, band: tuple[float, float], interpolation: str) -> None:
-        low, high = fit_range(band)
-        chosen = (table.freq_array >= low) & (table.freq_array <= high)
-        tabulated = table.freq_array[chosen]
-        if not chosen.any() or band[0] < tabulated[0] or band[1] > tabulated[-1]:
+        available, (low, high) = table.freq_array, fit_range(band)
+        # A coarse table may have its next frequency beyond the range.
+        start = min(np.searchsorted(available, low), np.searchsorted(available, band[0], side="right") - 1)
+        stop = max(np.searchsorted(available, high, side="right"), np.searchsorted(available, band[1]) + 1)
+        chosen = slice(max(start, 0), stop)
+        tabulated = available[chosen]
+        if start < 0 or stop > len(available):
             raise InputError(
                 f"instrument.channels: {_megahertz(*band)} is not within the beam file's "
                 f"{_megahertz(table.freq_array[0], table.freq_array[-1])}"

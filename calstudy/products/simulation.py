@@ -173,7 +173,7 @@ def _cost_of_chunk(task: Task) -> Cost:
     seconds = 6 + engine.seconds
     if beams > 1:
         # Tables of the beams at the nodes: twice, for sources that stay up and for those that rise or set.
-        seconds += beams * (0.4 + 0.1 * channels / pieces)
+        seconds += beams * (0.4 + 0.16 * channels / pieces)
         memory += beams * (TABLE_MEMORY * size.polarizations * channels / pieces + 2e7)
     if instrument.as_built.dipoles.differ:
         seconds += DIPOLE_SECONDS
