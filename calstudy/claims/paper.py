@@ -68,15 +68,16 @@ def distinct_papers(named: Iterable[Plugin]) -> list[Paper]:
 def stand_ins(experiment: Experiment) -> tuple[str, ...]:
     """Return what must be printed on every figure of an experiment: what stands in for its papers' ingredients.
 
-    If they name nothing, whether the foregrounds are synthetic.
+    If they name nothing, whether the foregrounds are synthetic. And how the instrument as built differs.
     """
     notes: list[str] = []
     for paper in distinct_papers(experiment.papers):
         with guarded(paper):
             notes += paper.substitutions(experiment)
     if not notes and experiment.sky.foregrounds.kind == "g4jy-and-counts":
-        return ("sky: G4Jy bright sources + synthetic faint ones from counts",)
-    return unique_notes(notes)
+        notes.append("sky: G4Jy bright sources + synthetic faint ones from counts")
+    as_built = experiment.instrument.as_built.note
+    return unique_notes([*notes, as_built] if as_built else notes)
 
 
 def unique_notes(notes: Iterable[str]) -> tuple[str, ...]:

@@ -75,6 +75,8 @@ def _flat(block: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]
 def assumed_world(experiment: Experiment, folder: Path | None = None) -> AssumedWorld:
     """Return the sky and the instrument from which the sky model of the calibrator is simulated.
 
+    The instrument is the nominal one, with changes: what `instrument.as_built` says is known to nobody.
+
     Parameters
     ----------
     experiment
@@ -90,7 +92,7 @@ def assumed_world(experiment: Experiment, folder: Path | None = None) -> Assumed
     """
     changes = {path: value for path, value in assumed_changes(experiment.calibration.assumed).items() if "." in path}
     if not changes:
-        return AssumedWorld(sky=experiment.sky, instrument=experiment.instrument)
+        return AssumedWorld(sky=experiment.sky, instrument=experiment.instrument.nominal())
     content = assumed_content(experiment, changes)
     try:
         world = AssumedWorld.model_validate(content, context={"folder": folder})
@@ -108,9 +110,10 @@ def assumed_world(experiment: Experiment, folder: Path | None = None) -> Assumed
 
 
 def assumed_content(experiment: Experiment, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sky and the instrument of an experiment as plain values, with changes (dotted path: value)."""
+    """Return the sky and the nominal instrument of an experiment as plain values, with changes (dotted path: value)."""
     content: dict[str, Any] = {
-        name: getattr(experiment, name).model_dump(mode="json") for name in AssumedWorld.model_fields
+        "sky": experiment.sky.model_dump(mode="json"),
+        "instrument": experiment.instrument.nominal().model_dump(mode="json"),
     }
     for path, value in changes.items():
         block = content

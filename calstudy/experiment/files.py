@@ -17,6 +17,8 @@ from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, AssumedWorld, assumed_changes, assumed_world, value_at
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
+from calstudy.instrument.distinct_beams import nominal_beams
+from calstudy.instrument.interface import model_of
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.size import antenna_count
 from calstudy.sky.settings import SkySettings
@@ -287,12 +289,21 @@ def _require_known_antennas(
     groups = {
         f"{prefix}instrument.antenna_beams.{name}.antennas": group.antennas
         for name, group in instrument.antenna_beams.items()
+    } | {
+        f"{prefix}instrument.as_built.dipoles.dead.{name}.antennas": tiles.antennas
+        for name, tiles in instrument.as_built.dipoles.dead.items()
     }
+    if instrument.as_built.beams.swapped:
+        groups[f"{prefix}instrument.as_built.beams.swapped"] = instrument.as_built.beams.swapped
     faults = [
         f"{field}: names antenna {max(places)}, but the layout has {count} antennas, counted from 0"
         for field, places in {**named, **groups}.items()
         if max(places) >= count
     ]
+    without = [model_of(beam) for beam in nominal_beams(instrument) if not model_of(beam).dipoles]
+    if instrument.as_built.dipoles.differ and without:
+        field = f"{prefix}instrument.as_built.dipoles"
+        faults.append(f"{field}: the beam {without[0].label!r} has no dipoles; use 'mwa-embedded-element'")
     if faults:
         raise ExperimentError(faults)
 

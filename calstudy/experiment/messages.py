@@ -95,7 +95,7 @@ def _unit(holder: type[BaseModel] | None, field: int | str) -> str:
     """Return the unit in which a field's bounds are, with a space before it, or an empty string."""
     info = holder.model_fields.get(str(field)) if holder else None
     extra = info.json_schema_extra if info else None
-    return f" {extra['unit']}" if isinstance(extra, dict) else ""
+    return f" {extra['unit']}" if isinstance(extra, dict) and "unit" in extra else ""
 
 
 def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:

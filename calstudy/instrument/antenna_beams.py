@@ -7,8 +7,12 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from calstudy.base.plugins import guarded
+from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beams import make_beam
-from calstudy.instrument.interface import Beam
+from calstudy.instrument.distinct_beams import AssignedBeam, assigned_beams, nominal_beams
+from calstudy.instrument.interface import AntennaBeam, Beam, model_of
+from calstudy.instrument.misaligned import MisalignedBeam
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -25,12 +29,12 @@ class AntennaBeams:
     Attributes
     ----------
     beams
-        Distinct beams; the first is `instrument.beam`.
+        Distinct beams; the first is `instrument.beam`, as the first antenna that has it is built.
     index
         Index into `beams` for each antenna, in the order of the layout, (Nants,) int.
     """
 
-    beams: tuple[Beam, ...]
+    beams: tuple[AntennaBeam, ...]
     index: np.ndarray
 
     @property
@@ -40,32 +44,49 @@ class AntennaBeams:
         return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
 
 
-def make_beams(settings: InstrumentSettings, n_antennas: int) -> Beam | AntennaBeams:
+def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | AntennaBeams:
     """Return the beam of all antennas, or the beams of an array that has several.
 
     Parameters
     ----------
     settings
-        The `instrument` section. Sets of antennas with equal beams share one.
+        The `instrument` section. Antennas with equal beams, as built, share one.
     n_antennas
         Antennas of the layout.
 
     Raises
     ------
     InputError
-        If a beam file is missing, cannot be read, or does not cover the channels.
+        If a beam file is missing, cannot be read, or does not cover the channels, or the beam cannot have the errors of
+        `instrument.as_built`.
     """
-    distinct = [settings.beam]
-    index = np.zeros(n_antennas, dtype=int)
-    for group in settings.antenna_beams.values():
-        if group.beam not in distinct:
-            distinct.append(group.beam)
-        index[list(group.antennas)] = distinct.index(group.beam)
-    beams = tuple(make_beam(beam, settings.channels) for beam in distinct)
+    assigned = assigned_beams(settings, n_antennas)
+    # Antennas with `instrument.beam` first.
+    distinct = list(dict.fromkeys(sorted(assigned, key=lambda beam: beam.model > 0)))
+    beams = tuple(_make(distinct, settings))
+    index = np.array([distinct.index(beam) for beam in assigned])
     return AntennaBeams(beams, index) if len(beams) > 1 else beams[0]
 
 
-def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source | Beam, ...], np.ndarray]:
+def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[AntennaBeam]:
+    """Return the distinct beams of an array."""
+    models = nominal_beams(settings)
+    made: dict[tuple, Beam] = {}
+    for model in dict.fromkeys(beam.model for beam in distinct):
+        section, members = models[model], [beam for beam in distinct if beam.model == model]
+        if any(beam.amplitudes is None for beam in members):
+            made[model, None] = make_beam(section, settings.channels)
+        tiles = list(dict.fromkeys(beam.amplitudes for beam in members if beam.amplitudes is not None))
+        if tiles:
+            with guarded(section):
+                tile_beams = model_of(section).make_tiles(settings.channels, np.array(tiles))
+            made |= {(model, amplitudes): beam for amplitudes, beam in zip(tiles, tile_beams, strict=True)}
+    nominal = Misalignment()
+    found = [(made[beam.model, beam.amplitudes], beam.misalignment) for beam in distinct]
+    return [beam if error == nominal else MisalignedBeam(beam, error) for beam, error in found]
+
+
+def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source | AntennaBeam, ...], np.ndarray]:
     """Return the distinct beams of an array, and which of them each antenna of the telescope has, (Nants,) int."""
     if isinstance(beam, AntennaBeams):
         return beam.beams, beam.index

@@ -6,6 +6,8 @@ a visibility is V_xx = ½ ∫ A I exp(−2πi ν b·s/c) dΩ.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from pyuvdata import UVBeam
 from pyuvdata.analytic_beam import AnalyticBeam
@@ -16,6 +18,9 @@ from calstudy.base.plugins import Plugin, guarded
 from calstudy.instrument.interface import Beam, model_of
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.tabulated import TabulatedBeam
+
+if TYPE_CHECKING:
+    from calstudy.instrument.dipoles import Tile
 
 FEEDS = {"xx": 0, "yy": 1}
 ZENITH_ANGLES = np.linspace(0, np.pi / 2, 361)
@@ -95,7 +100,7 @@ class GriddedBeam:
         Frequencies of the table in and next to the band, in Hz, shape (Ntab,).
     """
 
-    def __init__(self, table: TabulatedBeam, name: str, stand_in: str | None) -> None:
+    def __init__(self, table: TabulatedBeam | Tile, name: str, stand_in: str | None) -> None:
         self.name = name
         self.stand_in = stand_in
         self.fit_error = table.fit_error

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 STAND_IN = "beam: {what}, not the MWA full embedded element of Sokolowski et al. (2017)"
 
 
-class Beam(Protocol):
-    """The primary beam of an antenna.
+class AntennaBeam(Protocol):
+    """The primary beam of an antenna, as simulations need it.
 
     Attributes
     ----------
@@ -34,6 +34,10 @@ class Beam(Protocol):
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
         """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)), feeds x (east-west) and y (north-south)."""
+
+
+class Beam(AntennaBeam, Protocol):
+    """A nominal beam, one at the zenith, with the solid angles by which power spectra are normalized."""
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
         """Return Ω_p = ∫A dΩ and Ω_pp = ∫A² dΩ above the horizon, in sr, each of shape (Nfreqs,).
@@ -51,9 +55,15 @@ class BeamModel(Plugin, ABC):
     """The settings of a beam, and how it is made of them. Fields of a subclass are its settings.
 
     Its module is imported when an experiment file is read: import libraries that take long inside `make`.
+
+    Attributes
+    ----------
+    dipoles
+        Of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
     """
 
     registry: ClassVar = BEAMS
+    dipoles: ClassVar[int] = 0
 
     kind: str = Field("", description="Name of a beam, or a file.py.")
 
@@ -61,6 +71,23 @@ class BeamModel(Plugin, ABC):
     def smooth(self) -> bool:
         """Whether the beam is smooth in frequency, so that simulations may be interpolated between nodes."""
         return True
+
+    def make_tiles(self, channels: Channels, amplitudes: np.ndarray) -> list[Beam]:
+        """Return the beams of tiles with given amplitudes of their dipoles; only if `dipoles` is not zero.
+
+        Parameters
+        ----------
+        channels
+            As for `make`.
+        amplitudes
+            (Ntiles, 2 [x, y], dipoles), one where nominal and zero where dead.
+
+        Raises
+        ------
+        InputError
+            As `make`.
+        """
+        raise NotImplementedError(f"the beam {self.label} has no dipoles")
 
     @abstractmethod
     def make(self, channels: Channels) -> Beam:

@@ -4,47 +4,42 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy import units
 from astropy.coordinates import EarthLocation
 from scipy.spatial.distance import pdist, squareform
 
 from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
+from calstudy.instrument.hera import SPACING, core_positions, outrigger_positions
+from calstudy.instrument.sites import SITES, earth_location
 
-# The array centre in the metafits files of the observatory; given here because astropy looks up sites online.
-MWA_LOCATION = EarthLocation.from_geodetic(
-    lon=116.67081524 * units.deg, lat=-26.70331941 * units.deg, height=377.827 * units.m
-)
 
-CORE_TILES = tuple(
-    f"Tile{receiver:02d}{tile}"
-    for receiver, tiles in (
-        (1, range(1, 9)),
-        (2, range(1, 9)),
-        (3, range(1, 9)),
-        (4, range(1, 9)),
-        (6, range(1, 9)),
-        (8, range(1, 9)),
-        (9, range(1, 9)),
-    )
-    for tile in tiles
-)
+def _tiles(receivers: Iterable[int]) -> tuple[str, ...]:
+    return tuple(f"Tile{receiver:02d}{tile}" for receiver in receivers for tile in range(1, 9))
+
+
+CORE_RECEIVERS = (1, 2, 3, 4, 6, 8, 9)
+OUTER_RECEIVERS = (5, 7, 10, 11, 12, 13, 14, 15, 16)
+CORE_TILES = _tiles(CORE_RECEIVERS)
+LONG_BASELINE_TILES = tuple(f"LB{group}{tile}" for group in "ABCDEFG" for tile in range(1, 9))
 HEX_EAST_TILES = tuple(f"HexE{tile:02d}" for tile in range(1, 37))
 HEX_SOUTH_TILES = tuple(f"HexS{tile:02d}" for tile in range(1, 37))
 COMPACT_TILES = CORE_TILES + HEX_EAST_TILES + HEX_SOUTH_TILES
-MWA_TILES = {
+MWA_TILES: dict[str, tuple[str, ...]] = {
     "mwa-compact-minredundant": CORE_TILES[:36],
     "mwa-compact-hex-east": HEX_EAST_TILES,
     "mwa-compact-hex-south": HEX_SOUTH_TILES,
     "mwa-compact": COMPACT_TILES,
+    "mwa-extended": _tiles(OUTER_RECEIVERS) + LONG_BASELINE_TILES,
+    "mwa-phase1": _tiles(range(1, 17)),
 }
+MWA_CONFIGURATIONS = (COMPACT_TILES, MWA_TILES["mwa-extended"], MWA_TILES["mwa-phase1"])
 
 # Optimal Golomb rulers by order (all their differences are distinct; length proved shortest).
 GOLOMB_MARKS = {
@@ -61,6 +56,7 @@ GOLOMB_MARKS = {
     12: (0, 2, 6, 24, 29, 40, 43, 55, 68, 75, 76, 85),
 }
 ROW_LENGTH = 8
+HERA_SIDES = {"hera-19": 3, "hera-37": 4}
 
 
 @dataclass(frozen=True)
@@ -73,13 +69,13 @@ class Layout:
         Name of the layout.
     numbers
         Antenna numbers, unique, int array of shape (Nants,). The number of an MWA tile is its place in the 128-tile
-        compact configuration, also in layouts that use a part of it.
+        configuration, also in layouts that use a part of it.
     names
         Antenna names, unique.
     enu
         East, north, up in metres about the array centre, float64, shape (Nants, 3).
     location
-        The array centre.
+        Where the array is: its centre, for arrays at their own site.
     """
 
     name: str
@@ -123,7 +119,25 @@ def make_layout(settings: section.Layout) -> Layout:
         return _mwa(settings)
     if isinstance(settings, section.CsvLayout):
         return _from_csv(settings.path)
-    return _synthetic(settings.kind, SYNTHETIC[settings.kind](settings))
+    if isinstance(settings, section.HeraLayout):
+        return _synthetic(settings, _hera(settings), "HH")
+    return _synthetic(settings, SYNTHETIC[settings.kind](settings))
+
+
+def make_array(settings: section.InstrumentSettings) -> Layout:
+    """Return the antennas of an instrument, where `instrument.location` says or at the layout's own site.
+
+    Parameters
+    ----------
+    settings
+        The `instrument` section.
+
+    Raises
+    ------
+    InputError
+        If a CSV file is missing or does not hold antenna positions.
+    """
+    return replace(make_layout(settings.layout), location=earth_location(settings.site))
 
 
 def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
@@ -155,20 +169,33 @@ def _mwa(settings: section.MwaLayout) -> Layout:
 
     with (files("pyuvdata") / "data" / "mwa_ant_pos.csv").open() as table:
         relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
+    whole = next(tiles for tiles in MWA_CONFIGURATIONS if set(tiles) >= set(MWA_TILES[settings.kind]))
     tiles = MWA_TILES[settings.kind][: settings.count]
-    centre = np.array([axis.to_value("m") for axis in MWA_LOCATION.geocentric])
-    enu = ENU_from_ECEF(centre + [relative[tile] for tile in COMPACT_TILES], center_loc=MWA_LOCATION)
+    location = SITES["mwa"]
+    centre = np.array([axis.to_value("m") for axis in location.geocentric])
+    enu = ENU_from_ECEF(centre + [relative[tile] for tile in whole], center_loc=location)
     # The table's heights are above the ellipsoid, not the array centre (+377.83 m in all of them).
     enu[:, 2] -= enu[:, 2].mean()
-    numbers = np.array([COMPACT_TILES.index(tile) for tile in tiles])
-    return Layout(settings.kind, numbers, tiles, enu[numbers], MWA_LOCATION)
+    numbers = np.array([whole.index(tile) for tile in tiles])
+    return Layout(settings.kind, numbers, tiles, enu[numbers], location)
 
 
-def _synthetic(kind: str, positions: np.ndarray) -> Layout:
-    """Flat array of (east, north) positions, centred on the MWA site."""
+def _synthetic(settings: section.ArrayLayout, positions: np.ndarray, prefix: str | None = None) -> Layout:
+    """Flat array of (east, north) positions about their mean, at the site of the layout."""
     enu = np.column_stack([positions - positions.mean(axis=0), np.zeros(len(positions))])
     numbers = np.arange(len(enu))
-    return Layout(kind, numbers, tuple(f"{kind}{number:03d}" for number in numbers), enu, MWA_LOCATION)
+    kind = settings.kind
+    names = tuple(f"{kind if prefix is None else prefix}{number:03d}" for number in numbers)
+    return Layout(kind, numbers, names, enu, SITES[settings.site])
+
+
+def _hera(settings: section.HeraLayout) -> np.ndarray:
+    """Positions of HERA's antennas, in the order of their numbers."""
+    if settings.kind in HERA_SIDES:
+        positions = _hex(section.HexLayout(kind="hex", side=HERA_SIDES[settings.kind], spacing=f"{SPACING} m"))
+    else:
+        positions = np.concatenate([core_positions(), outrigger_positions()])[: settings.sizes[settings.kind]]
+    return positions[: settings.count]
 
 
 def _hex(settings: section.HexLayout) -> np.ndarray:
@@ -243,4 +270,4 @@ def _from_csv(path: Path) -> Layout:
             f"instrument.layout.path: antennas {names[first]!r} and {names[second]!r} in {path} are in the same place: "
             "a baseline of length zero"
         )
-    return Layout(path.stem, numbers, names, enu, MWA_LOCATION)
+    return Layout(path.stem, numbers, names, enu, SITES["mwa"])

@@ -2,42 +2,117 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, choice, fault
-from calstudy.base.units import Frequency, HourAngle, Length, Time
+from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
+from calstudy.instrument.as_built import AsBuilt
 
 
-class MwaLayout(Section):
-    """Tiles of the MWA Phase II compact configuration (paper §Simulations; Wayth et al. 2018)."""
+class Site(Section):
+    """A known site. By default HERA's own arrays are at its site, and all other layouts at the MWA's."""
 
-    kind: Literal["mwa-compact-minredundant", "mwa-compact-hex-east", "mwa-compact-hex-south", "mwa-compact"] = Field(
-        "mwa-compact-minredundant",
-        description="The first 36 tiles of the core, one of the two 36-tile hexagons, or all 128 tiles.",
-    )
+    kind: Literal["mwa", "hera", "paper", "ovro-lwa"]
+
+
+class Coordinates(Section):
+    """A site by its coordinates on the WGS84 ellipsoid."""
+
+    kind: Literal["coordinates"]
+    latitude: Angle = Field(ge=-90, le=90, description="North is positive.")
+    longitude: Angle = Field(ge=-180, le=360, description="East is positive.")
+    height: Length = Field(0.0, gt=-1e4, lt=1e5, description="Above the ellipsoid.")
+
+
+Location = Annotated[Site | Coordinates, Field(discriminator="kind"), choice("kind", "coordinates")]
+
+
+class ArrayLayout(Section):
+    """Where antennas are; `site` is where the array stands unless `instrument.location` says otherwise."""
+
+    site: ClassVar[Literal["mwa", "hera"]] = "mwa"
+    kind: str
+
+
+class NamedLayout(ArrayLayout):
+    """Antennas of an array that exists, or a part of it."""
+
+    sizes: ClassVar[Mapping[str, int]]
+    """Number of antennas of each kind."""
+
     count: int | None = Field(None, ge=2, description="Keep only the first `count` antennas (all by default).")
 
+    @property
+    def antennas(self) -> int:
+        """Number of antennas."""
+        return self.count or self.sizes[self.kind]
+
     @model_validator(mode="after")
-    def _enough_antennas(self) -> MwaLayout:
-        size = 128 if self.kind == "mwa-compact" else 36
+    def _enough_antennas(self) -> Self:
+        size = self.sizes[self.kind]
         if self.count is not None and self.count > size:
             raise ValueError(f"count = {self.count} is more than the {size} antennas of {self.kind}")
         return self
 
 
-class HexLayout(Section):
-    """A filled regular hexagon, flat, at the MWA site."""
+class MwaLayout(NamedLayout):
+    """Tiles of the MWA: Phase II compact (paper §Simulations), Phase II extended, or Phase I (Wayth et al. 2018)."""
+
+    sizes: ClassVar[Mapping[str, int]] = {
+        "mwa-compact-minredundant": 36,
+        "mwa-compact-hex-east": 36,
+        "mwa-compact-hex-south": 36,
+        "mwa-compact": 128,
+        "mwa-extended": 128,
+        "mwa-phase1": 128,
+    }
+    kind: Literal[
+        "mwa-compact-minredundant",
+        "mwa-compact-hex-east",
+        "mwa-compact-hex-south",
+        "mwa-compact",
+        "mwa-extended",
+        "mwa-phase1",
+    ] = Field(
+        "mwa-compact-minredundant",
+        description="The first 36 tiles of the core, one of the two 36-tile hexagons, or all 128 tiles of a "
+        "configuration.",
+    )
+
+
+class HeraLayout(NamedLayout):
+    """HERA at its own site: antennas 14.6 m apart, flat, as designed (DeBoer et al. 2017; Dillon & Parsons 2016).
+
+    `hera-19` and `hera-37` are filled hexagons. `hera-320` is the core, a hexagon in three sectors that are displaced
+    against each other by a third of the unit cell; `hera-350` has the 30 outriggers as well. `hera-128` is the first
+    128 antennas of the core. Antennas of the last three are numbered as HERA numbers them, from the south.
+    """
+
+    site: ClassVar[Literal["mwa", "hera"]] = "hera"
+    sizes: ClassVar[Mapping[str, int]] = {
+        "hera-19": 19,
+        "hera-37": 37,
+        "hera-128": 128,
+        "hera-320": 320,
+        "hera-350": 350,
+    }
+    kind: Literal["hera-19", "hera-37", "hera-128", "hera-320", "hera-350"]
+
+
+class HexLayout(ArrayLayout):
+    """A filled regular hexagon, flat."""
 
     kind: Literal["hex"]
     side: int = Field(4, ge=2, description="Antennas along one side; 4 gives 37 antennas.")
     spacing: Length = Field(14.0, gt=0, description="Distance between neighbours.")
 
 
-class LinearLayout(Section):
+class LinearLayout(ArrayLayout):
     """An east-west line of equally spaced antennas (paper Fig. MAXBL_RUNTIME)."""
 
     kind: Literal["linear"]
@@ -45,7 +120,7 @@ class LinearLayout(Section):
     spacing: Length = Field(14.0, gt=0)
 
 
-class RectangularLayout(Section):
+class RectangularLayout(ArrayLayout):
     """Rows of eight antennas, spread so that the longest baseline is `max_baseline` (paper Fig. ANTPOS_RUNTIME)."""
 
     kind: Literal["rectangular"]
@@ -63,7 +138,7 @@ class RectangularLayout(Section):
         return self
 
 
-class GolombLayout(Section):
+class GolombLayout(ArrayLayout):
     """An east-west line at the marks of an optimal Golomb ruler: every baseline is unique."""
 
     kind: Literal["golomb"]
@@ -71,15 +146,18 @@ class GolombLayout(Section):
     spacing: Length = Field(4.0, gt=0, description="Length of one unit of the ruler.")
 
 
-class CsvLayout(Section):
-    """Positions from a CSV file with columns east_m, north_m, up_m and, optionally, name and number."""
+class CsvLayout(ArrayLayout):
+    """Positions from a CSV file with columns east_m, north_m, up_m and, optionally, name and number.
+
+    Give `instrument.location`: without it the array is at the MWA's site, and `calstudy plan` says so.
+    """
 
     kind: Literal["csv"]
     path: Path = Field(strict=False, description="CSV file, relative to the experiment file or absolute.")
 
 
 Layout = Annotated[
-    MwaLayout | HexLayout | LinearLayout | RectangularLayout | GolombLayout | CsvLayout,
+    MwaLayout | HeraLayout | HexLayout | LinearLayout | RectangularLayout | GolombLayout | CsvLayout,
     Field(discriminator="kind"),
     choice("kind", "mwa-compact-minredundant"),
 ]
@@ -126,6 +204,11 @@ class InstrumentSettings(Section):
     """Positions and beams of the antennas, and times and frequencies of the observation."""
 
     layout: Layout = MwaLayout()
+    location: Location | None = Field(
+        None,
+        description="Where the array is: the name of a site, or coordinates; null: the site of the layout, HERA's for "
+        "its arrays and the MWA's for all others.",
+    )
     beam: Beam = Field(default_factory=lambda: BEAMS.make(DEFAULT_BEAM))
     antenna_beams: dict[str, AntennaBeam] = Field(
         default_factory=dict,
@@ -137,9 +220,20 @@ class InstrumentSettings(Section):
         ("xx",), description="Linear polarizations, calibrated independently: xx (east-west dipoles), yy, or both."
     )
 
+    as_built: AsBuilt = AsBuilt()
+
+    @property
+    def site(self) -> Site | Coordinates:
+        """Where the array is."""
+        return Site(kind=self.layout.site) if self.location is None else self.location
+
+    def nominal(self) -> InstrumentSettings:
+        """Return the instrument as designed: what calibrators and figures take it for."""
+        return self.reset("as_built")
+
     def without_beams(self) -> InstrumentSettings:
-        """Return the instrument with the default beam: for what reads antennas, channels and times only."""
-        return self.reset("beam", "antenna_beams")
+        """Return the nominal instrument with the default beam: for what reads antennas, channels and times only."""
+        return self.reset("beam", "antenna_beams", "as_built")
 
     @model_validator(mode="after")
     def _polarizations_are_unique(self) -> InstrumentSettings:

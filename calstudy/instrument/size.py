@@ -18,14 +18,22 @@ from calstudy.instrument.settings import (
     InstrumentSettings,
     Layout,
     LinearLayout,
+    NamedLayout,
     RectangularLayout,
 )
 
-MWA_LENGTHS = {
+NAMED_LENGTHS = {
     "mwa-compact-minredundant": (176.2, 54.1),
     "mwa-compact-hex-east": (84.1, 41.9),
     "mwa-compact-hex-south": (84.1, 41.9),
     "mwa-compact": (740.8, 154.9),
+    "mwa-extended": (5302.9, 1878.7),
+    "mwa-phase1": (2873.6, 680.0),
+    "hera-19": (58.4, 31.2),
+    "hera-37": (87.6, 43.0),
+    "hera-128": (263.4, 91.0),
+    "hera-320": (292.2, 127.3),
+    "hera-350": (876.1, 165.6),
 }
 """Longest and mean baseline, m."""
 MEAN_OVER_LONGEST = 0.45
@@ -101,8 +109,7 @@ def antenna_count(layout: Layout) -> int:
     if isinstance(layout, CsvLayout):
         lines = layout.path.read_text(encoding="utf-8", errors="replace").splitlines()
         return max(sum(1 for line in lines if line.strip() and not line.startswith("#")) - 1, 2)
-    whole = 128 if layout.kind == "mwa-compact" else 36
-    return layout.count or whole
+    return layout.antennas if isinstance(layout, NamedLayout) else layout.count
 
 
 def baseline_lengths(layout: Layout) -> tuple[float, float]:
@@ -118,7 +125,7 @@ def baseline_lengths(layout: Layout) -> tuple[float, float]:
     elif isinstance(layout, CsvLayout):
         longest = _extent(layout.path)
     else:
-        return MWA_LENGTHS[layout.kind]
+        return NAMED_LENGTHS[layout.kind]
     return longest, MEAN_OVER_LONGEST * longest
 
 

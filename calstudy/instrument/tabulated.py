@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -43,7 +42,7 @@ def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> U
     path = find_beam() if path is None else path
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
-    return _read_mwa(path, *_fit_range(band))
+    return _read_mwa(path, *fit_range(band))
 
 
 @lru_cache(maxsize=2)
@@ -54,31 +53,8 @@ def _read_mwa(path: Path, low: float, high: float) -> UVBeam:
         raise InputError(f"instrument.beam.path: {path} cannot be read as an MWA beam file ({error})") from error
 
 
-def read_beamfits(path: Path) -> UVBeam:
-    """Read an E-field beam on a grid of azimuth and zenith angle from a beamfits file.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, cannot be read, or holds another kind of beam.
-    """
-    if not path.is_file():
-        raise InputError(f"instrument.beam.path: there is no file {path}")
-    try:
-        beam = UVBeam.from_file(path, file_type="beamfits")
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"instrument.beam.path: {path} cannot be read as beamfits ({error})") from error
-    usable = beam.beam_type == "efield" and beam.pixel_coordinate_system == "az_za"
-    if not usable or list(beam.feed_array) not in (["x", "y"], ["x"]) or beam.axis2_array[0] != 0:
-        raise InputError(
-            f"instrument.beam.path: {path} must contain an efield beam of feeds x and y on a grid of azimuth and "
-            f"zenith angle from the zenith; it contains a {beam.beam_type} beam of feeds {beam.feed_array} on "
-            f"{beam.pixel_coordinate_system}"
-        )
-    return beam
-
-
-def _fit_range(band: tuple[float, float]) -> tuple[float, float]:
+def fit_range(band: tuple[float, float]) -> tuple[float, float]:
+    """Return the lowest and highest frequency (Hz) from which a beam is interpolated in a band."""
     low, high = band[0] - FIT_MARGIN, band[1] + FIT_MARGIN
     missing = max(0.0, FIT_BAND - (high - low))
     return low - missing / 2, high + missing / 2
@@ -102,13 +78,20 @@ class TabulatedBeam:
         Those of the band, and those next to its ends, in Hz, shape (Ntab,).
     fit_error
         Largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`.
+    template
+        The table as read.
+    interpolation
+        Between the tabulated frequencies in and around the band.
     """
 
     def __init__(self, table: UVBeam, band: tuple[float, float], interpolation: str) -> None:
-        low, high = _fit_range(band)
-        chosen = (table.freq_array >= low) & (table.freq_array <= high)
-        tabulated = table.freq_array[chosen]
-        if not chosen.any() or band[0] < tabulated[0] or band[1] > tabulated[-1]:
+        available, (low, high) = table.freq_array, fit_range(band)
+        # A coarse table may have its next frequency beyond the range.
+        start = min(np.searchsorted(available, low), np.searchsorted(available, band[0], side="right") - 1)
+        stop = max(np.searchsorted(available, high, side="right"), np.searchsorted(available, band[1]) + 1)
+        chosen = slice(max(start, 0), stop)
+        tabulated = available[chosen]
+        if start < 0 or stop > len(available):
             raise InputError(
                 f"instrument.channels: {_megahertz(*band)} is not within the beam file's "
                 f"{_megahertz(table.freq_array[0], table.freq_array[-1])}"
@@ -119,20 +102,18 @@ class TabulatedBeam:
                 f"frequencies near the channels, the beam file has {len(tabulated)}"
             )
         self.zenith_angles = table.axis2_array
-        self._table = table
+        self.template = table
         self._band = (float(tabulated[0]), float(tabulated[-1]))
         values = np.moveaxis(table.data_array[:, :, chosen], 2, 0)
-        if interpolation == "chebyshev":
-            self._evaluate = _smooth_fit(tabulated, values)
-        else:
-            self._evaluate = interp1d(tabulated, values, kind=interpolation, axis=0, assume_sorted=True)
+        self.interpolation = FrequencyInterpolation(tabulated, interpolation)
+        self._reduced = self.interpolation.reduce(values)
         first, last = np.searchsorted(tabulated, band[0], side="right") - 1, np.searchsorted(tabulated, band[1])
         self.tabulated_frequencies = tabulated[first : last + 1]
-        reference = _zenith_normalized(np.moveaxis(values[first : last + 1], 0, 2))
+        reference = zenith_normalized(np.moveaxis(values[first : last + 1], 0, 2))
         self.fit_error = float(np.abs(self.jones(self.tabulated_frequencies) - reference).max())
 
-    def jones(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz."""
+    def require_within(self, frequencies: np.ndarray) -> np.ndarray:
+        """Return frequencies (Hz) as floats; raises InputError if any is outside the band of the beam."""
         frequencies = np.asarray(frequencies, dtype=float)
         low, high = self._band
         if frequencies.min() < low or frequencies.max() > high:
@@ -140,53 +121,92 @@ class TabulatedBeam:
                 f"frequencies {_megahertz(frequencies.min(), frequencies.max())} are outside the band for which the "
                 f"beam was made, {_megahertz(low, high)}"
             )
-        return _zenith_normalized(np.moveaxis(self._evaluate(frequencies), 0, 2))
+        return frequencies
+
+    def jones(self, frequencies: np.ndarray) -> np.ndarray:
+        """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz."""
+        frequencies = self.require_within(frequencies)
+        return zenith_normalized(np.moveaxis(self.interpolation.evaluate(self._reduced, frequencies), 0, 2))
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
         """Return the efield beam tabulated at `frequencies` in Hz, shape (Nfreqs,)."""
-        table = self._table
-        return UVBeam.new(
-            telescope_name=table.telescope_name,
-            feed_name=table.feed_name,
-            feed_version=table.feed_version,
-            model_name=table.model_name,
-            model_version=table.model_version,
-            data_normalization="peak",
-            freq_array=np.asarray(frequencies, dtype=float),
-            feed_array=table.feed_array,
-            feed_angle=table.feed_angle,
-            mount_type="fixed",
-            pixel_coordinate_system="az_za",
-            axis1_array=table.axis1_array,
-            axis2_array=table.axis2_array,
-            basis_vector_array=table.basis_vector_array,
-            data_array=np.ascontiguousarray(self.jones(frequencies)),
-            history=table.history,
-        )
+        return tabulate(self.template, self.jones(frequencies), frequencies)
+
+
+def tabulate(template: UVBeam, jones: np.ndarray, frequencies: np.ndarray) -> UVBeam:
+    """Return an efield beam on the grid of another.
+
+    Parameters
+    ----------
+    template
+        Has the grid, the feeds and the names.
+    jones
+        (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, one at the zenith.
+    frequencies
+        In Hz, (Nfreqs,).
+    """
+    return UVBeam.new(
+        telescope_name=template.telescope_name,
+        feed_name=template.feed_name,
+        feed_version=template.feed_version,
+        model_name=template.model_name,
+        model_version=template.model_version,
+        data_normalization="peak",
+        freq_array=np.asarray(frequencies, dtype=float),
+        feed_array=template.feed_array,
+        feed_angle=template.feed_angle,
+        mount_type="fixed",
+        pixel_coordinate_system="az_za",
+        axis1_array=template.axis1_array,
+        axis2_array=template.axis2_array,
+        basis_vector_array=template.basis_vector_array,
+        data_array=np.ascontiguousarray(jones),
+        history=template.history,
+    )
 
 
 def _megahertz(low: float, high: float) -> str:
     return f"{low / 1e6:g} to {high / 1e6:g} MHz"
 
 
-def _zenith_normalized(jones: np.ndarray) -> np.ndarray:
+def zenith_normalized(jones: np.ndarray) -> np.ndarray:
     """Divide by the square root of the zenith power, per feed and frequency."""
     zenith = np.sqrt((np.abs(jones[..., 0, 0]) ** 2).sum(axis=0))
     return jones / zenith[None, :, :, None, None]
 
 
-def _smooth_fit(tabulated: np.ndarray, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of frequencies: the least-squares polynomial through `values` along their first axis."""
-    width = tabulated[-1] - tabulated[0]
-    # Beyond 2 sqrt(n) a polynomial through n equally spaced points swings between them.
-    order = min(
-        max(FIT_ORDER, round(FIT_ORDER * width / FIT_BAND)), int(2 * np.sqrt(len(tabulated))), len(tabulated) - 1
-    )
-    domain = [tabulated[0], tabulated[-1]] if width > 0 else [tabulated[0] - 1, tabulated[0] + 1]
+class FrequencyInterpolation:
+    """Interpolation between tabulated frequencies: linear in the table.
 
-    def basis(frequencies: np.ndarray) -> np.ndarray:
-        scaled = np.polynomial.polyutils.mapdomain(np.asarray(frequencies, dtype=float), domain, [-1, 1])
-        return chebyshev.chebvander(scaled, order)
+    Parameters
+    ----------
+    tabulated
+        Frequencies of the table, Hz, (Ntab,).
+    kind
+        "chebyshev", "cubic", "linear" or "nearest"; see `TabulatedBeam`.
+    """
 
-    coefficients = np.tensordot(np.linalg.pinv(basis(tabulated)), values, axes=1)
-    return lambda frequencies: np.tensordot(basis(frequencies), coefficients, axes=1)
+    def __init__(self, tabulated: np.ndarray, kind: str) -> None:
+        self._tabulated, self._kind = tabulated, kind
+        width = tabulated[-1] - tabulated[0]
+        # Beyond 2 sqrt(n) a polynomial through n equally spaced points swings between them.
+        self._order = min(
+            max(FIT_ORDER, round(FIT_ORDER * width / FIT_BAND)), int(2 * np.sqrt(len(tabulated))), len(tabulated) - 1
+        )
+        self._domain = [tabulated[0], tabulated[-1]] if width > 0 else [tabulated[0] - 1, tabulated[0] + 1]
+
+    def _basis(self, frequencies: np.ndarray) -> np.ndarray:
+        scaled = np.polynomial.polyutils.mapdomain(np.asarray(frequencies, dtype=float), self._domain, [-1, 1])
+        return chebyshev.chebvander(scaled, self._order)
+
+    def reduce(self, values: np.ndarray) -> np.ndarray:
+        """Return what `evaluate` needs of a table, (Ntab, ...): for "chebyshev", coefficients, (order + 1, ...)."""
+        if self._kind != "chebyshev":
+            return values
+        return np.tensordot(np.linalg.pinv(self._basis(self._tabulated)), values, axes=1)
+
+    def evaluate(self, reduced: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
+        """Return the interpolated table at frequencies (Hz), (Nfreqs, ...)."""
+        if self._kind != "chebyshev":
+            return interp1d(self._tabulated, reduced, kind=self._kind, axis=0, assume_sorted=True)(frequencies)
+        return np.tensordot(self._basis(frequencies), reduced, axes=1)

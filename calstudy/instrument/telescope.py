@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from astropy import units
 from astropy.coordinates import EarthLocation
@@ -9,11 +11,12 @@ from astropy.utils import iers
 from pyuvdata import Telescope, UVData
 from pyuvdata import utils as uvutils
 
-from calstudy.instrument.layouts import Layout, make_layout
+from calstudy.instrument.as_built import position_offsets
+from calstudy.instrument.layouts import Layout, make_array
 from calstudy.instrument.settings import InstrumentSettings
 
-# Noon UTC of 2016 November 15; the observation starts within the sidereal day after it. At the MWA the field of the
-# paper (LST 1.8 h) is then up at night, and the Earth's orientation is known, not predicted.
+# Noon UTC of 2016 November 15; the observation starts within the sidereal day after it, wherever the array is. At the
+# MWA the field of the paper (LST 1.8 h) is then up at night, and the Earth's orientation is known, not predicted.
 REFERENCE_JD = 2457708.0
 SECONDS_PER_DAY = 86400.0
 SIDEREAL_DAY = 0.99726956633
@@ -28,7 +31,7 @@ def use_bundled_earth_orientation() -> None:
     iers.conf.auto_download = False
 
 
-def make_template(settings: InstrumentSettings, autos: bool = False) -> UVData:
+def make_template(settings: InstrumentSettings, autos: bool = False, as_built: bool = False) -> UVData:
     """Return the metadata of the simulated observation.
 
     Baselines are (a, b) with a before b in the layout, ordered by a and then b, all of them at every time, time by
@@ -41,6 +44,8 @@ def make_template(settings: InstrumentSettings, autos: bool = False) -> UVData:
         The `instrument` section.
     autos
         Whether to include autocorrelations.
+    as_built
+        Whether antennas are where `instrument.as_built` has them, and not at their nominal positions.
 
     Returns
     -------
@@ -52,7 +57,10 @@ def make_template(settings: InstrumentSettings, autos: bool = False) -> UVData:
     InputError
         If the layout's file cannot be used.
     """
-    layout = make_layout(settings.layout)
+    layout = make_array(settings)
+    if as_built:
+        offsets = position_offsets(settings.as_built.positions, len(layout.numbers))
+        layout = replace(layout, enu=layout.enu + offsets)
     first, second = np.triu_indices(len(layout.numbers), 0 if autos else 1)
     times, channels = settings.times, settings.channels
     start = time_of_lst(times.start_lst, layout.location)

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.instrument.distinct_beams import assigned_beams
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, once
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
+from calstudy.simulate.nodes import node_counts
 from calstudy.sky.counts import FAINTEST, expected_sources
 from calstudy.sky.settings import Eor, NoSources, PointSources
 
@@ -30,7 +32,10 @@ TOLERATED = 100
 """Interpolation errors up to this times the tolerance, which bounds a typical one, go without a warning."""
 
 SOURCES = 546_000
-TIME_NODES, FREQUENCY_NODES = 16, 96
+TABLE_MEMORY = 1.3e6
+"""Bytes of the table of a beam for one polarization and frequency."""
+DIPOLE_SECONDS, DIPOLE_MEMORY = 20.0, 1.0e9
+"""For the fields of the single dipoles of a tile; a worker makes them for the first of its chunks only."""
 
 
 @once
@@ -106,7 +111,7 @@ def simulate_chunk(job: Job) -> Mapping[str, Any]:
         return {"empty": True}
     chunk = component.chunks[job.settings["index"]]
     sky = component.sky(chunk.channels if component.is_eor else slice(None))
-    cube = simulate(component.engine, sky, component.beam, component.template, chunk)
+    cube = simulate(component.engine, sky, component.beam, component.as_built, chunk)
     frame = subset_template(component.template, integration_times(component.template), chunk.frequencies)
     write_visibilities(from_cube(frame, cube), job.output / CHUNK)
     return {"frequencies": len(chunk.frequencies), "components": int(sky.Ncomponents)}
@@ -176,20 +181,27 @@ def _as_json(floor: DelayFloor) -> dict[str, Any]:
 
 def _cost_of_chunk(task: Task) -> Cost:
     instrument, simulation, sky = (task.settings[name] for name in ("instrument", "simulation", "sky"))
-    size, nodes = Size.of(instrument), simulation.nodes.enabled
-    channels = size.channels.count
+    size, channels = Size.of(instrument), instrument.channels.count
     pieces = min(simulation.chunks, channels)
-    times = min(size.times, TIME_NODES) if nodes else size.times
+    times, frequencies = node_counts(instrument, simulation.nodes)
     if isinstance(sky, Eor):
         sources, spectral = 12 * sky.nside**2, channels / simulation.chunks
     else:
         sources, spectral = _sources(task.settings), 0.0
-        channels = min(channels, FREQUENCY_NODES) if nodes else channels
-    work = SimulationSize(sources, times * channels / pieces, size.antennas, 1 + len(instrument.antenna_beams))
-    engine = simulation.engine.cost(work)
+        channels = frequencies
+    beams = len(set(assigned_beams(instrument, size.antennas)))
+    engine = simulation.engine.cost(SimulationSize(sources, times * channels / pieces, size.antennas, beams))
     disk = size.samples / size.channels.count * channels / pieces * COMPLEX128
     memory = engine.memory + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
-    return Cost(6 + engine.seconds, memory, disk)
+    seconds = 6 + engine.seconds
+    if beams > 1:
+        # Tables of the beams at the nodes: twice, for sources that stay up and for those that rise or set.
+        seconds += beams * (0.4 + 0.16 * channels / pieces)
+        memory += beams * (TABLE_MEMORY * size.polarizations * channels / pieces + 2e7)
+    if instrument.as_built.dipoles.differ:
+        seconds += DIPOLE_SECONDS
+        memory += DIPOLE_MEMORY
+    return Cost(seconds, memory, disk)
 
 
 def _sources(settings: Mapping[str, Any]) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.assumed import SKY_MODEL, AssumedWorld, assumed_changes, assumed_world
+from calstudy.experiment.model import Experiment
 from calstudy.instrument.size import Size
 from calstudy.products import simulation
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
@@ -56,7 +57,13 @@ def differences(graph: Graph) -> list[tuple[str, str, str]]:
         return [(SKY_MODEL, "the true foregrounds", str(changes[SKY_MODEL]))]
     world = assumed_world(experiment)
     true = AssumedWorld(sky=experiment.sky, instrument=experiment.instrument)
-    return list(_differences(true.model_dump(mode="json"), world.model_dump(mode="json")))
+    before, after = (_without_errors(found.model_dump(mode="json")) for found in (true, world))
+    return [*_differences(before, after), *_differences_as_built(experiment)]
+
+
+def _without_errors(world: dict[str, Any]) -> dict[str, Any]:
+    """Return a world without what makes its antennas differ from the nominal ones, which gets a row of its own."""
+    return {**world, "instrument": {key: value for key, value in world["instrument"].items() if key != "as_built"}}
 
 
 def _differences(true: Any, assumed: Any, path: str = "") -> Iterator[tuple[str, str, str]]:
@@ -66,6 +73,13 @@ def _differences(true: Any, assumed: Any, path: str = "") -> Iterator[tuple[str,
             yield from _differences(true.get(key), assumed.get(key), f"{path}.{key}" if path else key)
     elif true != assumed:
         yield path, _text(true), _text(assumed)
+
+
+def _differences_as_built(experiment: Experiment) -> list[tuple[str, str, str]]:
+    """Return the row of `differences` for the errors of the antennas, which the calibrator does not know by default."""
+    built = [found.as_built for found in (experiment.instrument, assumed_world(experiment).instrument)]
+    true, assumed = ((found.note or "nominal").removeprefix("as built: ") for found in built)
+    return [("instrument.as_built", true, assumed)] if built[0] != built[1] else []
 
 
 def described(graph: Graph) -> str:

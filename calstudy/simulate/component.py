@@ -31,7 +31,7 @@ CHECKED = 2
 
 
 class Component:
-    """The instrument and one component of the sky; what is costly is made when it is asked for.
+    """The instrument as built and one component of the sky; what is costly is made when it is asked for.
 
     Parameters
     ----------
@@ -43,6 +43,13 @@ class Component:
         Name of the cosmology, which turns the EoR's P(k) into brightness.
     diffuse
         Settings of the diffuse emission that is added to sources, or None.
+
+    Attributes
+    ----------
+    template
+        The observation with the nominal positions of antennas, as data files have them.
+    as_built
+        The same with the true ones, of which it is simulated.
     """
 
     def __init__(
@@ -57,9 +64,14 @@ class Component:
         self.is_eor = isinstance(sky, Eor)
         self.instrument, self.simulation = instrument, simulation
         self.template = make_template(instrument)
+        moved = instrument.as_built.positions.scatter > 0
+        self.as_built = make_template(instrument, as_built=True) if moved else self.template
         self.beam = make_beams(instrument, self.template.telescope.Nants)
         self.engine = simulation.engine
-        self.stand_ins = [self.beam.stand_in] if self.beam.stand_in else []
+        self.stand_ins = self._notes(None)
+
+    def _notes(self, sky: str | None) -> list[str]:
+        return [note for note in (sky, self.beam.stand_in, self.instrument.as_built.note) if note]
 
     @cached_property
     def _field(self) -> EorField | None:
@@ -72,7 +84,7 @@ class Component:
         if isinstance(self._sky, Eor):
             raise TypeError("the EoR has no foregrounds")
         foregrounds = make_foregrounds(self._sky, self.template.freq_array, self._diffuse)
-        self.stand_ins = [note for note in (foregrounds.stand_in, self.beam.stand_in) if note]
+        self.stand_ins = self._notes(foregrounds.stand_in)
         return foregrounds.sky
 
     @property
@@ -85,7 +97,7 @@ class Component:
     @cached_property
     def chunks(self) -> list[Chunk]:
         """The pieces of the simulation; there may be fewer than asked for."""
-        return plan_chunks(self.template, self.simulation, self.smooth)
+        return plan_chunks(self.as_built, self.simulation, self.smooth)
 
     def sky(self, channels: slice | np.ndarray) -> SkyModel:
         """Return the sky, of the EoR only the given channels."""
@@ -106,4 +118,4 @@ class Component:
         channels = slice(-CHECKED, None) if self.is_eor else slice(None)
         sky = self.sky(np.arange(self.template.Nfreqs)[channels])
         simulate = partial(simulate_with, self.engine, sky, self.beam)
-        return asdict(check_interpolation(simulate, self.template, cube, grid, channels=channels, count=CHECKED))
+        return asdict(check_interpolation(simulate, self.as_built, cube, grid, channels=channels, count=CHECKED))

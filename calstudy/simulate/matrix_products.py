@@ -7,10 +7,11 @@ With C = Re E and S = Im E,
     Z_ab = sum_s w (C_a - S_a) C_b + w (C_a + S_a) S_b = Re V_ab + Im V_ab,
     Re V = (Z + Z^T) / 2,    Im V = (Z - Z^T) / 2,
 
-half the arithmetic of the complex product. Where antennas have different beams the weights of a pair of antennas are
-complex, w = J_a J_b* I / 2; then the same is done with their real and with their imaginary parts, for every pair of
-beams (`calstudy.simulate.patterns.CrossPattern`). Sine and cosine are evaluated by polynomials in a loop the compiler
-vectorizes, which costs less than the complex multiplications of a recurrence over channels and allows any frequencies.
+half the arithmetic of the complex product. Where antennas have different beams, the field of each takes part in its
+factor: V_ab = sum_s sum_c w conj(X_asc) X_bsc with X = E conj(J), components c of J and w = I / 2. That is the same
+product over twice as many terms, however many beams there are. Sine and cosine are evaluated by polynomials in a loop
+the compiler vectorizes, which costs less than the complex multiplications of a recurrence over channels and allows any
+frequencies.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from calstudy.simulate.brightness import stokes_i
 from calstudy.simulate.directions import SourceTracks
 from calstudy.simulate.interface import BeamSource
 from calstudy.simulate.nodes import integration_times
-from calstudy.simulate.patterns import CrossPattern, Pattern, power_pattern
+from calstudy.simulate.patterns import Pattern, power_pattern
 
 # Sources per block: the two factors of the matrix product then stay in a 2 MB cache for tens of antennas.
 BLOCK_BYTES = 1_200_000
@@ -62,14 +63,12 @@ def visibilities(sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVDat
     frequencies, feeds = template.freq_array, polarization_feeds(template)
     beams, index = split_beams(beam, template)
     patterns = [power_pattern(item.at(frequencies), frequencies, feeds) for item in beams]
-    pattern = patterns[0] if len(patterns) == 1 else CrossPattern(patterns)
     flux = stokes_i(sky, frequencies)
     times = integration_times(template)
     tracks = SourceTracks(sky, template.telescope.location, times)
     order = _order_on_sky(tracks.at(times[0]))
     used, pairs = np.unique(antenna_indices(template), return_inverse=True)
     first, second = pairs.reshape(-1, 2).T
-    owners = index[used[np.array([first, second])]]
     delays = template.telescope.get_enu_antpos()[used] / speed_of_light
     cube = np.empty((len(times), template.Nbls, len(frequencies), len(feeds)), dtype=np.complex128)
     # The products are many and small: threads in each cost more than they gain, and workers share the cores.
@@ -78,11 +77,13 @@ def visibilities(sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVDat
             vectors = tracks.at(time, order)
             up = vectors[2] > 0
             tracked = _Sources(vectors[:, up], flux, order[up])
-            sums = _sum_sources(tracked, delays, frequencies, pattern, dtype)
+            if len(patterns) == 1:
+                sums = _sum_sources(tracked, delays, frequencies, patterns[0], dtype)
+            else:
+                sums = _sum_fields(tracked, delays, frequencies, (patterns, index[used]), dtype)
             forward, backward = sums[..., first, second], sums[..., second, first]
-            # Shape (Nbls, Nfreqs, Nweights).
-            products = 0.5 * ((forward + backward) + 1j * (forward - backward)).transpose(2, 0, 1)
-            cube[step] = products if len(patterns) == 1 else _of_beams(products, len(beams), *owners)
+            # Shape (Nbls, Nfreqs, Nfeeds).
+            cube[step] = 0.5 * ((forward + backward) + 1j * (forward - backward)).transpose(2, 0, 1)
     return cube
 
 
@@ -108,17 +109,63 @@ class _Sources:
 def _sum_sources(
     sources: _Sources, delays: np.ndarray, frequencies: np.ndarray, pattern: Pattern, dtype: type
 ) -> np.ndarray:
-    """Return Z of every frequency and weight, (Nfreqs, Nweights, Nants, Nants), for antennas at delays (Nants, 3)."""
+    """Return Z of every frequency and feed, (Nfreqs, Nfeeds, Nants, Nants), for antennas at delays (Nants, 3)."""
     n_ants, vectors = len(delays), sources.vectors
     azimuth, zenith_angle = np.arctan2(vectors[1], vectors[0]) % (2 * np.pi), _zenith_angles(vectors)
     size = max(64, BLOCK_BYTES // (4 * 8 * n_ants) // 64 * 64)
-    sums = np.zeros((len(frequencies), pattern.n_weights, n_ants, n_ants))
+    sums = np.zeros((len(frequencies), pattern.n_feeds, n_ants, n_ants))
     for start in range(0, len(sources.components), size):
         block = slice(start, start + size)
         weights = pattern.at(azimuth[block], zenith_angle[block])
         weights *= 0.5 * sources.flux[:, sources.components[block]]
         _add_products(delays @ vectors[:, block], weights, frequencies, sums, dtype)
     return sums
+
+
+def _sum_fields(
+    sources: _Sources,
+    delays: np.ndarray,
+    frequencies: np.ndarray,
+    antennas: tuple[list[Pattern], np.ndarray],
+    dtype: type,
+) -> np.ndarray:
+    """Return Z as `_sum_sources` does, for antennas with several patterns and the index of that of each."""
+    patterns, index = antennas
+    n_ants, vectors = len(delays), sources.vectors
+    azimuth, zenith_angle = np.arctan2(vectors[1], vectors[0]) % (2 * np.pi), _zenith_angles(vectors)
+    # A quarter of that for one beam: factors have two components, and the fields are there as well.
+    size = max(64, BLOCK_BYTES // (16 * 8 * n_ants) // 64 * 64)
+    sums = np.zeros((len(frequencies), patterns[0].n_feeds, n_ants, n_ants))
+    for start in range(0, len(sources.components), size):
+        block = slice(start, start + size)
+        fields = [pattern.fields(azimuth[block], zenith_angle[block]) for pattern in patterns]
+        # Shape (Nfreqs, Nfeeds, Nbeams, 4, N): sources of one part of one component lie together.
+        table = np.ascontiguousarray(np.stack(fields).transpose(3, 2, 0, 4, 1))
+        fluxes = 0.5 * sources.flux[:, sources.components[block]]
+        _add_field_products(delays @ vectors[:, block], (table, index), fluxes, frequencies, sums, dtype)
+    return sums
+
+
+def _add_field_products(
+    delays: np.ndarray,
+    fields: tuple[np.ndarray, np.ndarray],
+    fluxes: np.ndarray,
+    frequencies: np.ndarray,
+    sums: np.ndarray,
+    dtype: type,
+) -> None:
+    """Add to Z a block of sources with delays (Nants, N), fields (Nfreqs, Nfeeds, Nbeams, 4, N), fluxes (Nfreqs, N)."""
+    table, index = fields
+    n_ants, n_sources = delays.shape
+    fringes = np.empty((2, n_ants, n_sources))
+    left = np.empty((n_ants, 4 * n_sources), dtype=dtype)
+    right = np.empty((n_ants, 4 * n_sources), dtype=dtype)
+    for channel, frequency in enumerate(frequencies):
+        for antenna in range(n_ants):
+            _fringes(delays[antenna], frequency, fringes[0, antenna], fringes[1, antenna])
+        for feed in range(table.shape[1]):
+            _field_factors(fringes, table[channel, feed], index, fluxes[channel], left, right)
+            sums[channel, feed] += left @ right.T
 
 
 def _add_products(
@@ -131,26 +178,6 @@ def _add_products(
     for index, frequency in enumerate(frequencies):
         _factors(delays, weights[:, index], frequency, left, right)
         sums[index] += (left @ right.T).reshape(n_weights, n_ants, n_ants)
-
-
-def _of_beams(products: np.ndarray, count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the visibilities of baselines between antennas of given beams, (Nbls, Nfreqs, Nfeeds).
-
-    Parameters
-    ----------
-    products : (Nbls, Nfreqs, Nbeams * Nbeams * Nfeeds)
-        Visibilities for each of the weights of a `CrossPattern`.
-    count
-        Number of beams.
-    first, second : (Nbls,) int
-        Beams of the antennas of each baseline.
-    """
-    baselines = np.arange(len(first))
-    matrices = products.reshape(*products.shape[:2], count, count, -1)
-    low, high = np.minimum(first, second), np.maximum(first, second)
-    sign = np.sign(second - first)[:, None, None]
-    # The baseline first: numpy puts the axes of separated index arrays in front.
-    return matrices[baselines, :, low, high] + 1j * sign * matrices[baselines, :, high, low]
 
 
 def polarization_feeds(template: UVData) -> list[str]:
@@ -211,3 +238,37 @@ def _factors(delays: np.ndarray, weights: np.ndarray, frequency: float, left: np
         for index in range(len(weights)):
             row = left[index * n_ants + antenna]
             _weigh(cosine, sine, weights[index], row[:n_sources], row[n_sources:])
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _multiply(
+    cosine: np.ndarray, sine: np.ndarray, real: np.ndarray, imaginary: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> None:
+    """Fill real and imaginary part of a fringe times the conjugate of a field."""
+    for source in range(cosine.size):
+        low[source] = cosine[source] * real[source] + sine[source] * imaginary[source]
+        high[source] = sine[source] * real[source] - cosine[source] * imaginary[source]
+
+
+@numba.njit(cache=True, nogil=True)
+def _field_factors(
+    fringes: np.ndarray, fields: np.ndarray, index: np.ndarray, flux: np.ndarray, left: np.ndarray, right: np.ndarray
+) -> None:
+    """Fill right (Nants, 4 N) with C and S of X of both components, left with w (C - S) and w (C + S) of them.
+
+    `fringes` are cosine and sine, (2, Nants, N), and `fields` those of the beams, (Nbeams, 4, N): real and imaginary
+    part of one component, then of the other.
+    """
+    n_sources = flux.size
+    for antenna in range(len(index)):
+        for component in range(2):
+            start = 2 * component * n_sources
+            cosine = right[antenna, start : start + n_sources]
+            sine = right[antenna, start + n_sources : start + 2 * n_sources]
+            field = fields[index[antenna]]
+            _multiply(
+                fringes[0, antenna], fringes[1, antenna], field[2 * component], field[2 * component + 1], cosine, sine
+            )
+            low = left[antenna, start : start + n_sources]
+            high = left[antenna, start + n_sources : start + 2 * n_sources]
+            _weigh(cosine, sine, flux, low, high)

@@ -16,10 +16,12 @@ from scipy.constants import speed_of_light
 from scipy.special import jv
 
 from calstudy.base.visibilities import baseline_vectors
+from calstudy.instrument.size import baseline_lengths
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
+    from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.settings import Nodes
 
 EARTH_ROTATION_RATE = 7.2921158553e-5  # rad / s, sidereal
@@ -171,6 +173,27 @@ def _axis(samples: np.ndarray, bandwidth: float, settings: Nodes) -> tuple[np.nd
         return samples, np.eye(len(samples))
     nodes = chebyshev_nodes(samples.min(), samples.max(), count)
     return nodes, interpolation_matrix(nodes, samples)
+
+
+def node_counts(instrument: InstrumentSettings, settings: Nodes) -> tuple[int, int]:
+    """Return how many time and frequency nodes a smooth sky takes, about, from the settings alone: for plans.
+
+    Parameters
+    ----------
+    instrument
+        The `instrument` section.
+    settings
+        Tolerance and extent of the beam, or `enabled=False` for every integration and channel.
+    """
+    times, channels = instrument.times, instrument.channels
+    if not settings.enabled:
+        return times.count, channels.count
+    length = baseline_lengths(instrument.layout)[0] + settings.beam_extent
+    low, high = channels.band
+    rotation = EARTH_ROTATION_RATE * times.integration * (times.count - 1)
+    in_time = chebyshev_count(np.pi * high / speed_of_light * length * rotation, settings.tolerance)
+    in_frequency = chebyshev_count(np.pi * length / speed_of_light * (high - low), settings.tolerance)
+    return min(in_time, times.count), min(in_frequency, channels.count)
 
 
 def node_grid(template: UVData, settings: Nodes, smooth_in_frequency: bool) -> NodeGrid:

@@ -9,7 +9,7 @@ from calstudy.base.observation import Frame
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.layouts import Layout, make_layout
+from calstudy.instrument.layouts import Layout, make_array, make_layout
 from calstudy.instrument.settings import InstrumentSettings
 
 
@@ -19,8 +19,9 @@ def require_calibration(experiment: Experiment) -> None:
         changes, world = assumed_changes(experiment.calibration.assumed), assumed_world(experiment)
         has_sky_model = SKY_MODEL in changes or world.sky.has_foregrounds
         require_calibratable(experiment.calibration, frame_of(experiment.instrument), has_sky_model)
-        if world.instrument.layout != experiment.instrument.layout:
-            _require_same_antennas(make_layout(experiment.instrument.layout), make_layout(world.instrument.layout))
+        places = [(instrument.layout, instrument.site) for instrument in (experiment.instrument, world.instrument)]
+        if places[0] != places[1]:
+            _require_same_antennas(make_array(experiment.instrument), make_array(world.instrument))
 
 
 def _require_same_antennas(true: Layout, assumed: Layout) -> None:

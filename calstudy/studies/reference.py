@@ -14,6 +14,7 @@ from pydantic_core import PydanticUndefined
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
 from calstudy.experiment.model import Experiment, RealizationBlock, Variant
+from calstudy.instrument.as_built import DeadDipoles
 from calstudy.instrument.settings import AntennaBeam
 from calstudy.studies.collection import CollectionFile, Member
 from calstudy.studies.runtime import RuntimeFile
@@ -191,6 +192,9 @@ def field_reference() -> str:
         *_plain_section(AntennaBeam),
         "`beam` takes what `instrument.beam` does.",
         "",
+        "## `instrument.as_built.dipoles.dead`: each",
+        "",
+        *_plain_section(DeadDipoles),
         "# Collection files",
         "",
         "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run",

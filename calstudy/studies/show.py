@@ -72,9 +72,25 @@ def show_plan(study: Study, budget: Budget, console: Console) -> None:
     _total(plan.todo, largest_disk(study.targets, plan.todo), workers, console)
     for note in study.stand_ins:
         console.print(f"stand-in: {note}", markup=False)
+    for place in sites(study.tasks):
+        console.print(f"site: {place}", markup=False)
     console.print(f"store: {store.root}", markup=False, soft_wrap=True)
     for folder in study.folders:
         console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
+
+
+def sites(tasks: Sequence[Task]) -> list[str]:
+    """Return in words where the arrays of simulations are, once each."""
+    from calstudy.instrument.sites import describe
+
+    instruments = [task.settings["instrument"] for task in tasks if "instrument" in task.settings]
+    assumed = "; assumed, for instrument.layout is a CSV file and there is no instrument.location"
+    return list(
+        dict.fromkeys(
+            describe(found.site) + (assumed if found.layout.kind == "csv" and found.location is None else "")
+            for found in instruments
+        )
+    )
 
 
 def _total(tasks: Sequence[Task], disk: float, workers: int, console: Console) -> None:

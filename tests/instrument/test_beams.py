@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from importlib.metadata import distribution
+
+import healpy
 import numpy as np
 import pytest
 from pyuvdata import BeamInterface, UVBeam
@@ -15,13 +19,16 @@ from calstudy.instrument import settings as section
 from calstudy.instrument.beam_models.airy import AiryBeam
 from calstudy.instrument.beam_models.beamfits import FileBeam
 from calstudy.instrument.beam_models.gaussian import GaussianBeam
+from calstudy.instrument.beam_models.hera import FILES, HeraBeam
 from calstudy.instrument.beam_models.mwa_analytic import MwaAnalyticBeam
 from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
 from calstudy.instrument.beam_models.short_dipole import DipoleBeam
-from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, integrate_power, make_beam
+from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, MwaTile, integrate_power, make_beam
 
 CHANNELS = 167.075e6 + 320e3 * np.arange(96)
 BAND = np.array([167.075e6, 182e6, 197.715e6])
+EVEN = np.array([166e6, 182e6, 198e6])
+"""Frequencies of beamfits files, which must be equally spaced."""
 
 
 @pytest.fixture(scope="module")
@@ -236,14 +243,94 @@ def test_unusable_beam_files_are_refused(tmp_path):
         make_beam(FileBeam(kind="beamfits", path=tmp_path / "none.fits"))
 
 
-def test_power_beam_files_are_refused(tmp_path):
-    dipole = ShortDipoleBeam().to_uvbeam(
-        freq_array=BAND[:1], beam_type="power", axis1_array=AZIMUTHS, axis2_array=ZENITH_ANGLES[::10]
-    )
-    assert isinstance(dipole, UVBeam)
+def test_a_power_beam_is_its_root_along_the_feed(tmp_path):
+    """A short dipole from its power: the power is kept, and at the zenith so is the direction of the field."""
+    grid = {"axis1_array": np.radians(np.arange(360.0)), "axis2_array": np.radians(np.arange(91.0))}
+    dipole = ShortDipoleBeam().to_uvbeam(freq_array=EVEN, beam_type="power", **grid)
     dipole.write_beamfits(tmp_path / "power.beamfits")
-    with pytest.raises(InputError, match="power beam"):
-        make_beam(FileBeam(kind="beamfits", path=tmp_path / "power.beamfits"))
+    beam = make_beam(FileBeam(kind="beamfits", path=tmp_path / "power.beamfits", interpolation="linear"))
+    found = beam.at(EVEN).data_array
+    expected = ShortDipoleBeam().to_uvbeam(freq_array=EVEN, **grid).data_array
+    np.testing.assert_allclose((np.abs(found) ** 2).sum(axis=0), (np.abs(expected) ** 2).sum(axis=0), atol=1e-6)
+    np.testing.assert_allclose(found[..., 0, :], expected[..., 0, :], atol=1e-6)
+
+
+def healpix_file(path, beam, **options):
+    """Write a beam in closed form on HEALPix, the half below the horizon as well, and return it."""
+    table = beam.to_uvbeam(freq_array=EVEN, pixel_coordinate_system="healpix", ordering="ring", **options)
+    table.write_beamfits(path)
+    return table
+
+
+@pytest.mark.parametrize("kind", ["efield", "power"])
+def test_healpix_beams_are_read_better_than_pixels_are_apart(tmp_path, kind):
+    """A tile on pixels of 1.8 degrees against its formula, and pyuvdata between these pixels."""
+    path = tmp_path / "beam.beamfits"
+    table = healpix_file(path, MwaTile(), nside=32, beam_type=kind)
+    beam = make_beam(FileBeam(kind="beamfits", path=path, interpolation="linear"))
+    azimuth, zenith_angle = np.radians([3.0, 50, 130, 222, 310]), np.radians([0.5, 2.7, 11, 17.5, 33])
+    points = {"az_array": azimuth, "za_array": zenith_angle, "freq_array": EVEN}
+    expected = (np.abs(MwaTile().efield_eval(**points)) ** 2).sum(axis=0)
+    interface = BeamInterface(beam.at(EVEN), beam_type="efield")
+    found = (np.abs(interface.compute_response(**points, interpolation_function="az_za_simple")) ** 2).sum(axis=0)
+    interface = BeamInterface(table, beam_type=kind)
+    bilinear = interface.compute_response(**points, interpolation_function="healpix_simple")
+    bilinear = (np.abs(bilinear) ** 2).sum(axis=0) if kind == "efield" else bilinear[0, :2].real
+    # Splines of degree 5 over pixels of a tenth of the beam; bilinear interpolation errs by their square.
+    assert np.abs(found - expected).max() < 2e-4
+    assert np.abs(bilinear - expected).max() > 10 * np.abs(found - expected).max()
+
+
+def test_nested_pixels_are_the_same_beam(tmp_path):
+    found = []
+    for ordering in ("ring", "nested"):
+        table = MwaTile().to_uvbeam(freq_array=EVEN, pixel_coordinate_system="healpix", nside=16, ordering=ordering)
+        table.write_beamfits(tmp_path / f"{ordering}.beamfits")
+        path = tmp_path / f"{ordering}.beamfits"
+        found.append(make_beam(FileBeam(kind="beamfits", path=path, interpolation="linear")).at(EVEN).data_array)
+    np.testing.assert_allclose(*found, atol=1e-12)
+
+
+def test_a_healpix_beam_without_all_of_the_sky_is_refused(tmp_path):
+    path = tmp_path / "part.beamfits"
+    healpix_file(path, MwaTile(), nside=16, healpix_pixel_array=np.arange(300))
+    with pytest.raises(InputError, match="does not have all pixels above the horizon"):
+        make_beam(FileBeam(kind="beamfits", path=path))
+
+
+def test_a_beam_whose_feed_x_is_north_south_is_refused(tmp_path):
+    turned = ShortDipoleBeam(x_orientation="north").to_uvbeam(
+        freq_array=EVEN, axis1_array=AZIMUTHS, axis2_array=ZENITH_ANGLES[::10]
+    )
+    turned.write_beamfits(tmp_path / "north.beamfits")
+    with pytest.raises(InputError, match=r"feed x of .* is not east-west"):
+        make_beam(FileBeam(kind="beamfits", path=tmp_path / "north.beamfits"))
+
+
+@pytest.mark.parametrize(("model", "frequency", "pixels"), [("fagnoni", 160e6, "healpix"), ("nic-cst", 130e6, "az_za")])
+def test_hera_beams_are_those_of_their_files(model, frequency, pixels):
+    """At a tabulated frequency and the pixels of the file, which pyuvdata reads by itself."""
+    name, path = FILES[model]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # The files are old, and say little of their feeds.
+        table = UVBeam.from_file(distribution(name).locate_file(path), file_type="beamfits")
+    assert table.pixel_coordinate_system == pixels
+    channels = section.Channels(first=f"{frequency / 1e6 - 4} MHz", width="1 MHz", count=8)
+    beam = make_beam(HeraBeam(kind="hera", model=model, interpolation="linear"), channels)
+    at = np.array([frequency])
+    rng = np.random.default_rng(3)
+    azimuth, zenith_angle = np.radians(rng.integers(0, 360, 200)), np.radians(rng.integers(1, 60, 200))
+    if pixels == "healpix":
+        chosen = rng.choice(np.flatnonzero(table.pixel_array < 12 * 32**2 // 5), 200)
+        zenith_angle, azimuth = healpy.pix2ang(32, table.pixel_array[chosen])
+    points = {"az_array": azimuth, "za_array": zenith_angle, "freq_array": at}
+    function = "healpix_simple" if pixels == "healpix" else "az_za_simple"
+    expected = BeamInterface(table, beam_type="efield").compute_response(**points, interpolation_function=function)
+    found = BeamInterface(beam.at(at), beam_type="efield").compute_response(
+        **points, interpolation_function="az_za_simple"
+    )
+    power_found, power_expected = ((np.abs(jones) ** 2).sum(axis=0) for jones in (found, expected))
+    np.testing.assert_allclose(power_found, power_expected * (power_found.max() / power_expected.max()), atol=2e-3)
 
 
 def test_integral_of_an_isotropic_beam_is_the_hemisphere():

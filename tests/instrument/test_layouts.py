@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
+from importlib.resources import files
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from pyuvdata.utils import ENU_from_ECEF
 
 from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
 from calstudy.instrument.layouts import GOLOMB_MARKS, make_layout, redundant_groups
+from calstudy.instrument.sites import SITES
+from calstudy.instrument.size import antenna_count, baseline_lengths
 
 
 def vectors_of(layout):
@@ -152,3 +157,78 @@ def test_impossible_layouts_are_refused():
         section.MwaLayout(kind="mwa-compact-hex-east", count=37)
     with pytest.raises(ValidationError, match="must exceed the length of a row"):
         section.RectangularLayout(kind="rectangular", spacing="20 m", max_baseline="100 m")
+
+
+@pytest.mark.parametrize("kind", section.HeraLayout.sizes)
+def test_hera_arrays_have_their_antennas_at_their_spacing(kind):
+    layout = make_layout(section.HeraLayout(kind=kind))
+    assert len(layout.numbers) == len(set(layout.names)) == section.HeraLayout.sizes[kind]
+    assert np.linalg.norm(vectors_of(layout), axis=1).min() == pytest.approx(14.6)
+    assert layout.location.lat.deg == pytest.approx(-30.7215, abs=1e-3)
+
+
+def test_hera_is_where_it_was_surveyed():
+    """Every antenna of the design against the surveyed position of the antenna with its number, in pyuvdata's table.
+
+    The survey's grid is turned against east by the convergence of its map projection, and lengths on that map are
+    longer by its scale factor; both are fitted. What is left are the millimetres to which the table was made.
+    """
+    with (files("pyuvdata") / "data" / "hera_ant_pos.csv").open() as table:
+        rows = sorted(csv.DictReader(table), key=lambda row: int(row["number"]))
+    site = SITES["hera"]
+    centre = np.array([axis.to_value("m") for axis in site.geocentric])
+    surveyed = ENU_from_ECEF(centre + [[float(row[axis]) for axis in "xyz"] for row in rows], center_loc=site)
+    surveyed, design = (
+        (enu - enu.mean(axis=0))[:, :2] @ [1, 1j]
+        for enu in (surveyed, make_layout(section.HeraLayout(kind="hera-350")).enu)
+    )
+    factor = np.vdot(design, surveyed) / np.vdot(design, design)
+    assert abs(abs(factor) - 1) < 1e-3
+    assert abs(np.angle(factor, deg=True)) < 0.3
+    assert np.abs(surveyed - factor * design).max() < 0.01
+
+
+def test_parts_of_hera():
+    whole = vectors_of(make_layout(section.HeraLayout(kind="hera-350")))
+    for kind in ("hera-128", "hera-320"):
+        part = make_layout(section.HeraLayout(kind=kind))
+        first, second = np.triu_indices(len(part.numbers), 1)
+        places = first * 350 - first * (first + 1) // 2 + second - first - 1
+        np.testing.assert_allclose(vectors_of(part), whole[places], atol=1e-9)
+    for kind, side in (("hera-19", 3), ("hera-37", 4)):
+        hexagon = make_layout(section.HexLayout(kind="hex", side=side, spacing="14.6 m"))
+        np.testing.assert_array_equal(make_layout(section.HeraLayout(kind=kind)).enu, hexagon.enu)
+
+
+def test_mwa_configurations_are_the_parts_of_the_whole_array():
+    """Phase II extended is Phase I without its core, and 56 tiles at up to 5.3 km (Wayth et al. 2018)."""
+    compact, extended, phase1 = (
+        make_layout(section.MwaLayout(kind=kind)) for kind in ("mwa-compact", "mwa-extended", "mwa-phase1")
+    )
+    assert len(extended.names) == len(phase1.names) == 128
+    assert not set(extended.names) & set(compact.names)
+    assert len(set(extended.names) & set(phase1.names)) == 72
+    assert set(phase1.names) == {name for name in (*compact.names, *extended.names) if name.startswith("Tile")}
+    assert 5.2e3 < np.linalg.norm(vectors_of(extended), axis=1).max() < 5.4e3
+    place, known = (dict(zip(layout.names, layout.enu, strict=True)) for layout in (phase1, compact))
+    # Horizontal offsets do not depend on the configuration; heights are about its mean.
+    assert place["Tile011"][:2] == pytest.approx(known["Tile011"][:2], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "layout", [*map(section.MwaLayout.model_validate, ({"kind": kind} for kind in section.MwaLayout.sizes))], ids=str
+)
+def test_plans_know_mwa_arrays(layout):
+    check_size(layout)
+
+
+@pytest.mark.parametrize("kind", section.HeraLayout.sizes)
+def test_plans_know_hera_arrays(kind):
+    check_size(section.HeraLayout(kind=kind))
+    assert antenna_count(section.HeraLayout(kind=kind, count=7)) == 7
+
+
+def check_size(layout):
+    lengths = np.linalg.norm(vectors_of(make_layout(layout)), axis=1)
+    assert antenna_count(layout) == len(make_layout(layout).numbers)
+    assert baseline_lengths(layout) == pytest.approx((lengths.max(), lengths.mean()), rel=0.01)

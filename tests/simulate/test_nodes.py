@@ -8,12 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulation_cases import observe
 
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.telescope import make_template
 from calstudy.simulate.nodes import (
     chebyshev_count,
     chebyshev_nodes,
     frequency_bandwidth,
     integration_times,
     interpolation_matrix,
+    node_counts,
     node_grid,
     time_bandwidth,
 )
@@ -109,3 +112,14 @@ def test_a_sky_that_is_not_smooth_has_every_channel_as_a_node():
     grid = node_grid(template, Nodes(), smooth_in_frequency=False)
     assert grid.at_channels
     assert not grid.at_integrations
+
+
+@pytest.mark.parametrize("layout", ["mwa-compact-minredundant", "hera-19", "mwa-extended"])
+def test_plans_expect_the_nodes_that_there_are(layout):
+    """The plan takes baselines for perpendicular to the Earth's axis, so it may have more, but not many more."""
+    settings = InstrumentSettings.model_validate({"layout": {"kind": layout}, "times": {"integration": "10 s"}})
+    grid = node_grid(make_template(settings), Nodes(), smooth_in_frequency=True)
+    times, frequencies = node_counts(settings, Nodes())
+    assert frequencies == len(grid.frequencies)
+    assert len(grid.times_jd) <= times < 1.2 * len(grid.times_jd) + 2
+    assert node_counts(settings, Nodes(enabled=False)) == (56, 384)

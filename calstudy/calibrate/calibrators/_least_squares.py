@@ -67,7 +67,7 @@ class LeastSquares(GainFit):
         coefficients = structure.basis.n_coefficients
         unknowns = coefficients + structure.n_antennas * structure.n_frequencies
         samples = structure.n_baselines * structure.n_frequencies
-        notes = ()
+        notes: tuple[str, ...] = ()
         if unknowns >= CROWDED * samples:
             notes = (
                 f"The fit has {unknowns} unknowns for {samples} samples, so that it can absorb anything: expect slow "

@@ -203,7 +203,7 @@ def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Te
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
     if blocks.absorbed is not None:
         # L of the module's M.
-        inverse = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), blocks.gram.dtype)
+        inverse = tf.cast(_inverse(tf.cast(blocks.gram, tf.float64)), blocks.degrees.dtype)
         lift = tf.cast(blocks.degrees[:, :, None] * (blocks.common @ inverse), columns.dtype)
         inner = tf.matmul(columns, lift, adjoint_a=True)
         matrix -= inner @ tf.matmul(tf.complex(blocks.absorbed[0], blocks.absorbed[1]), inner, adjoint_b=True)

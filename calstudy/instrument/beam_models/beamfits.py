@@ -12,7 +12,10 @@ from calstudy.instrument.settings import Channels
 
 
 class FileBeam(BeamModel):
-    """An E-field beam from a beamfits file, on a grid of azimuth and zenith angle."""
+    """A beam from a beamfits file, on a grid of azimuth and zenith angle or on HEALPix.
+
+    It should be an E-field: of a power beam the field is taken to be its root, along the direction of the feed.
+    """
 
     path: Path = Field(strict=False)
     interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = "chebyshev"
@@ -24,8 +27,9 @@ class FileBeam(BeamModel):
 
     def make(self, channels: Channels) -> Beam:
         """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
+        from calstudy.instrument.beam_grid import read_beamfits
         from calstudy.instrument.beams import GriddedBeam
-        from calstudy.instrument.tabulated import TabulatedBeam, read_beamfits
+        from calstudy.instrument.tabulated import TabulatedBeam
 
         table = TabulatedBeam(read_beamfits(self.path), channels.band, self.interpolation)
         return GriddedBeam(table, self.path.name, STAND_IN.format(what=f"the file {self.path.name}"))

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
 from calstudy.instrument.interface import Beam, BeamModel
 from calstudy.instrument.settings import Channels
 
+if TYPE_CHECKING:
+    import numpy as np
+
 
 class MwaEmbeddedBeam(BeamModel):
     """The MWA full embedded element beam (Sokolowski et al. 2017), pointed at zenith."""
+
+    dipoles: ClassVar[int] = 16
 
     path: Path | None = Field(None, strict=False, description="Beam file; default: the file of the mwa_pb package.")
     interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = Field(
@@ -33,3 +38,11 @@ class MwaEmbeddedBeam(BeamModel):
 
         table = read_mwa_embedded_element(self.path, channels.band)
         return GriddedBeam(TabulatedBeam(table, channels.band, self.interpolation), self.kind, None)
+
+    def make_tiles(self, channels: Channels, amplitudes: np.ndarray) -> list[Beam]:
+        """Return the beams of tiles with given amplitudes of their dipoles, (Ntiles, 2 [x, y], 16)."""
+        from calstudy.instrument.beams import GriddedBeam
+        from calstudy.instrument.dipoles import Tile, dipole_fields
+
+        fields = dipole_fields(self.path, channels.band, self.interpolation)
+        return [GriddedBeam(Tile(fields, weights), self.kind, None) for weights in amplitudes]

@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from calstudy.calibrate.settings import FirstOrderSettings, GainFit, Solver
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.settings import NoNoise, RadiometerNoise
+from calstudy.instrument.as_built import AsBuilt
 from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
 
 if TYPE_CHECKING:
@@ -152,6 +153,8 @@ def _other_noise(role: str, experiment: Experiment) -> str | None:
 
 def _other_data(role: str, experiment: Experiment) -> str | None:
     del role
+    if experiment.instrument.as_built != AsBuilt():
+        return "instrument.as_built is set: the paper's antennas are as designed"
     if experiment.corruption.eor_level != EOR_LEVEL:
         return f"corruption.eor_level is not {EOR_LEVEL:g} dB"
     papers = type(experiment).model_fields["variants"].get_default(call_default_factory=True)

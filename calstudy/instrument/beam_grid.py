@@ -1,0 +1,214 @@
+"""Beams of UVBeam files, on grids or HEALPix, E-field or power, as E-fields on a grid of azimuth and zenith angle.
+
+Components along azimuth and zenith angle jump at the zenith. Between pixels it is therefore the components along two
+fixed directions that are interpolated (`fixed_components`).
+"""
+
+from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+
+import healpy
+import numpy as np
+from pyuvdata import UVBeam
+from scipy.interpolate import make_interp_spline
+
+from calstudy.base.errors import InputError
+
+POLARIZATIONS = {"x": -5, "y": -6}
+# HEALPix maps finer than this are put on a grid finer than one point per degree.
+DEGREE_NSIDE = 64
+# Of the splines across the rings of a HEALPix map.
+SPLINE_DEGREE = 5
+# Of a ring of n pixels, orders above (n - 1) / 2 by this are taken for zero: amplitudes grow as a power of the angle.
+UNRESOLVED = 2
+# Rings below the horizon that splines may use (rad).
+BELOW = np.radians(15)
+
+
+def read_beamfits(path: Path) -> UVBeam:
+    """Read a beam from a beamfits file, as an E-field on a grid of azimuth and zenith angle from the zenith.
+
+    The phases of a power beam are lost: its field is the square root of the power, along the direction of the feed.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cannot be read, or has other feeds than x and y, or not the sky above the horizon.
+    """
+    if not path.is_file():
+        raise InputError(f"instrument.beam.path: there is no file {path}")
+    return _read(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=2)
+def _read(path: Path, modified: int) -> UVBeam:
+    del modified
+    with warnings.catch_warnings():
+        # Files of earlier versions lack what pyuvdata now wants to know; what is used here is checked below.
+        warnings.simplefilter("ignore")
+        try:
+            beam = UVBeam.from_file(path, file_type="beamfits")
+        except (OSError, KeyError, ValueError) as error:
+            raise InputError(f"instrument.beam.path: {path} cannot be read as beamfits ({error})") from error
+    feeds = _feeds(beam)
+    described = f"it contains a {beam.beam_type} beam of feeds {', '.join(feeds)} on {beam.pixel_coordinate_system}"
+    usable = feeds in (["x", "y"], ["x"]) and beam.pixel_coordinate_system in ("az_za", "healpix")
+    if not usable or (beam.pixel_coordinate_system == "az_za" and beam.axis2_array[0] != 0):
+        raise InputError(
+            f"instrument.beam.path: {path} must contain a beam of feeds x and y on a grid of azimuth and zenith angle "
+            f"from the zenith, or on HEALPix; {described}"
+        )
+    angles = None if beam.feed_angle is None else dict(zip(beam.feed_array, beam.feed_angle, strict=True))
+    if angles is not None and not np.isclose(abs(angles["x"]), np.pi / 2):
+        raise InputError(f"instrument.beam.path: feed x of {path} is not east-west, which it must be")
+    if beam.beam_type == "efield" and beam.pixel_coordinate_system == "az_za":
+        return beam
+    return _on_grid(beam, feeds, path)
+
+
+def _feeds(beam: UVBeam) -> list[str]:
+    if beam.beam_type == "efield":
+        return list(beam.feed_array)
+    return [feed for feed, number in POLARIZATIONS.items() if number in beam.polarization_array]
+
+
+def _on_grid(beam: UVBeam, feeds: list[str], path: Path) -> UVBeam:
+    """Return a beam on HEALPix, or a power beam, as an E-field on a grid."""
+    if beam.pixel_coordinate_system == "healpix":
+        per_degree = -(-beam.nside // DEGREE_NSIDE)
+        azimuth = np.radians(np.arange(360 * per_degree) / per_degree)
+        zenith_angle = np.radians(np.arange(90 * per_degree + 1) / per_degree)
+        values = HealpixRings(beam, path).on_grid(_smooth_values(beam, feeds), azimuth, zenith_angle)
+    else:
+        azimuth, zenith_angle, values = beam.axis1_array, beam.axis2_array, _smooth_values(beam, feeds)
+    if beam.beam_type == "power":
+        values = np.sqrt(np.maximum(values.real, 0))
+        along = [int(feed == "y") for feed in feeds]
+        fields = np.zeros((2, *values.shape), dtype=complex)
+        fields[along, range(len(feeds))] = values
+        values = fields
+    basis = np.zeros((2, 2, len(zenith_angle), len(azimuth)))
+    basis[0, 0] = basis[1, 1] = 1.0
+    return UVBeam.new(
+        telescope_name=beam.telescope_name,
+        feed_name=beam.feed_name,
+        feed_version=beam.feed_version,
+        model_name=beam.model_name,
+        model_version=beam.model_version,
+        data_normalization="physical",
+        freq_array=beam.freq_array,
+        feed_array=feeds,
+        feed_angle=[np.pi / 2, 0.0][: len(feeds)],
+        mount_type="fixed",
+        pixel_coordinate_system="az_za",
+        axis1_array=azimuth,
+        axis2_array=zenith_angle,
+        basis_vector_array=basis,
+        data_array=polar_components(values, azimuth),
+        history=beam.history,
+    )
+
+
+def _smooth_values(beam: UVBeam, feeds: list[str]) -> np.ndarray:
+    """Return what is smooth at the zenith: power, (Nfeeds, ...), or fixed components of the field, (2, Nfeeds, ...)."""
+    if beam.beam_type == "power":
+        places = [list(beam.polarization_array).index(POLARIZATIONS[feed]) for feed in feeds]
+        return beam.data_array[0, places].real.astype(complex)
+    longitude = healpy.pix2ang(beam.nside, beam.pixel_array, nest=beam.ordering == "nested")[1]
+    # Axes of the file to azimuth and zenith angle.
+    polar = np.einsum("a...p,acp->c...p", beam.data_array, beam.basis_vector_array)
+    return fixed_components(polar, longitude)
+
+
+class HealpixRings:
+    """The rings of a HEALPix beam above the horizon and a little below.
+
+    The pixels of a ring are equally spaced, and give its Fourier coefficients in azimuth as far as they are many
+    enough. Splines in zenith angle join those of all rings, order by order. They go on beyond the zenith, where a
+    coefficient of order m returns with the sign (-1)^m, and at which all but that of order 0 vanish.
+
+    Parameters
+    ----------
+    beam
+        On HEALPix; azimuth from east through north is the longitude.
+    path
+        For messages.
+
+    Raises
+    ------
+    InputError
+        If a pixel above the horizon is missing.
+    """
+
+    def __init__(self, beam: UVBeam, path: Path) -> None:
+        nested = beam.ordering == "nested"
+        numbers = healpy.nest2ring(beam.nside, beam.pixel_array) if nested else beam.pixel_array
+        place = np.full(12 * beam.nside**2, -1)
+        place[numbers] = np.arange(len(numbers))
+        colatitude, longitude = healpy.pix2ang(beam.nside, np.arange(len(place)))
+        first = np.flatnonzero(np.diff(colatitude, prepend=-1.0) > 1e-9)
+        self._rings: list[tuple[np.ndarray, float]] = []
+        angles: list[float] = []
+        for start, stop in pairwise([*first, len(place)]):
+            members, angle = place[start:stop], float(colatitude[start])
+            if angle > np.pi / 2 + BELOW or (angle > np.pi / 2 and (members < 0).any()):
+                break
+            if (members < 0).any():
+                raise InputError(f"instrument.beam.path: {path} does not have all pixels above the horizon")
+            self._rings.append((members, float(longitude[start])))
+            angles.append(angle)
+        self._zenith_angles = np.array(angles)
+        # Coefficients of a higher order cannot be told from those of a lower one.
+        self._resolved = np.array([(len(members) - 1) // 2 for members, _ in self._rings])
+
+    def on_grid(self, values: np.ndarray, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return values (..., Npixels), which are smooth at the zenith, on a grid, (..., Nza, Naz)."""
+        highest = int(self._resolved.max())
+        orders = np.arange(-highest, highest + 1)
+        coefficients = np.zeros((len(self._rings), len(orders), *values.shape[:-1]), dtype=complex)
+        for ring, (members, longitude) in enumerate(self._rings):
+            modes = np.fft.fft(values[..., members], axis=-1) / len(members)
+            inner = np.abs(orders) <= self._resolved[ring]
+            shifted = modes[..., orders[inner]] * np.exp(-1j * orders[inner] * longitude)
+            coefficients[ring, inner] = np.moveaxis(shifted, -1, 0)
+        by_order = [
+            self._along_zenith_angle(order, coefficients[:, place], zenith_angle)
+            for place, order in enumerate(orders.tolist())
+        ]
+        # (Nza, ..., Norders) to (..., Nza, Naz).
+        return np.moveaxis(np.stack(by_order, axis=-1) @ np.exp(1j * orders[:, None] * azimuth), 0, -2)
+
+    def _along_zenith_angle(self, order: int, coefficients: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return the coefficients (Nrings, ...) of an order at other zenith angles, (Nza, ...)."""
+        # Rings of too few pixels are left out where the coefficient may matter, and are zero further in.
+        used = (self._resolved >= abs(order)) | (self._resolved < abs(order) - UNRESOLVED)
+        angles, sign = self._zenith_angles[used], (-1) ** abs(order)
+        nodes, values = [-angles[::-1], angles], [sign * coefficients[used][::-1], coefficients[used]]
+        if order != 0:
+            nodes.insert(1, np.zeros(1))
+            values.insert(1, np.zeros_like(coefficients[:1]))
+        return make_interp_spline(np.concatenate(nodes), np.concatenate(values), k=SPLINE_DEGREE)(zenith_angle)
+
+
+def fixed_components(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Return the components along and across feed x (Ludwig's third definition), (2, ..., Ndirections), of a field.
+
+    Parameters
+    ----------
+    polar
+        Its components along azimuth and zenith angle, (2, ..., Ndirections).
+    azimuth
+        From east through north, rad, (Ndirections,).
+    """
+    sine, cosine = np.sin(azimuth), np.cos(azimuth)
+    return np.stack([cosine * polar[1] - sine * polar[0], sine * polar[1] + cosine * polar[0]])
+
+
+def polar_components(fixed: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Return the components along azimuth and zenith angle of what `fixed_components` returned."""
+    sine, cosine = np.sin(azimuth), np.cos(azimuth)
+    return np.stack([cosine * fixed[1] - sine * fixed[0], cosine * fixed[0] + sine * fixed[1]])

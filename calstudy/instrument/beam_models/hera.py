@@ -1,0 +1,45 @@
+"""HERA's beam."""
+
+from __future__ import annotations
+
+from importlib.metadata import distribution
+from pathlib import Path
+from typing import Literal
+
+from calstudy.instrument.interface import STAND_IN, Beam, BeamModel
+from calstudy.instrument.settings import Channels
+
+FILES = {
+    "fagnoni": ("hera_pspec", "hera_pspec/data/HERA_NF_efield.beamfits"),
+    "nic-cst": ("pyuvsim", "pyuvsim/data/HERA_NicCST.beamfits"),
+}
+"""Distribution and file in it of each model."""
+
+
+class HeraBeam(BeamModel):
+    """HERA's dish with the dipole feed of Phase I, from electromagnetic simulations by Nicolas Fagnoni.
+
+    `fagnoni` is tabulated every 4 MHz from 100 to 200 MHz, on HEALPix of nside 32 (in the package hera_pspec).
+    `nic-cst` is tabulated every 15 MHz from 100 to 145 MHz, on a grid of one degree (in pyuvsim). Between these
+    frequencies either is a smooth fit; it cannot have the structure in delay that reflections in the dish make beyond
+    some 100 ns.
+    """
+
+    model: Literal["fagnoni", "nic-cst"] = "fagnoni"
+    interpolation: Literal["chebyshev", "cubic", "linear", "nearest"] = "chebyshev"
+
+    @property
+    def smooth(self) -> bool:
+        """Whether it is interpolated by a smooth fit."""
+        return self.interpolation == "chebyshev"
+
+    def make(self, channels: Channels) -> Beam:
+        """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
+        from calstudy.instrument.beam_grid import read_beamfits
+        from calstudy.instrument.beams import GriddedBeam
+        from calstudy.instrument.tabulated import TabulatedBeam
+
+        distribution_name, path = FILES[self.model]
+        file = Path(str(distribution(distribution_name).locate_file(path)))
+        table = TabulatedBeam(read_beamfits(file), channels.band, self.interpolation)
+        return GriddedBeam(table, self.kind, STAND_IN.format(what=f"HERA's ({self.model})"))

@@ -1,0 +1,162 @@
+"""Beams of antennas that are tilted, turned, wider or narrower than designed, or have their feeds exchanged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyuvdata import UVBeam
+from pyuvdata.analytic_beam import AnalyticBeam, UnpolarizedAnalyticBeam
+from scipy.ndimage import spline_filter1d
+from scipy.spatial.transform import Rotation
+
+from calstudy.base.errors import InputError
+from calstudy.instrument.as_built import Misalignment
+from calstudy.instrument.beam_grid import fixed_components, polar_components
+from calstudy.instrument.interface import AntennaBeam
+from calstudy.instrument.splines import bspline_coefficients, cells, spline_fields
+from calstudy.instrument.tabulated import tabulate
+
+# Rows by which a table is extended beyond the zenith: splines forget their ends within a few.
+MARGIN = 12
+
+
+class MisalignedBeam:
+    """The beam of an antenna whose orientation, width or feeds are not as designed (`AntennaBeam`).
+
+    Its pattern moves with the antenna, and so does its polarization. It is one where the nominal beam is, at the
+    antenna's own axis.
+
+    Parameters
+    ----------
+    beam
+        As designed.
+    misalignment
+        What differs.
+    """
+
+    def __init__(self, beam: AntennaBeam, misalignment: Misalignment) -> None:
+        self.name, self.stand_in = beam.name, beam.stand_in
+        self._beam, self._misalignment = beam, misalignment
+
+    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
+        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)).
+
+        Raises
+        ------
+        InputError
+            If feeds are exchanged and there is only one, or a table does not go all around.
+        """
+        beam = self._beam.at(frequencies)
+        if self._misalignment.swapped and list(beam.feed_array) != ["x", "y"]:
+            raise InputError(f"instrument.as_built.beams.swapped: the beam {self.name} does not have feeds x and y")
+        if isinstance(beam, UVBeam):
+            return tabulate(beam, _turned_table(beam, self._misalignment), frequencies)
+        # A formula may have settings of its own for its feeds; they are those of what it describes.
+        return TurnedBeam(
+            nominal=beam, misalignment=self._misalignment, feed_array=beam.feed_array, feed_angle=beam.feed_angle
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class TurnedBeam(AnalyticBeam):
+    """A beam in closed form, evaluated in the frame of a misaligned antenna."""
+
+    nominal: AnalyticBeam
+    misalignment: Misalignment
+
+    basis_vector_type = "az_za"
+
+    def _efield_eval(self, *, az_grid: np.ndarray, za_grid: np.ndarray, f_grid: np.ndarray) -> np.ndarray:
+        """Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
+        # The same directions at all frequencies.
+        frame = AntennaFrame(self.misalignment, az_grid[0], za_grid[0])
+        jones = self.nominal.efield_eval(
+            az_array=frame.azimuth, za_array=frame.nominal_zenith_angle, freq_array=f_grid[:, 0]
+        )
+        if not isinstance(self.nominal, UnpolarizedAnalyticBeam):
+            jones = frame.to_ground(jones)
+        return jones[:, ::-1] if self.misalignment.swapped else jones
+
+
+class AntennaFrame:
+    """Directions in the frame of a misaligned antenna.
+
+    Parameters
+    ----------
+    misalignment
+        Of the antenna.
+    azimuth, zenith_angle
+        Directions, rad, azimuth from east through north, (Ndirections,).
+
+    Attributes
+    ----------
+    azimuth
+        In the frame of the antenna, rad.
+    nominal_zenith_angle
+        At which the nominal beam has the value of this one, rad, at most pi / 2: what is below the antenna's own
+        horizon has the value there.
+    """
+
+    def __init__(self, misalignment: Misalignment, azimuth: np.ndarray, zenith_angle: np.ndarray) -> None:
+        tilt = Rotation.from_rotvec([-misalignment.north, misalignment.east, 0.0])
+        self._turn = tilt * Rotation.from_rotvec([0.0, 0.0, misalignment.rotation])
+        self._ground = _basis(azimuth, zenith_angle)
+        east, north, up = self._turn.apply(_direction(azimuth, zenith_angle), inverse=True).T
+        self.azimuth = np.arctan2(north, east) % (2 * np.pi)
+        self._zenith_angle = np.arctan2(np.hypot(east, north), up)
+        self.nominal_zenith_angle = np.minimum(self._zenith_angle / misalignment.width, np.pi / 2)
+
+    def to_ground(self, jones: np.ndarray) -> np.ndarray:
+        """Return azimuth and zenith angle components, (2, ..., Ndirections), on the ground of those of the antenna."""
+        own = [self._turn.apply(vector) for vector in _basis(self.azimuth, self._zenith_angle)]
+        overlaps = [[(ground * vector).sum(axis=1) for vector in own] for ground in self._ground]
+        return np.stack([first * jones[0] + second * jones[1] for first, second in overlaps])
+
+
+def _direction(azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+    """Return unit vectors in east, north, up, (N, 3)."""
+    sine = np.sin(zenith_angle)
+    return np.column_stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith_angle)])
+
+
+def _basis(azimuth: np.ndarray, zenith_angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit vectors of growing azimuth and of growing zenith angle, (N, 3) each."""
+    cosine, zeros = np.cos(zenith_angle), np.zeros_like(azimuth)
+    along_azimuth = np.column_stack([-np.sin(azimuth), np.cos(azimuth), zeros])
+    along_zenith_angle = np.column_stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), -np.sin(zenith_angle)])
+    return along_azimuth, along_zenith_angle
+
+
+def _turned_table(beam: UVBeam, misalignment: Misalignment) -> np.ndarray:
+    """Return J of a misaligned antenna on the grid of the nominal one, (2, Nfeeds, Nfreqs, Nza, Naz)."""
+    azimuth, zenith_angle = beam.axis1_array, beam.axis2_array
+    step = azimuth[1] - azimuth[0]
+    around = np.isclose(len(azimuth) * step, 2 * np.pi) and len(azimuth) % 2 == 0
+    if not around or zenith_angle[0] != 0:
+        raise InputError("instrument.as_built.beams: the table of the beam must go all around, from the zenith")
+    frame = AntennaFrame(misalignment, *(axis.ravel() for axis in np.meshgrid(azimuth, zenith_angle)))
+    # Components in azimuth and zenith angle jump at the zenith; along two fixed directions they are smooth there.
+    table = _spline_table(fixed_components(beam.data_array, azimuth))
+    rows = cells(frame.nominal_zenith_angle, np.concatenate([-zenith_angle[MARGIN:0:-1], zenith_angle]))
+    columns = cells((frame.azimuth - azimuth[0]) % (2 * np.pi), step * np.arange(len(azimuth) + 1))
+    values = np.empty((len(frame.azimuth), table.shape[2]))
+    spline_fields(table, *rows, *columns, values)
+    shape = (len(frame.azimuth), *beam.data_array.shape[:3])
+    fixed = np.moveaxis(values.view(np.complex128).reshape(shape), 0, -1)
+    jones = frame.to_ground(polar_components(fixed, frame.azimuth)).reshape(beam.data_array.shape)
+    return jones[:, ::-1] if misalignment.swapped else jones
+
+
+def _spline_table(values: np.ndarray) -> np.ndarray:
+    """Return the coefficients of splines, (MARGIN + Nza + 2, Naz + 3, Nvalues) float, of values (..., Nza, Naz).
+
+    Rows go on beyond the zenith on the other side, so that the splines do not end there. Columns go around.
+    """
+    n_columns = values.shape[-1]
+    beyond = np.roll(values, n_columns // 2, axis=-1)[..., MARGIN:0:-1, :]
+    extended = np.concatenate([beyond, values], axis=-2)
+    flat = np.ascontiguousarray(np.moveaxis(extended.reshape(-1, *extended.shape[-2:]), 0, -1)).view(np.float64)
+    along_rows = np.tensordot(bspline_coefficients(len(flat)), flat, axes=1)
+    coefficients = spline_filter1d(along_rows, order=3, axis=1, mode="grid-wrap")
+    return np.take(coefficients, np.arange(-1, n_columns + 2) % n_columns, axis=1)
