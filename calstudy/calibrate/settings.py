@@ -229,6 +229,16 @@ class GainFit(Calibrator):
         return True
 
 
+ScalePrior = Annotated[
+    Literal["sum", "post-hoc", "gains", "sky-model", "none"],
+    Field(
+        description="How the overall scale is fixed: by the paper's prior on the summed model, by the summed model "
+        "afterwards, by the geometric mean of the gains afterwards, by regression of the calibrated data on the sky "
+        "model afterwards, or not."
+    ),
+]
+
+
 class ForegroundFit(GainFit):
     """Settings of calibrators that fit foregrounds with the gains, in a basis of functions of frequency.
 
@@ -242,12 +252,7 @@ class ForegroundFit(GainFit):
         description="Groups of baselines with common coefficients and vectors of your own, in place of the DPSS basis; "
         "other baselines keep theirs.",
     )
-    prior: Literal["sum", "post-hoc", "gains", "sky-model", "none"] = Field(
-        "sum",
-        description="How the overall scale is fixed: by the paper's prior on the summed model, by the summed model "
-        "afterwards, by the geometric mean of the gains afterwards, by regression of the calibrated data on the sky "
-        "model afterwards, or not.",
-    )
+    prior: ScalePrior = "sum"
 
     @model_validator(mode="before")
     @classmethod

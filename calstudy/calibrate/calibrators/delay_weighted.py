@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from calstudy.calibrate.calibrators._least_squares import LeastSquares
-from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior
+from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, ScalePrior
 
 
 class DelayWeighted(LeastSquares, ForegroundFit):
@@ -13,4 +11,4 @@ class DelayWeighted(LeastSquares, ForegroundFit):
 
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
-    prior: Literal["sum", "post-hoc", "gains", "sky-model", "none"] = "sky-model"
+    prior: ScalePrior = "sky-model"
