@@ -15,7 +15,7 @@ from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube
 from calstudy.calibrate.calibrators.sky_based import SkyBased
-from calstudy.calibrate.delay_start import delay_start
+from calstudy.calibrate.delay_start import _DelaySearch, delay_start
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.preparation import prepare
@@ -105,6 +105,62 @@ def test_without_the_sky_delays_are_right_but_for_a_gradient(cables):
     assert rms(errors(toy, delays_of(start), delays)) < 0.05 * horizon
     assert rms(errors(toy, np.zeros(ANTENNAS), delays)) > horizon
     assert np.allclose(np.abs(start), 1)
+
+
+def one_source(extent, cables, direction=(0.15, -0.1)):
+    """Return antennas under a single source at these direction cosines, with cables up to so long, and their delays."""
+    positions = extent / 20 * scattered(ANTENNAS)
+    toy = make_toy(positions, noise=0.0)
+    fringe = np.exp(-2j * np.pi * FREQUENCIES * (toy.vectors[:, :2] @ np.array(direction))[:, None] / speed_of_light)
+    delays = np.random.default_rng(8).uniform(-cables, cables, ANTENNAS)
+    return replace(toy, foregrounds=fringe, noise=0 * fringe, gains=np.exp(delays[:, None] * TURNS)), delays
+
+
+def test_on_a_large_array_a_gradient_is_the_sky():
+    """A kilometre: the source is 0.6 us from the zenith on long baselines, and cables have scattered by 10 ns."""
+    toy, delays = one_source(1000, 10e-9)
+    found = delays_of(start_of(toy))
+    first, second = toy.antennas.T
+    assert rms((found - delays)[first] - (found - delays)[second]) < 30e-9
+    assert rms(toy.vectors[:, :2] @ [0.15, -0.1] / speed_of_light) > 200e-9
+
+
+def test_on_a_small_array_a_gradient_is_left_to_the_cables():
+    """Twenty metres and cables of 500 ns: corrected data have the source at the zenith, wherever it is."""
+    low = (0.7, -0.5)
+    toy, _ = one_source(20, CABLES, low)
+    corrected = toy.visibilities / gain_products(start_of(toy), toy.antennas)
+    assert rms(delays_of(corrected)) < 0.25 * rms(toy.vectors[:, :2] @ low / speed_of_light)
+
+
+@pytest.mark.parametrize("with_sky", [True, False])
+def test_noise_of_twice_the_signal_leaves_the_delays(cables, with_sky):
+    toy, delays = cables
+    noise = 2 * rms(toy.foregrounds) * complex_normal(np.random.default_rng(5), toy.foregrounds.shape)
+    noisy = replace(toy, noise=noise)
+    start = start_of(noisy, toy.foregrounds if with_sky else None)
+    # A quarter of the delay resolution, 1 / 25.6 MHz: phases are off by less than a radian at the ends of the band.
+    assert rms(errors(noisy, delays_of(start), delays)) < 10e-9
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_antenna_alone_can_raise_the_sum_of_scores(seed):
+    """Scores of noise alone have many maxima: what is found is one of them."""
+    n_antennas, n_delays = 9, 64
+    antennas = np.column_stack(np.triu_indices(n_antennas, 1))
+    scores = np.random.default_rng(seed).standard_normal((len(antennas), n_delays))
+    search = _DelaySearch(scores, antennas, n_antennas)
+    search.place()
+    while search.improve():
+        pass
+
+    def total(delays):
+        return scores[np.arange(len(antennas)), (delays[antennas[:, 0]] - delays[antennas[:, 1]]) % n_delays].sum()
+
+    for antenna in range(n_antennas):
+        alone = np.arange(n_antennas) == antenna
+        moved = [total(np.where(alone, delay, search.delays)) for delay in range(n_delays)]
+        assert max(moved) == pytest.approx(total(search.delays), rel=1e-12)
 
 
 def test_channels_in_descending_order(cables):
