@@ -311,6 +311,11 @@ def changed(experiment: dict, changes: dict) -> dict:
         ({"corruption.effects": []}, "corruption.effects is empty"),
         ({"corruption.effects": [{"kind": "per-channel-gains", "sigma": 0}]}, "corruption.effects.0.sigma is 0.0"),
         ({"corruption.effects": [{"kind": "per-channel-gains", "sigma": 0.2}]}, "corruption.effects.0.sigma is 0.2"),
+        (
+            {"corruption.effects": [{"kind": "per-channel-gains", "drift": {"kind": "jumps"}}]},
+            "corruption.effects.0.drift is ",
+        ),
+        ({"corruption.noise": {"kind": "radiometer"}}, "corruption.noise is 'radiometer'"),
         ({"corruption.effects": [{"kind": "reflection-gains"}]}, "corruption.effects is reflection-gains"),
         (
             {"corruption.effects": [{"kind": "per-channel-gains"}, {"kind": "reflection-gains", "seed": 8}]},
