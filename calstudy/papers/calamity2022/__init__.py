@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
+from pydantic import BaseModel
+
 from calstudy.calibrate.settings import FirstOrderSettings, GainFit, Solver
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.settings import NoNoise
@@ -12,8 +14,6 @@ from calstudy.instrument.as_built import AsBuilt
 from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
     from calstudy.verdicts.statement import Statement
