@@ -34,8 +34,8 @@ TOLERATED = 100
 SOURCES = 546_000
 TABLE_MEMORY = 1.3e6
 """Bytes of the table of a beam for one polarization and frequency."""
-DIPOLE_SECONDS, DIPOLE_MEMORY = 20.0, 1.0e9
-"""For the fields of the single dipoles of a tile; a worker makes them for the first of its chunks only."""
+DIPOLE_SECONDS, DIPOLE_MEMORY, WORKERS = 20.0, 0.6e9, 4
+"""For the fields of the single dipoles of a tile, which each of some workers makes for the first of its chunks."""
 
 
 @once
@@ -196,10 +196,10 @@ def _cost_of_chunk(task: Task) -> Cost:
     seconds = 6 + engine.seconds
     if beams > 1:
         # Tables of the beams at the nodes: twice, for sources that stay up and for those that rise or set.
-        seconds += beams * (0.4 + 0.16 * channels / pieces)
+        seconds += beams * (0.3 + 0.1 * channels / pieces)
         memory += beams * (TABLE_MEMORY * size.polarizations * channels / pieces + 2e7)
     if instrument.as_built.dipoles.differ:
-        seconds += DIPOLE_SECONDS
+        seconds += DIPOLE_SECONDS * min(1, WORKERS / pieces)
         memory += DIPOLE_MEMORY
     return Cost(seconds, memory, disk)
 
