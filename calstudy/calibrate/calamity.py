@@ -25,7 +25,7 @@ def make_solver(settings: GainFit) -> Solver:
     """Return the solver of the `calibration.solver` section."""
     solver = settings.solver
     if isinstance(solver, GaussNewtonSettings):
-        return GaussNewton(solver.tolerance, solver.max_steps)
+        return GaussNewton(solver.tolerance, solver.max_steps, solver.precision)
     if isinstance(solver, LbfgsSettings):
         return Lbfgs(solver.tolerance, solver.max_steps, solver.memory)
     optimizer = Optimizer(solver.name, solver.learning_rate, solver.schedule, solver.final_rate, solver.max_steps)

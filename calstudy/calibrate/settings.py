@@ -38,6 +38,11 @@ class GaussNewtonSettings(Section):
         1e-3, gt=0, lt=1, description="Stop when the predicted relative decrease of the loss is smaller."
     )
     max_steps: int = Field(100, ge=1)
+    precision: Literal["single", "double"] = Field(
+        "single",
+        description="Of the inner products of the iteration. `double` goes on with less damping where the noise is "
+        "below about 3e-4 of the data, in directions that single precision does not resolve.",
+    )
     warm_start: bool = Field(True, description="Start each integration from the solution of the one before.")
 
 

@@ -140,7 +140,7 @@ def test_plans_count_distinct_beams(tmp_path: Path):
         ({"dipoles": {"dead_fraction": "15 %"}}, r"as_built\.dipoles: the beam 'gaussian' has no dipoles"),
         ({"beams": {"swapped": [7]}}, r"as_built\.beams\.swapped: names antenna 7, but the layout has 7 antennas"),
         ({"positions": {"scatter": "2 deg"}}, r"as_built\.positions\.scatter"),
-        ({"dipoles": {"dead_fraction": "many"}}, r"as_built\.dipoles\.dead_fraction.*percentage"),
+        ({"dipoles": {"dead_fraction": "many"}}, r"as_built\.dipoles\.dead_fraction.*fraction"),
     ],
 )
 def test_mistakes_are_told(as_built, told, tmp_path: Path):

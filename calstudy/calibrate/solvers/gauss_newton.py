@@ -7,11 +7,12 @@ which also predict how much the loss can still fall. Where baselines share model
 the strong ones, and the antenna blocks of each channel are used throughout.
 
 Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
-that are smaller. They matter where the noise is far below the foregrounds: once the loss is so small that single
-precision does not resolve the damping, products are made in double precision, the damping is a hundredth of what it
-was, and the prediction comes from a solution of the normal equations. In such directions steps are long and valleys
-curved: the damping then remembers what it was raised to, gains change by the exponential of a step, along which a phase
-is only a phase, and steps are bent by their geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885).
+that are smaller. They matter where the noise is far below the foregrounds. In double precision, if that is asked for,
+the iteration goes on once the loss is so small that single precision does not resolve the damping: the damping is a
+hundredth of what it was, and the prediction comes from a solution of the normal equations. In such directions steps are
+long and valleys curved: the damping then remembers what it was raised to, gains change by the exponential of a step,
+along which a phase is only a phase, and steps are bent by their geodesic acceleration (Transtrum & Sethna 2012,
+arXiv:1201.5885).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import tensorflow as tf
 
@@ -139,10 +140,13 @@ class GaussNewton:
         crawls by less than this at each step counts as converged.
     max_steps
         Gauss-Newton steps at most.
+    precision
+        Of the inner products; ``double`` goes on where single precision does not resolve the damping that is due.
     """
 
     tolerance: float = 1e-3
     max_steps: int = 100
+    precision: Literal["single", "double"] = "single"
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and take over the preconditioner of the warm start."""
@@ -165,7 +169,7 @@ class GaussNewton:
 
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
         """Try one damped step, and keep it if it lowers the loss; or check whether there is need of one."""
-        if self._settled(state) or (state.beyond_single and state.gained < state.history[-1]):
+        if self._goes_on(state) and (self._settled(state) or (state.gained < state.history[-1] and not state.curved)):
             return self._checked(state)
         kernels = state.kernels
         state, step = self._curved_step(state) if state.curved else (state, self._plain_step(state))
@@ -205,7 +209,7 @@ class GaussNewton:
         if loss < ROUNDING_LOSS:
             return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
-        if self._settled(state) and (state.checked or not (state.beyond_single or state.curved)):
+        if self._settled(state) and (state.checked or not self._goes_on(state)):
             return Verdict("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         hint = f"{fall:.1e} of {{}} is predicted to go" if math.isfinite(fall) else ""
         if state.damping > MAX_DAMPING:
@@ -223,6 +227,10 @@ class GaussNewton:
             return state.predicted / loss < self.tolerance
         falling = min(state.decrease_to_come, state.gained / loss)
         return state.predicted / loss < self.tolerance and falling < self.tolerance
+
+    def _goes_on(self, state: GaussNewtonState) -> bool:
+        """Whether the iteration is, or is to be, in double precision."""
+        return self.precision == "double" and (state.beyond_single or state.curved)
 
     def _checked(self, state: GaussNewtonState) -> GaussNewtonState:
         """Predict the decrease of the loss with a hundredth of the damping, from a solution of the normal equations."""
