@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_calibration_loss import redundant_structure
-from toy import make_toy, scattered
+from toy import complex_normal, make_toy, scattered
 
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
@@ -289,3 +289,26 @@ def test_a_plateau_is_not_taken_for_the_minimum(toy, gained, predicted, converge
     state = replace(solver.init(toy.problem()), history=(2.0, 1.0), gained=gained, predicted=predicted)
     verdict = solver.terminate(state)
     assert (verdict is not None and verdict.status == "converged") == converged
+
+
+def test_double_precision_goes_on_where_single_precision_stops(quiet):
+    """Exact data: the only minimum is zero, and what single precision calls converged is not there."""
+    problem = quiet.problem(visibilities=gain_products(quiet.gains, quiet.antennas) * in_the_span(quiet))
+    single = solve(problem, GaussNewton(max_steps=500))
+    double = solve(problem, GaussNewton(max_steps=500, precision="double"))
+    assert double.status == "converged", double.message
+    assert double.loss_history[-1] < 0.1 * single.loss_history[-1]
+    # Single precision resolves 6e-8 of the data.
+    assert product_error(problem, double) < 1e-6
+
+
+def test_double_precision_says_that_it_has_not_converged(quiet):
+    """Little noise and few steps: the loss can still fall, and the status says so."""
+    rng = np.random.default_rng(4)
+    rms = np.sqrt(np.mean(np.abs(quiet.foregrounds) ** 2))
+    noisy = quiet.foregrounds + 1e-6 * rms * complex_normal(rng, quiet.foregrounds.shape)
+    problem = quiet.problem(visibilities=gain_products(quiet.gains, quiet.antennas) * noisy)
+    few = solve(problem, GaussNewton(max_steps=12, precision="double"))
+    more = solve(problem, GaussNewton(max_steps=40, precision="double"))
+    assert more.loss_history[-1] < 0.9 * few.loss_history[-1]
+    assert few.status == "max-steps"
