@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calstudy.calibrate.calibrators._least_squares import LeastSquares
-from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, ScalePrior
+from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, GaussNewtonSettings, ScalePrior, Solver
 
 
 class Unified(LeastSquares, ForegroundFit):
@@ -12,3 +12,5 @@ class Unified(LeastSquares, ForegroundFit):
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
+    # What is left of the foregrounds at the default tolerance is more than the EoR near the wedge.
+    solver: Solver = GaussNewtonSettings(tolerance=1e-5)
