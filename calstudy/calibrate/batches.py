@@ -152,6 +152,56 @@ class Vectors:
         return _joined(found, 0)
 
 
+class Piece(NamedTuple):
+    """One batch, and its vectors.
+
+    Attributes
+    ----------
+    owner
+        Position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model.
+    vectors
+        Of its models.
+    own
+        Of its baselines, if they have coefficients of their own besides the shared ones.
+    """
+
+    batch: Batch
+    owner: tf.Tensor | None
+    vectors: Vectors
+    own: Vectors | None
+
+    def to_models(self, values: tf.Tensor) -> tf.Tensor:
+        """Add up the baselines of each model: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
+        if self.owner is None:
+            return values
+        return tf.stack([tf.math.segment_sum(part, self.owner) for part in tf.unstack(values)])
+
+    def to_baselines(self, values: tf.Tensor) -> tf.Tensor:
+        """Give each baseline what its model has, the transpose of `to_models`."""
+        return values if self.owner is None else tf.gather(values, self.owner, axis=1)
+
+
+def make_piece(batch: Batch, common: np.ndarray, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
+    """Return a batch with its vectors.
+
+    Parameters
+    ----------
+    batch, common
+        As for `batch_vectors`.
+    owner
+        Position in the batch of the model of each baseline, ascending, (Nbls,); None if each baseline is its own model.
+    with_own
+        Whether baselines have coefficients of their own besides the shared ones.
+    dtype
+        Of the overlaps.
+    """
+    kind = dtype.as_numpy_dtype
+    own = batch_vectors(batch, common, owner, kind) if with_own else None
+    return Piece(
+        batch, None if owner is None else tf.constant(owner, tf.int32), batch_vectors(batch, common, None, kind), own
+    )
+
+
 def batch_vectors(batch: Batch, common: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
     """Return the vectors of the models of a batch, or of its baselines.
 

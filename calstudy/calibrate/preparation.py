@@ -115,24 +115,28 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         return f"{100 * flagged:.0f} % of the samples are flagged, which skip_flagged excludes"
     if not np.any(visibilities, where=weights > 0):
         return "the data are zero"
+    sky = None if prepared.sky is None else rows(prepared.sky)
     return CalibrationProblem(
         structure,
         visibilities,
         weights,
         prepared.start[:, :, times.start, polarization],
-        None if prepared.sky is None else rows(prepared.sky),
+        sky,
         settings.prior if isinstance(settings, ForegroundFit) else "sum",
         frozen=settings.frozen,
-        deviations=_deviations(prepared, settings),
+        deviations=_deviations(sky, weights, settings),
     )
 
 
-def _deviations(prepared: PreparedFit, settings: GainFit) -> tuple[float, float]:
-    """Return the deviations of the foregrounds' prior in the unit of the data, of each baseline's own and shared."""
-    if not isinstance(settings, ForegroundFit) or not settings.foreground_prior.finite or prepared.sky is None:
+def _deviations(sky: np.ndarray | None, weights: np.ndarray, settings: GainFit) -> tuple[float, float]:
+    """Return the deviations of the foregrounds' prior in the unit of the data, of each baseline's own and shared.
+
+    They are those of the integrations that are solved together: results must not depend on how runs are cut in pieces.
+    """
+    if not isinstance(settings, ForegroundFit) or not settings.foreground_prior.finite or sky is None:
         return math.inf, math.inf
     prior = settings.foreground_prior
-    rms = float(np.sqrt(np.mean(np.abs(prepared.sky[prepared.weights > 0]) ** 2)))
+    rms = float(np.sqrt(np.mean(np.abs(sky[weights > 0]) ** 2)))
     own, shared = (float(value) * rms for value in (prior.deviation, prior.shared_deviation))
     return own, shared
 

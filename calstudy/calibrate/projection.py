@@ -27,7 +27,7 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.batches import Batch, Vectors, batch_vectors
+from calstudy.calibrate.batches import Batch, Piece, make_piece
 from calstudy.calibrate.problem import FitStructure
 from calstudy.calibrate.tensors import FitTensors
 
@@ -102,35 +102,6 @@ class _PieceData(NamedTuple):
     mean: tf.Tensor | None
 
 
-class _Piece(NamedTuple):
-    """One batch, and its vectors.
-
-    Attributes
-    ----------
-    owner
-        Position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model.
-    vectors
-        Of its models.
-    own
-        Of its baselines, if they have coefficients of their own besides the shared ones.
-    """
-
-    batch: Batch
-    owner: tf.Tensor | None
-    vectors: Vectors
-    own: Vectors | None
-
-    def to_models(self, values: tf.Tensor) -> tf.Tensor:
-        """Add up the baselines of each model: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
-        if self.owner is None:
-            return values
-        return tf.stack([tf.math.segment_sum(part, self.owner) for part in tf.unstack(values)])
-
-    def to_baselines(self, values: tf.Tensor) -> tf.Tensor:
-        """Give each baseline what its model has, the transpose of `to_models`."""
-        return values if self.owner is None else tf.gather(values, self.owner, axis=1)
-
-
 class Projector:
     """Eliminates the foregrounds of one fit structure.
 
@@ -161,15 +132,12 @@ class Projector:
         common = left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
         self.common = tf.constant(common, dtype)
         self.rank = common.shape[1]
-        self._pieces = [self._piece(batch, common) for batch in tensors.batches]
+        needed = tensors.shared or self._two_levels
+        self._pieces = [
+            make_piece(batch, common, tensors.owner(batch) if needed else None, self._two_levels, dtype)
+            for batch in tensors.batches
+        ]
         self.project = tf.function(self._project)
-
-    def _piece(self, batch: Batch, common: np.ndarray) -> _Piece:
-        owner, kind = self.tensors.owner(batch), self.dtype.as_numpy_dtype
-        vectors = batch_vectors(batch, common, None, kind)
-        own = batch_vectors(batch, common, owner, kind) if self._two_levels else None
-        needed = self.tensors.shared or self._two_levels
-        return _Piece(batch, tf.constant(owner, tf.int32) if needed else None, vectors, own)
 
     def _factor(self, normal: tf.Tensor, filled: np.ndarray) -> tuple[tf.Tensor, tf.Tensor]:
         """Return the Cholesky factors of N, and a root R of the kernel, N^-1 ~ R^T R; all (N, Nvec, Nvec).
@@ -240,7 +208,7 @@ class Projector:
             tuple(part.roots for part in parts),
         )
 
-    def _eliminate(self, piece: _Piece, products: tf.Tensor, data: _PieceData, deviations: tf.Tensor | None) -> _Part:
+    def _eliminate(self, piece: Piece, products: tf.Tensor, data: _PieceData, deviations: tf.Tensor | None) -> _Part:
         """Eliminate the foregrounds of one batch, whose baselines have the gain products `products`."""
         curvature = data.weights * pairs.squared_modulus(products)
         matched = pairs.conjugate_multiply(products, data.weights * data.visibilities)
@@ -260,7 +228,7 @@ class Projector:
         )
 
     def _eliminate_one(
-        self, piece: _Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
+        self, piece: Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
     ) -> tuple[tf.Tensor, tf.Tensor, Roots]:
         """Return F - m on the baselines, the prior's share of the loss, and the roots, where a model has one kind.
 
@@ -292,7 +260,7 @@ class Projector:
         return piece.to_baselines(model), penalty, Roots(vectors.overlap(tf.cast(scale * root, self.dtype)), None)
 
     def _eliminate_both(
-        self, piece: _Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
+        self, piece: Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
     ) -> tuple[tf.Tensor, tf.Tensor, Roots]:
         """Return what `_eliminate_one` does, where baselines have coefficients of their own besides the shared ones."""
         vectors: Any = piece.own
