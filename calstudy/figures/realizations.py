@@ -79,7 +79,7 @@ def _draw_transfer(axes: Axes, results: Mapping[str, RegionResults]) -> None:
         axes.errorbar(pooled.k, total.mean, total.scatter, fmt=marker, color=colour, elinewidth=0.7, label=label)
     axes.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
     axes.set_ylabel(TRANSFER)
-    axes.legend(loc="lower right", title="bars: scatter", title_fontsize=style.SMALL_SIZE)
+    axes.legend(loc="center right", title="bars: scatter", title_fontsize=style.SMALL_SIZE)
 
 
 def _draw_errors(axes: Axes, results: RegionResults, names: Sequence[str]) -> None:
