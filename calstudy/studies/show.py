@@ -9,11 +9,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from calstudy.base.resources import LIBRARIES_MEMORY, free_memory
+from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory, total_memory
 from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
 from calstudy.run.execution import largest_disk, schedule
 from calstudy.run.progress import duration
-from calstudy.run.store import Store
+from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.folder import MANIFEST
 from calstudy.studies.study import Budget, Run, Study
@@ -52,6 +52,9 @@ def show_plan(study: Study, budget: Budget, console: Console) -> None:
     store = Store(study.outputs.store)
     plan = schedule(study.targets, store)
     todo = {task.key for task in plan.todo}
+    if todo:
+        require_writable(store.root, "outputs.store")
+    require_writable(study.folder.parent, "outputs.runs")
     table = Table(title=f"{study.name}: plan for {workers} worker(s)", title_justify="left")
     table.add_column("stage")
     for heading in ("products", "to make", "cpu time", "memory each", "disk"):
@@ -72,6 +75,10 @@ def show_plan(study: Study, budget: Budget, console: Console) -> None:
     _total(plan.todo, largest_disk(study.targets, plan.todo), workers, console)
     for note in study.stand_ins:
         console.print(f"stand-in: {note}", markup=False)
+    if budget.max_memory is not None and parse_memory(budget.max_memory) > total_memory():
+        console.print(f"note: --max-memory {budget.max_memory} is more than this machine has", markup=False)
+    for note in study.notes:
+        console.print(f"note: {note}", markup=False)
     for place in sites(study.tasks):
         console.print(f"site: {place}", markup=False)
     console.print(f"store: {store.root}", markup=False, soft_wrap=True)
