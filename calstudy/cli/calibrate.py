@@ -172,7 +172,7 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
         console.print(plan, markup=False)
         if request.dry_run:
             return 0
-        context = {
+        context: dict[str, Any] = {
             "data": [str(path) for path in request.paths],
             "sky_model": None if request.sky_path is None else str(request.sky_path),
             "gains": None if request.gains_path is None else str(request.gains_path),

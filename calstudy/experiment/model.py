@@ -186,12 +186,20 @@ class Experiment(Section):
         description="Published papers whose statements the run is compared with, such as [calamity2022]; none by "
         "default.",
     )
-    sweep: Annotated[tuple[SweepBlock, ...], Field(strict=False), BeforeValidator(_as_list)] = Field(
+    sweep: Annotated[
+        tuple[SweepBlock, ...],
+        Field(strict=False),
+        BeforeValidator(_as_list, json_schema_input_type=SweepBlock | tuple[SweepBlock, ...]),
+    ] = Field(
         (),
         description="Fields to vary (dotted path: list of values; several fields: all combinations), or a list of such "
         "blocks; a run makes every point and compares their signal loss.",
     )
-    realizations: Annotated[tuple[RealizationBlock, ...], Field(strict=False), BeforeValidator(_as_list)] = Field(
+    realizations: Annotated[
+        tuple[RealizationBlock, ...],
+        Field(strict=False),
+        BeforeValidator(_as_list, json_schema_input_type=RealizationBlock | tuple[RealizationBlock, ...]),
+    ] = Field(
         (),
         description="Draw the EoR, the gains or the noise several times, and pool what is measured: a block, or a list "
         "of blocks that draw different things.",
