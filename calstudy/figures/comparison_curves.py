@@ -6,8 +6,8 @@ import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from calstudy.figures import CasesFigure, Drawing
 from calstudy.figures.comparison_spectra import look
@@ -22,7 +22,9 @@ LABEL_WIDTH = 9
 
 
 @style.journal_style()
-def draw_curves(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_curves(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
     """Draw T above and the bias below for each band of k, calibrators from left to right, with 95 % bars.
 
     It is meant for calibrators that are values of one setting, in order.
@@ -31,19 +33,23 @@ def draw_curves(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[str
     ----------
     cases
         By world and calibrator.
+    calibrators
+        Their labels, in order.
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
     worlds = list(cases)
-    calibrators = list(cases[worlds[0]])
-    edges = cases[worlds[0]][calibrators[0]].bands.bin_edges
+    edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     figure = style.new_figure(style.TWO_COLUMNS, 4.2)
     grid = figure.subplots(2, edges.size - 1, squeeze=False, sharex=True, sharey="row")
     for band, (upper, lower) in enumerate(grid.T):
         for place, found in enumerate(cases.values()):
-            shift = 0.3 * (place - (len(worlds) - 1) / 2) / len(worlds)
-            _draw_curve(upper, found, "transfer", band, place, shift)
-            _draw_curve(lower, found, "bias", band, place, shift)
+            at = np.array([calibrators.index(name) for name in found])
+            at = at + 0.3 * (place - (len(worlds) - 1) / 2) / len(worlds)
+            for axes, name in ((upper, "transfer"), (lower, "bias")):
+                values, errors = (_in_band(found, column, band) for column in (name, f"{name}_error"))
+                bars = SIGMAS_95 * np.nan_to_num(errors)
+                axes.errorbar(at, values, yerr=bars, elinewidth=0.6, linewidth=0.7, **look(place))
         upper.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
         upper.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
         lower.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
@@ -52,24 +58,14 @@ def draw_curves(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[str
         lower.set_xticks(range(len(calibrators)), names, fontsize=style.SMALL_SIZE, rotation=90)
     grid[0, 0].set_ylabel(r"$T$, free of the flux scale")
     grid[1, 0].set_ylabel(r"bias $s^2 P^{R_0} / P^S$")
-    handles, _ = grid[0, 0].get_legend_handles_labels()
+    handles = [Line2D([], [], linewidth=0.7, **look(place)) for place in range(len(worlds))]
     figure.legend(handles, worlds, loc="outside upper center", ncols=min(len(worlds), 5))
     style.note_stand_ins(figure, stand_ins)
     return figure
 
 
-def _draw_curve(axes: Axes, found: Mapping[str, Case], name: str, band: int, place: int, shift: float) -> None:
-    values = np.array([getattr(case.bands, name)[band] for case in found.values()])
-    errors = np.array([getattr(case.bands, f"{name}_error")[band] for case in found.values()])
-    axes.errorbar(
-        np.arange(values.size) + shift,
-        values,
-        yerr=SIGMAS_95 * np.nan_to_num(errors),
-        elinewidth=0.6,
-        linewidth=0.7,
-        label=str(place),
-        **look(place),
-    )
+def _in_band(found: Mapping[str, Case], name: str, band: int) -> np.ndarray:
+    return np.array([getattr(case.bands, name)[band] for case in found.values()])
 
 
 class ComparisonCurves(CasesFigure):
@@ -81,4 +77,4 @@ class ComparisonCurves(CasesFigure):
         """Draw T above and the bias below."""
         cases = read_cases(job)
         shown = {world: {name: case.bands for name, case in found.items()} for world, found in cases.items()}
-        return Drawing(draw_curves(cases, stand_ins=job.settings["notes"]), shown)
+        return Drawing(draw_curves(cases, job.settings["calibrators"], job.settings["notes"]), shown)

@@ -29,7 +29,9 @@ SIGNIFICANT = 2.0
 
 
 @style.journal_style()
-def draw_matrix(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_matrix(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
     """Draw a matrix for each band of k: worlds from left to right, calibrators from top to bottom.
 
     The colour is the bias. A bias within two standard deviations of zero is shown as an upper limit of two of them.
@@ -38,18 +40,19 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[str
     ----------
     cases
         By world and calibrator.
+    calibrators
+        Their labels, in order; a case that is not there is left white.
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
     worlds = list(cases)
-    calibrators = list(cases[worlds[0]])
-    edges = cases[worlds[0]][calibrators[0]].bands.bin_edges
+    edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     n_bands = edges.size - 1
     height = n_bands * (HEADING_HEIGHT + ROW_HEIGHT * len(calibrators)) + 0.4
     figure = style.new_figure(style.TWO_COLUMNS if len(worlds) > 2 else style.ONE_COLUMN + 1, height)
     panels = figure.subplots(n_bands, 1, squeeze=False, sharex=True)[:, 0]
     for band, axes in enumerate(panels):
-        _draw_band(axes, cases, band)
+        _draw_band(axes, cases, calibrators, band)
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
     panels[-1].set_xticks(range(len(worlds)), [textwrap.fill(world, LABELS_WIDTH // len(worlds)) for world in worlds])
     bar = figure.colorbar(ScalarMappable(SHADES, COLOURS), ax=panels, extend="both", aspect=40, pad=0.01)
@@ -58,11 +61,11 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[str
     return figure
 
 
-def _draw_band(axes: Axes, cases: Mapping[str, Mapping[str, Case]], band: int) -> None:
-    calibrators = list(next(iter(cases.values())))
+def _draw_band(axes: Axes, cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], band: int) -> None:
     colours = np.full((len(calibrators), len(cases), 4), 1.0)
     for column, found in enumerate(cases.values()):
-        for row, case in enumerate(found.values()):
+        for name, case in found.items():
+            row = calibrators.index(name)
             bias, error = case.bands.bias[band], case.bands.bias_error[band]
             shown = max(abs(bias), SIGNIFICANT * error) if np.isfinite(error) else abs(bias)
             if np.isfinite(shown):
@@ -105,4 +108,4 @@ class ComparisonMatrix(CasesFigure):
         """Draw the matrices."""
         cases = read_cases(job)
         shown = {world: {name: case.bands for name, case in found.items()} for world, found in cases.items()}
-        return Drawing(draw_matrix(cases, stand_ins=job.settings["notes"]), shown)
+        return Drawing(draw_matrix(cases, job.settings["calibrators"], job.settings["notes"]), shown)

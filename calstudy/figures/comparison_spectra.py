@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from calstudy.figures import CasesFigure, Drawing
 from calstudy.figures.signal_loss import SIGMAS_95
@@ -33,21 +34,26 @@ def look(place: int) -> dict[str, Any]:
 
 
 @style.journal_style()
-def draw_spectra(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_spectra(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
     """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, outside the wedge, with 95 % bars.
 
     Parameters
     ----------
     cases
         By world and calibrator.
+    calibrators
+        Their labels, in order.
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(cases))
     grid = figure.subplots(len(cases), 2, squeeze=False, sharex=True)
     for (left, right), (world, found) in zip(grid, cases.items(), strict=True):
-        for place, case in enumerate(found.values()):
-            shift = 0.15 * (place - (len(found) - 1) / 2) / len(found)
+        for name, case in found.items():
+            place = calibrators.index(name)
+            shift = 0.15 * (place - (len(calibrators) - 1) / 2) / len(calibrators)
             _draw_points(left, case, "recovered", place, shift)
             _draw_points(right, case, "bias", place, shift)
         for axes, name in ((left, "recovered"), (right, "bias")):
@@ -60,10 +66,8 @@ def draw_spectra(cases: Mapping[str, Mapping[str, Case]], stand_ins: Sequence[st
         right.set_ylabel(r"$s^2 P^{R_0} / P^S$")
     for axes in grid[-1]:
         axes.set_xlabel(style.WAVENUMBER)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, next(list(found) for found in cases.values())[: len(labels)], loc="outside upper center", ncols=4
-    )
+    handles = [Line2D([], [], linewidth=0.6, markersize=2.5, **look(place)) for place in range(len(calibrators))]
+    figure.legend(handles, list(calibrators), loc="outside upper center", ncols=min(len(calibrators), 5))
     style.note_stand_ins(figure, stand_ins)
     return figure
 
@@ -73,16 +77,8 @@ def _draw_points(axes: Axes, case: Case, name: str, place: int, shift: float) ->
     values, errors = getattr(bins, name), getattr(bins, f"{name}_error")
     used = np.isfinite(values) & (bins.k <= LARGEST_K)
     k = bins.k + shift * np.diff(bins.bin_edges)
-    axes.errorbar(
-        k[used],
-        values[used],
-        yerr=SIGMAS_95 * np.nan_to_num(errors[used]),
-        elinewidth=0.5,
-        linewidth=0.6,
-        markersize=2.5,
-        label=str(place),
-        **look(place),
-    )
+    bars = SIGMAS_95 * np.nan_to_num(errors[used])
+    axes.errorbar(k[used], values[used], yerr=bars, elinewidth=0.5, linewidth=0.6, markersize=2.5, **look(place))
 
 
 class ComparisonSpectra(CasesFigure):
@@ -94,4 +90,4 @@ class ComparisonSpectra(CasesFigure):
         """Draw a row for each world."""
         cases = read_cases(job)
         shown = {world: {name: case.bins for name, case in found.items()} for world, found in cases.items()}
-        return Drawing(draw_spectra(cases, stand_ins=job.settings["notes"]), shown)
+        return Drawing(draw_spectra(cases, job.settings["calibrators"], job.settings["notes"]), shown)

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calstudy.power.clusters import Clusters
-from calstudy.power.spectra import DelaySpectra, outside_wedge
+from calstudy.power.spectra import DelaySpectra
+from calstudy.power.transfer import clusters_in_k
 
 BANDS = (0.1, 0.2, 0.5, 1.0)
 """Edges in h/Mpc of the bands in which calibrations are compared."""
@@ -89,12 +89,20 @@ def score(spectra: Calibrated, edges: ArrayLike, buffer: float, flux_scale: floa
         s of the calibration; NaN if not known.
     """
     limits, signal = np.asarray(edges, dtype=float), spectra.signal
-    bins = np.searchsorted(limits, np.hypot(signal.k_perp[:, None], signal.k_parallel), side="left") - 1
-    bins[(bins >= limits.size - 1) | ~outside_wedge(signal, buffer)] = -1
-    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
-    clusters = Clusters.of(signal, bins, samples, limits.size - 1)
+    clusters = clusters_in_k(signal, limits, buffer, inside=False)
     of_signal = clusters.powers(signal)
-    parts = (spectra.response, spectra.residual_without_eor, spectra.residual)
-    transfer, bias, recovered = (clusters.powers(part).ratio(of_signal) for part in parts)
-    scaled = (flux_scale**2 * values for values in (*transfer, *bias))
-    return Score((limits[1:] + limits[:-1]) / 2, limits, *scaled, *recovered, flux_scale)
+    (transfer, transfer_error), (bias, bias_error), (recovered, recovered_error) = (
+        clusters.powers(part).ratio(of_signal)
+        for part in (spectra.response, spectra.residual_without_eor, spectra.residual)
+    )
+    return Score(
+        k=(limits[1:] + limits[:-1]) / 2,
+        bin_edges=limits,
+        transfer=transfer * flux_scale**2,
+        transfer_error=transfer_error * flux_scale**2,
+        bias=bias * flux_scale**2,
+        bias_error=bias_error * flux_scale**2,
+        recovered=recovered,
+        recovered_error=recovered_error,
+        flux_scale=flux_scale,
+    )

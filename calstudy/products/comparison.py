@@ -44,32 +44,30 @@ def case_name(world: int, calibrator: int) -> str:
     return f"{world:03d}:{calibrator:03d}"
 
 
-def comparison(
-    title: str, calibrators: Sequence[str], worlds: Sequence[str], scores: Mapping[str, Task], notes: Sequence[str]
-) -> Task:
+def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Task], notes: Sequence[str]) -> Task:
     """Return the task of the table.
 
     Parameters
     ----------
     title
         Name of the study.
-    calibrators, worlds
-        Their labels.
+    labels
+        ``calibrators`` and ``worlds`` in order, and ``refusals``: world, calibrator and why it cannot work there.
     scores
-        Of all cases, by `case_name`.
+        Of all other cases, by `case_name`.
     notes
         What stands in for the papers' own ingredients.
     """
-    settings = {"title": title, "calibrators": list(calibrators), "worlds": list(worlds), "notes": list(notes)}
-    return Task(COMPARISON, "comparison", settings, scores)
+    return Task(COMPARISON, "comparison", {"title": title, **labels, "notes": list(notes)}, scores)
 
 
 def read_cases(job: Job) -> dict[str, dict[str, Case]]:
-    """Return the cases of a job by the labels of world and calibrator, in the order of the file."""
+    """Return the cases of a job by the labels of world and calibrator, in the order of the file; none if refused."""
     return {
         world: {
             calibrator: _read(job.inputs[case_name(row, column)])
             for column, calibrator in enumerate(job.settings["calibrators"])
+            if case_name(row, column) in job.inputs
         }
         for row, world in enumerate(job.settings["worlds"])
     }
@@ -140,7 +138,11 @@ def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, An
         *([""] if settings["notes"] else []),
     ]
     for world, found in cases.items():
-        lines += [f"## {world}", "", _sky_models(found), "", _table(found).markdown()]
+        lines += [f"## {world}", ""]
+        if found:
+            lines += [_sky_models(found), "", _table(found).markdown()]
+        refused = [(name, why) for place, name, why in settings["refusals"] if place == world]
+        lines += [f"- {name} cannot work here: {why}" for name, why in refused] + ([""] if refused else [])
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -26,7 +26,7 @@ from calstudy.products.score import score
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import CASES, product_entries, publish, run_folder, write, write_manifest
-from calstudy.studies.preflight import require_calibration
+from calstudy.studies.preflight import refusal_of_calibrator, require_calibration
 from calstudy.studies.study import Budget, Made, Study
 
 KEY = "calibrators"
@@ -57,7 +57,7 @@ class ComparisonFile(Section):
         "the place of the experiment's own.",
     )
     worlds: dict[str, dict[str, Any]] = Field(
-        default_factory=lambda: {"ideal": {}},
+        {"ideal": {}},
         min_length=1,
         description="Changes of the experiment by a label (dotted path: value): of what is true, or of what is assumed "
         "(`calibration.assumed`).",
@@ -89,15 +89,18 @@ class Case:
         Their labels.
     experiment
         Validated.
+    refusal
+        Why the calibrator cannot work there; empty if it can.
     """
 
     calibrator: str
     world: str
     experiment: Experiment
+    refusal: str = ""
 
 
 class Comparison(Study):
-    """Calibrators in worlds.
+    """Calibrators in worlds. A calibrator that cannot work in a world is left out there, and the table says why.
 
     Products that several cases need have one key, and are one product.
 
@@ -131,6 +134,9 @@ class Comparison(Study):
         """Return the comparison with every case fitted, and the smallest number of workers of all."""
         fitted, counts = [], []
         for case in self.cases:
+            if case.refusal:
+                fitted.append(case)
+                continue
             try:
                 require_calibration(case.experiment)
                 experiment, count = fit(case.experiment, budget, _targets_of)
@@ -152,19 +158,28 @@ class Comparison(Study):
         return {
             case_name(worlds.index(case.world), calibrators.index(case.calibrator)): _graph(case.experiment)
             for case in self.cases
+            if not case.refusal
+        }
+
+    @property
+    def _labels(self) -> dict[str, Any]:
+        """Labels of calibrators and worlds, and why some cases are not there: world, calibrator and sentence."""
+        return {
+            "calibrators": list(self.file.calibrators),
+            "worlds": list(self.file.worlds),
+            "refusals": [[case.world, case.calibrator, case.refusal] for case in self.cases if case.refusal],
         }
 
     @cached_property
     def table(self) -> Task:
         """The table of all cases."""
         scores = {name: required(score(graph)) for name, graph in self.graphs.items()}
-        return comparison(self.name, list(self.file.calibrators), list(self.file.worlds), scores, self.stand_ins)
+        return comparison(self.name, self._labels, scores, self.stand_ins)
 
     @cached_property
     def figures(self) -> list[Task]:
         """The figures asked for."""
-        labels = {"calibrators": list(self.file.calibrators), "worlds": list(self.file.worlds)}
-        return [cases_task(figure, self.graphs, labels, self.stand_ins) for figure in _shown(self.file)]
+        return [cases_task(figure, self.graphs, self._labels, self.stand_ins) for figure in _shown(self.file)]
 
     @property
     def targets(self) -> Sequence[Task]:
@@ -186,6 +201,7 @@ class Comparison(Study):
             "stand_ins": list(self.stand_ins),
             "captions": {figure.label: figure.caption for figure in _shown(self.file)},
             "cases": files,
+            "refusals": self._labels["refusals"],
             "products": product_entries(self.tasks, made.products, made.tasks),
         }
         write_manifest(folder, self.name, fields)
@@ -275,9 +291,11 @@ def _make_cases(file: ComparisonFile, base: Mapping[str, Any], folder: Path, ove
                 continue
             if not experiment.measures_signal_loss:
                 faults.setdefault(VARIANTS_NEEDED, []).append(f"{calibrator} in {world}")
-            cases.append(Case(calibrator, world, experiment))
+            cases.append(Case(calibrator, world, experiment, refusal_of_calibrator(experiment)))
     if faults:
         raise ExperimentError([f"{sentence} (in {_listed(found)})" for sentence, found in faults.items()])
+    if all(case.refusal for case in cases):
+        raise InputError(f"calibrators: all refuse; {cases[0].calibrator}: {cases[0].refusal}")
     return cases
 
 
