@@ -8,9 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calstudy.base.resources import Cost
 from calstudy.products import score
 from calstudy.products.files import read_json
+from calstudy.products.tolerances import BAND, LIMIT, faults, tolerance
 from calstudy.run.task import Job, Stage, Task
 from calstudy.verdicts.tables import Table, number
 
@@ -137,6 +140,7 @@ def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, An
         *(f"Stand-in: {note}." for note in settings["notes"]),
         *([""] if settings["notes"] else []),
     ]
+    lines += _tolerances(cases, settings["calibrators"])
     for world, found in cases.items():
         lines += [f"## {world}", ""]
         if found:
@@ -144,6 +148,33 @@ def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, An
         refused = [(name, why) for place, name, why in settings["refusals"] if place == world]
         lines += [f"- {name} cannot work here: {why}" for name, why in refused] + ([""] if refused else [])
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> list[str]:
+    """Return the severity of every fault at which the bias of each calibrator reaches the limit, as Markdown."""
+    rows = []
+    for fault in faults(list(cases)):
+        cells = []
+        for calibrator in calibrators:
+            there = [place for place, world in enumerate(fault.worlds) if calibrator in cases[world]]
+            bands = [cases[fault.worlds[place]][calibrator].bands for place in there]
+            if not bands:
+                cells.append("-")
+                continue
+            band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - BAND[0])))
+            bias, error = (np.array([getattr(item, name)[band] for item in bands]) for name in ("bias", "bias_error"))
+            found = tolerance([fault.severities[place] for place in there], bias, error)
+            known = "" if found.relation == "=" else f"{found.relation} "
+            cells.append("noise" if found.relation == "?" else f"{known}{found.severity:.2g} {fault.unit}".strip())
+        rows.append((fault.name, *cells))
+    if not rows:
+        return []
+    low, high = BAND
+    sentence = (
+        f"Severity of each fault at which the bias reaches {LIMIT:g} of the EoR at k from {low:g} to {high:g} h/Mpc. "
+        "Between two severities it is taken for a power law; `noise`: it cannot be told from the noise."
+    )
+    return ["## Tolerances", "", sentence, "", Table(("fault", *calibrators), rows).markdown()]
 
 
 def _sky_models(found: Mapping[str, Case]) -> str:

@@ -15,7 +15,7 @@ from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, choice, fault
-from calstudy.claims.paper import stand_ins, unique_notes
+from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import apply_scale, dump, override, parse_override, read_mapping, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import FIGURES, Experiment, Outputs
@@ -148,8 +148,9 @@ class Comparison(Study):
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
-        """What any case uses in place of the papers' own ingredients."""
-        return unique_notes(note for case in self.cases for note in stand_ins(case.experiment))
+        """What all cases use in place of the papers' own ingredients; what some do besides, their world says."""
+        first, *others = [stand_ins(case.experiment) for case in self.cases]
+        return tuple(note for note in first if all(note in found for found in others))
 
     @cached_property
     def graphs(self) -> Mapping[str, Graph]:

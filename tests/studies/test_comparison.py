@@ -23,8 +23,10 @@ CALIBRATORS = {
     "sky-based": "sky-based",
     "trusting": {"calibrator": "delay-weighted", "foreground_prior": {"deviation": 0.03}},
     "CALAMITY": {"calibrator": "calamity", "prior": "sky-model"},
+    "none": "none",
 }
-WORLDS = {"ideal": {}, "fluxes off by 20 %": {"calibration.assumed.sky.foregrounds.errors": {"flux_scatter": 0.2}}}
+FIGURES = ("comparison-matrix", "comparison-spectra", "comparison-curves", "comparison-tolerances")
+WORLDS = {"ideal": {}, "flux errors: 20 %": {"calibration.assumed.sky.foregrounds.errors": {"flux_scatter": 0.2}}}
 
 
 def comparison_file(folder, **fields):
@@ -37,7 +39,7 @@ def comparison_file(folder, **fields):
         "experiment": "base.yaml",
         "calibrators": CALIBRATORS,
         "worlds": WORLDS,
-        "figures": ["comparison-matrix", "comparison-spectra", "comparison-curves"],
+        "figures": list(FIGURES),
         **fields,
     }
     path = folder / "comparison.yaml"
@@ -64,7 +66,7 @@ def test_a_wrong_sky_model_spoils_only_those_who_trust_it(summaries):
     assert bias["trusting"] < 0.01 * bias["sky-based"]
     assert abs(bias["CALAMITY"]) < max(1, 4 * error["CALAMITY"])
     # With a complete sky model nobody has a bias beyond the noise.
-    for name in CALIBRATORS:
+    for name in ("sky-based", "trusting", "CALAMITY"):
         band = ideal[name]["bands"][1]
         assert abs(band["bias"]) < 4 * band["bias_error"] + 0.1, name
     assert ideal["CALAMITY"]["sky_model_error"] == 0
@@ -83,6 +85,23 @@ def test_held_out_data_are_fitted_to_the_noise_unless_the_sky_is_wrong(summaries
     assert 1 < ideal["CALAMITY"]["held_out_chi_squared"] < 2
     assert 1 < ideal["sky-based"]["held_out_chi_squared"] < ideal["CALAMITY"]["held_out_chi_squared"]
     assert wrong["sky-based"]["held_out_chi_squared"] > 100
+
+
+def test_without_calibration_gain_errors_times_foregrounds_are_the_bias(summaries):
+    """Gains of 1 + 0.1 (n + i n') times a perfect sky model: the error of g g* has the power 4 sigma^2 of F, white."""
+    found = summaries["ideal"]["none"]
+    assert found["gain_error_as_fitted"] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    assert found["bands"][2]["bias"] > 1e3
+    # T is measured of the response, and so is the power of g g* in the signal: 1 + 4 sigma^2 + ...
+    assert found["bands"][2]["transfer"] * found["flux_scale"] ** -2 == pytest.approx(1.04, abs=0.1)
+
+
+def test_tolerances_name_each_fault_and_calibrator(compared):
+    text = (compared.folder / "tables" / "comparison.md").read_text()
+    row = next(line for line in text.splitlines() if line.startswith("| flux errors |"))
+    cells = dict(zip(CALIBRATORS, (cell.strip() for cell in row.split("|")[2:-1]), strict=True))
+    assert cells["sky-based"] == "< 20 %"
+    assert cells["CALAMITY"] in ("noise", "> 20 %")
 
 
 def test_scores_are_those_of_the_experiments_own_products(compared):
@@ -110,15 +129,15 @@ def test_tables_and_figures_hold_every_case(compared):
     assert len(rows) == len(cases) * (len(BANDS) - 1)
     text = (folder / "tables" / "comparison.md").read_text()
     assert all(f"| {name} |" in text for name in CALIBRATORS)
-    for figure in ("comparison-matrix", "comparison-spectra", "comparison-curves"):
+    for figure in FIGURES:
         arrays = np.load(folder / "figures" / f"{figure}.npz")
         assert {name.split(".")[0] for name in arrays.files} == set(WORLDS)
-    assert "fluxes off by 20 %" in (folder / "report.html").read_text()
+    assert "flux errors: 20 %" in (folder / "report.html").read_text()
 
 
 def test_faults_name_the_case_and_the_field(tmp_path):
     path = comparison_file(tmp_path, worlds={"a": {"sky.foregrounds.flux_limit": "8 parsec"}})
-    with pytest.raises(ExperimentError, match=r"flux_limit: '8 parsec'.*in 'sky-based in a' and 2 other"):
+    with pytest.raises(ExperimentError, match=r"flux_limit: '8 parsec'.*in 'sky-based in a' and 3 other"):
         load_study(path)
     with pytest.raises(ExperimentError, match=r"calibration.sovler: unknown.*CALAMITY in ideal"):
         load_study(
@@ -137,5 +156,5 @@ def test_faults_name_the_case_and_the_field(tmp_path):
 def test_scales_of_the_file_and_of_its_experiment_go_together(tmp_path):
     path = comparison_file(tmp_path, scales={"short": {"worlds": {"ideal": {}}, "overrides": {"sky.eor.seed": 9}}})
     study = load_study(path, "short")
-    assert [case.world for case in study.cases] == ["ideal"] * 3
+    assert [case.world for case in study.cases] == ["ideal"] * len(CALIBRATORS)
     assert {case.experiment.sky.eor.seed for case in study.cases} == {9}
