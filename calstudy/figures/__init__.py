@@ -16,7 +16,7 @@ from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import FIGURES, Experiment
 from calstudy.run.task import Job, Stage, Task
-from calstudy.verdicts.tolerances import Rules
+from calstudy.verdicts.tolerances import Drawn, Rules, spread_of_scale
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -147,6 +147,8 @@ class CasesFigure(StudyFigure):
 
     Its `draw` reads the scores of all cases with `calstudy.products.comparison.read_cases`.
     """
+
+    tolerances = ((r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),)
 
     def refusal(self, experiment: Experiment) -> str:
         """Refuse: a single experiment has nothing to compare."""

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
+import yaml
 from pydantic import Field, SerializeAsAny, ValidationError, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
@@ -25,7 +26,7 @@ from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
-from calstudy.studies.folder import CASES, product_entries, publish, run_folder, write, write_manifest
+from calstudy.studies.folder import CASES, EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
 from calstudy.studies.preflight import refusal_of_calibrator, require_calibration
 from calstudy.studies.study import Budget, Made, Study
 
@@ -45,8 +46,9 @@ class ComparisonFile(Section):
 
     name: str = Field(pattern=NAME, description="Names the run folder.")
     description: str = ""
-    experiment: Path = Field(
-        strict=False, description="The experiment that all cases start from; a relative path starts at this file."
+    experiment: Annotated[Path, Field(strict=False)] | dict[str, Any] = Field(
+        description="The experiment that all cases start from: a file, whose relative path starts at this one, or the "
+        "experiment itself."
     )
     overrides: dict[str, Any] = Field(
         default_factory=dict, description="Fields of the experiment to change in all cases (dotted path: value)."
@@ -110,10 +112,12 @@ class Comparison(Study):
         What the file says.
     cases
         World by world, all calibrators each, in the order of the file.
+    resolved
+        The file with its experiment in it, and all changes applied.
     """
 
-    def __init__(self, file: ComparisonFile, cases: Sequence[Case]) -> None:
-        self.file, self.cases = file, tuple(cases)
+    def __init__(self, file: ComparisonFile, cases: Sequence[Case], resolved: Mapping[str, Any]) -> None:
+        self.file, self.cases, self.resolved = file, tuple(cases), resolved
         self.name, self.description = file.name, file.description
 
     @property
@@ -144,7 +148,7 @@ class Comparison(Study):
                 raise InputError(f"{case.calibrator} in {case.world}: {error}") from None
             fitted.append(replace(case, experiment=experiment))
             counts.append(count)
-        return type(self)(self.file, fitted), min(counts)
+        return type(self)(self.file, fitted, self.resolved), min(counts)
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
@@ -188,10 +192,11 @@ class Comparison(Study):
         return [self.table, *self.figures]
 
     def fill(self, made: Made) -> None:
-        """Write figures, table, the experiment of every case, and the manifest."""
+        """Write figures, table, the file with its experiment, the experiment of every case, and the manifest."""
         folder = self.folder
         publish([made.products[task.key] for task in self.figures], folder / "figures")
         publish([made.products[self.table.key]], folder / "tables")
+        write(folder / EXPERIMENT, yaml.safe_dump(self.resolved, sort_keys=False, allow_unicode=True, width=100))
         (folder / CASES).mkdir(exist_ok=True)
         files = {}
         for number, case in enumerate(self.cases):
@@ -261,29 +266,56 @@ def load_comparison(
             built_in = [name for name in FIGURES.built_in() if issubclass(FIGURES.find(name), CasesFigure)]
             hint = f"does not compare calibrators{nearest(figure.label, built_in)} (built in: {', '.join(built_in)})"
             raise ExperimentError([f"figures.{place}: {figure.label!r} {hint}; ask for it in an experiment"])
-    source = file.experiment.expanduser()
-    source = source if source.is_absolute() else folder / source
-    base = read_mapping(source)
+    base, origin = _base(file, folder, scale if own is None else None, scale)
+    changes = dict(parse_override(text) for text in overrides)
+    worlds = {world: {**fields, **changes} for world, fields in file.worlds.items()}
+    cases = _make_cases(file.calibrators, worlds, base, origin)
+    figures = [figure.model_dump(mode="json") for figure in _shown(file)]
+    said = {"name": file.name, "description": file.description, "experiment": base, "worlds": worlds}
+    return Comparison(file, cases, {**said, "calibrators": dict(file.calibrators), "figures": figures})
+
+
+def _base(
+    file: ComparisonFile, folder: Path, required_scale: str | None, scale: str | None
+) -> tuple[dict[str, Any], Path]:
+    """Return the content of the experiment that all cases start from, and the folder of its relative paths.
+
+    Parameters
+    ----------
+    file, folder
+        The comparison, and where it lies.
+    required_scale
+        The scale that the experiment must have; None if the comparison has it, or none was asked for.
+    scale
+        The one that is applied if the experiment has it.
+    """
+    if isinstance(file.experiment, dict):
+        base: dict[str, Any] = file.experiment
+    else:
+        source = file.experiment.expanduser()
+        source = source if source.is_absolute() else folder / source
+        base, folder = read_mapping(source), source.resolve().parent
     for key in (KEY, "experiments", "runtime"):
         if key in base:
-            raise ExperimentError([f"experiment: {file.experiment} has {key!r}, and is no single experiment"])
-    base = apply_scale(base, scale if own is None or scale in (base.get("scales") or {}) else None)
-    base = {key: value for key, value in base.items() if key not in ("calibration", "sweep", "realizations")}
+            raise ExperimentError([f"experiment: has the key {key!r}, and is no single experiment"])
+    base = apply_scale(base, scale if scale in (base.get("scales") or {}) else required_scale)
+    base = {key: value for key, value in base.items() if key not in ("calibration", "sweep", "realizations", "scales")}
     for dotted, value in file.overrides.items():
         base = override(base, dotted, value)
-    return Comparison(file, _make_cases(file, base, source.resolve().parent, overrides))
+    return base, folder
 
 
-def _make_cases(file: ComparisonFile, base: Mapping[str, Any], folder: Path, overrides: Sequence[str]) -> list[Case]:
+def _make_cases(
+    calibrators: Mapping[str, Block], worlds: Mapping[str, Mapping[str, Any]], base: Mapping[str, Any], folder: Path
+) -> list[Case]:
+    """Return all cases; raises ExperimentError with every fault once, and InputError if all calibrators refuse."""
     cases: list[Case] = []
     faults: dict[str, list[str]] = {}
-    for world, changes in file.worlds.items():
-        for calibrator, block in file.calibrators.items():
+    for world, changes in worlds.items():
+        for calibrator, block in calibrators.items():
             data = {**base, "calibration": {**base.get("calibration", {}), **block}}
             for dotted, value in changes.items():
                 data = override(data, dotted, value)
-            for text in overrides:
-                data = override(data, *parse_override(text))
             try:
                 experiment = validate(data, folder)
             except ExperimentError as error:

@@ -16,6 +16,8 @@ from calstudy.power.transfer import TransferFunction
 from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.products.signal_loss import transfer
+from calstudy.regression.comparison import compare_figures
+from calstudy.regression.reference import accept, read_reference, read_run
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Run, run_study
 
@@ -158,3 +160,20 @@ def test_scales_of_the_file_and_of_its_experiment_go_together(tmp_path):
     study = load_study(path, "short")
     assert [case.world for case in study.cases] == ["ideal"] * len(CALIBRATORS)
     assert {case.experiment.sky.eor.seed for case in study.cases} == {9}
+
+
+def test_the_file_in_the_run_folder_is_the_same_comparison(compared, tmp_path):
+    again = load_study(compared.folder / "experiment.yaml")
+    assert again.table.key in compared.made.products
+    assert again.folder.name == compared.folder.name
+    # As a reference it has no folders of this machine, and can be made again with those of another.
+    accept(compared.folder, tmp_path / "reference")
+    text = (tmp_path / "reference" / "experiment.yaml").read_text()
+    assert str(compared.folder.parent) not in text
+    moved = load_study(tmp_path / "reference" / "experiment.yaml", overrides=[f"outputs.store={tmp_path}"])
+    assert moved.table.key == again.table.key
+    assert (tmp_path / "reference" / "comparison.md").is_file()
+    reference = read_reference(tmp_path / "reference")
+    found = compare_figures(reference.figures, read_run(compared.folder).figures, reference.tolerances)
+    assert found
+    assert all(item.status == "same" for item in found)
