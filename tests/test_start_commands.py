@@ -72,7 +72,7 @@ def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
         (["init", "my study"], "'my study' cannot name an experiment"),
         (["init", "../mine"], "cannot name an experiment"),
         (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
-        (["init", "mine", "--example", "paper"], "--example paper: is a collection"),
+        (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
         (["schema", "--output", "nowhere/schema.json"], "--output nowhere/schema.json: cannot be written"),
         (["runs", "nowhere"], "nowhere: no such folder of runs"),
         (["store", "nowhere"], "nowhere: no such store"),

@@ -163,11 +163,27 @@ def _rms(values: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
     return np.sqrt(np.mean(values.real**2 + values.imag**2, axis=axis))
 
 
-def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
-    aligned = np.stack([align(*both)[0] for both in zip(fit.gains, truth.gains, strict=True)])
-    size = _rms(truth.gains, axis=2)
+def aligned_gains(fitted: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return fitted gains brought closest to the true ones by what no fit can know, (Ntimes, Nants, Nfreqs)."""
+    return np.stack([align(*both)[0] for both in zip(fitted, true, strict=True)])
+
+
+def gain_errors(fitted: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the rms over channels of fitted minus true gains, over that of the true ones; where there are any, (N,).
+
+    Parameters
+    ----------
+    fitted, true
+        Complex, (Ntimes, Nants, Nfreqs); zero where there is no solution.
+    """
+    size = _rms(true, axis=2)
     known = size > 0
-    error, raw_error = (_rms(gains - truth.gains, axis=2)[known] / size[known] for gains in (aligned, fit.gains))
+    return _rms(fitted - true, axis=2)[known] / size[known]
+
+
+def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
+    aligned = aligned_gains(fit.gains, truth.gains)
+    error, raw_error = (gain_errors(gains, truth.gains) for gains in (aligned, fit.gains))
     power = [
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
         for values in (aligned - truth.gains, truth.gains, fit.gains - truth.gains)

@@ -21,10 +21,18 @@ each baseline or group; and that on what gains can do and foregrounds cannot, th
 Jacobian J_g of the gains. What gains of per-channel freedom absorb far from the modelled delays is their share of the
 degrees of freedom, (2 N - 1) / (N (N - 1)) for N antennas.
 
+With a finite prior, the foregrounds answer y with the smoother B (1 + B^T B)^-1 B^T = 1 - W, where B = sqrt(D) A are
+their sequences for coefficients of unit variance. W takes the place of 1 - P_F, but is no projector. The residual is
+
+    M y,   M = W - W J_g (J_g^T W J_g)^-1 J_g^T W,   T = <f|M^2|f> / <f|f>.
+
+Gains absorb <f|W^2 - M^2|f>. For an infinite prior this is <f|P|f> of their projector.
+
 The second part is exact from a dense decomposition for small arrays. For others it is a stochastic diagonal (Hutchinson
 1990, Commun. Stat. Simul. Comput. 19, 433; Bekas, Kokiopoulou & Saad 2007, Appl. Numer. Math. 57, 1214), here in the
-basis of the delay modes: for white noise x with <x x*> = 1, the mean of |f* P x|^2 is <f|P P|f> = <f|P|f>, and P x
-costs one solve of the normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`).
+basis of the delay modes: for white noise x with <x x*> = 1, the mean of |f* P x|^2 is <f|P P|f> = <f|P|f>, that of
+|f* W x|^2 - |f* M x|^2 is <f|W^2 - M^2|f>, and P x or M x cost one solve of the normal equations of the reduced problem
+(`calstudy.calibrate.solvers.reduced`).
 """
 
 from __future__ import annotations
@@ -36,15 +44,13 @@ import tensorflow as tf
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import channel_grid
-from calstudy.calibrate.problem import CalibrationProblem, gain_products
+from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.solvers.preconditioners import DEGREE_FLOOR, Inverse, channel_inverse
 from calstudy.calibrate.solvers.reduced import LEAST_DAMPING, PRECONDITIONER_DAMPING, NormalEquations, compiled
+from calstudy.calibrate.tangent_space import TangentSpace
 from calstudy.power.delay import make_taper
 
 TAPER = "blackman-harris"
-# Singular values of weighted sequences below this, relative to the largest, belong to what flags left undetermined; the
-# solvers' ridge on their squares is the square of it.
-SPAN_CUTOFF = 1e-6
 # Elements of the dense Jacobian up to which the exact diagonal is offered.
 DENSE = 3e7
 CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
@@ -134,87 +140,25 @@ def expected_transfer(
     else:
         by_gains, error = _stochastic_diagonal(problem, gains, tangent, modes, probes, seed)
     norm = np.where(norm > 0, norm, np.nan)
-    foregrounds, by_gains, error = tangent.foreground_diagonal(modes) / norm, by_gains / norm, error / norm
+    foregrounds, by_gains, error = _foreground_diagonal(tangent, modes) / norm, by_gains / norm, error / norm
     return ExpectedTransfer(modes.delay, 1 - foregrounds - by_gains, error, foregrounds, by_gains)
 
 
-@dataclass(frozen=True, eq=False)
-class TangentSpace:
-    """The tangent space of a fit, in units in which the noise of the likelihood is white.
-
-    Attributes
-    ----------
-    roots
-        Square root of D, (Nbls, Nfreqs).
-    slope
-        sqrt(D) F: what a relative change of a gain does to the baseline, (Nbls, Nfreqs), complex.
-    conjugated
-        Baselines that see the conjugate of their model, (Nbls,) bool.
-    sequences
-        For each model, or joint bucket of models, its baselines, and orthonormal sequences on all of them,
-        (Nmembers, Nfreqs, Nkept), real.
-    """
-
-    roots: np.ndarray
-    slope: np.ndarray
-    conjugated: np.ndarray
-    sequences: tuple[tuple[np.ndarray, np.ndarray], ...]
-
-    @classmethod
-    def at(cls, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) -> TangentSpace:
-        """Return the tangent space at a solution.
-
-        Parameters
-        ----------
-        problem
-            What was fitted.
-        gains, model
-            The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-        """
-        structure = problem.structure
-        curvature = problem.weights * np.abs(gain_products(gains, structure.antennas)) ** 2
-        roots = np.sqrt(curvature)
-        sequences = []
-        if not problem.frozen:
-            for bucket in structure.basis.buckets:
-                if bucket.joint:
-                    row, members = np.nonzero(structure.groups == bucket.members[:, None])
-                    sequences.append((members, _orthonormal(roots[members], bucket.vectors[row])))
-                    continue
-                for index in bucket.members:
-                    members = np.flatnonzero(structure.groups == index)
-                    sequences.append((members, _orthonormal(roots[members], bucket.vectors)))
-        return cls(roots, roots * model, structure.conjugated, tuple(sequences))
-
-    def without_foregrounds(self, values: np.ndarray) -> np.ndarray:
-        """Return (1 - P_F) y of whitened changes y, complex, (Nbls, Nfreqs, ...)."""
-        result = values.copy()
-        result[self.conjugated] = result[self.conjugated].conj()
-        for members, vectors in self.sequences:
-            stacked = vectors.reshape(vectors.shape[0] * vectors.shape[1], vectors.shape[2])
-            rows = result[members].reshape(len(stacked), -1)
-            result[members] = (rows - stacked @ (stacked.T @ rows)).reshape(result[members].shape)
-        result[self.conjugated] = result[self.conjugated].conj()
-        return result
-
-    def foreground_diagonal(self, modes: DelayModes) -> np.ndarray:
-        """Return <f|P_F|f> of the unnormalized modes f, (Nbls, Ndelays)."""
-        found = np.zeros((len(self.roots), modes.delay.size))
-        for members, vectors in self.sequences:
-            spectra = modes.amplitudes(np.moveaxis(vectors, 2, 1))
-            found[members] = np.sum(np.abs(spectra) ** 2, axis=1)
-        return found
-
-
-def _orthonormal(roots: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of the sequences, weighted by `roots` (Nmembers, Nfreqs).
-
-    The sequences are (Nfreqs, Nvec), the same on all members, or (Nmembers, Nfreqs, Nvec).
-    """
-    weighted = (roots[:, :, None] * vectors).reshape(-1, vectors.shape[-1])
-    left, singular, _ = np.linalg.svd(weighted, full_matrices=False)
-    kept = singular > SPAN_CUTOFF * max(singular[0], np.finfo(float).tiny)
-    return left[:, kept].reshape(*roots.shape, -1)
+def _foreground_diagonal(tangent: TangentSpace, modes: DelayModes) -> np.ndarray:
+    """Return <f|1 - W^2|f> of the unnormalized modes f, (Nbls, Ndelays); <f|P_F|f> if foregrounds are free."""
+    found = np.zeros((len(tangent.roots), modes.delay.size))
+    for response in tangent.responses:
+        sequences, common = response.sequences, response.common
+        spectra = modes.amplitudes(np.swapaxes(sequences, 1, 2))
+        power = np.sum(np.abs(spectra) ** 2, axis=1)
+        if tangent.finite:
+            products = np.swapaxes(sequences, 1, 2) @ sequences
+            # The common sequences reach from one baseline to the others.
+            last = slice(-common.shape[2], None)
+            products[:, last, last] = np.einsum("pfv,pfu->vu", common, common, optimize=True)
+            power = 2 * power - np.einsum("pvd,pvu,pud->pd", spectra.conj(), products, spectra, optimize=True).real
+        found[response.members] = power
+    return found
 
 
 def jacobian_size(problem: CalibrationProblem) -> int:
@@ -234,23 +178,34 @@ def _exact_diagonal(
             "channels needs too large a matrix; use random probes"
         )
     jacobian, degrees = _jacobian(problem, gains, tangent)
-    normal = jacobian.T @ jacobian
-    inverse = np.linalg.inv(normal + np.diag(LEAST_DAMPING[tf.float32] * degrees))
+    left = tangent.without_foregrounds(jacobian)
+    again = tangent.without_foregrounds(left) if tangent.finite else None
     # The damped projector is one but for directions of next to no curvature; its square is what the probes measure.
-    kernel = inverse @ normal @ inverse
-    n_baselines, n_frequencies = tangent.roots.shape
-    rows = jacobian.reshape(2, n_baselines, n_frequencies, -1)
-    found = np.empty((n_baselines, modes.delay.size))
-    for p in range(n_baselines):
-        real, imaginary = (modes.amplitudes(part[p].T) for part in rows)
+    inverse = np.linalg.inv(_real_product(jacobian, left) + np.diag(LEAST_DAMPING[tf.float32] * degrees))
+    kernel = inverse @ _real_product(left, left) @ inverse
+    found = np.empty((len(left), modes.delay.size))
+    for p in range(len(left)):
         # Re and Im of f* x are two real functionals of the real and imaginary parts of x.
-        first, second = real.real - imaginary.imag, real.imag + imaginary.real
-        found[p] = sum(np.einsum("ud,uv,vd->d", part, kernel, part, optimize=True) for part in (first, second)) / 2
+        once = modes.amplitudes(left[p].T)
+        found[p] = _quadratic_form(once, kernel, once) / 2
+        if again is not None:
+            found[p] = _quadratic_form(modes.amplitudes(again[p].T), inverse, once) - found[p]
     return found
 
 
+def _real_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return Re(first^H second) over baselines and channels, for columns (Nbls, Nfreqs, unknowns)."""
+    first, second = first.reshape(-1, first.shape[-1]), second.reshape(-1, second.shape[-1])
+    return first.real.T @ second.real + first.imag.T @ second.imag
+
+
+def _quadratic_form(first: np.ndarray, matrix: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return Re sum_uv first_u* matrix_uv second_v for each delay; amplitudes are (unknowns, Ndelays)."""
+    return np.sum((first.conj() * (matrix @ second)).real, axis=0)
+
+
 def _jacobian(problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace) -> tuple[np.ndarray, np.ndarray]:
-    """Return Z, (2 Nbls Nfreqs, unknowns), real and imaginary parts stacked, and the diagonal that damping scales."""
+    """Return J_g, complex, (Nbls, Nfreqs, unknowns), and the diagonal that damping scales."""
     structure, shape = problem.structure, tangent.slope.shape
     n_antennas, n_frequencies = structure.n_antennas, structure.n_frequencies
     directions = np.eye(n_frequencies) if structure.gain_vectors is None else structure.gain_vectors
@@ -267,10 +222,9 @@ def _jacobian(problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSp
             for side, column in enumerate(structure.antennas.T):
                 rows = column == antenna
                 change[rows] += tangent.slope[rows][:, :, None] * (relative.conj() if side else relative)
-            columns.append(tangent.without_foregrounds(change).reshape(-1, directions.shape[1]))
+            columns.append(change)
             diagonal.append(np.sum(degrees[antenna][:, None] * np.abs(relative) ** 2, axis=0))
-    whole = np.concatenate(columns, axis=1)
-    return np.concatenate([whole.real, whole.imag]), np.concatenate(diagonal)
+    return np.concatenate(columns, axis=2), np.concatenate(diagonal)
 
 
 class GainResponse:
@@ -329,13 +283,17 @@ def _stochastic_diagonal(
     sums = np.zeros((2, shape[0], modes.delay.size))
     for _ in range(probes):
         noise = used * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
-        gradient = tangent.slope.conj() * tangent.without_foregrounds(noise)
+        left = tangent.without_foregrounds(noise)
+        gradient = tangent.slope.conj() * left
         descent = np.zeros(gains.shape, complex)
         np.add.at(descent, first, gradient)
         np.add.at(descent, second, gradient.conj())
         eta = response.solve(descent)
         absorbed = tangent.without_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
-        power = np.abs(modes.amplitudes(absorbed)) ** 2
+        amplitudes = modes.amplitudes(absorbed)
+        power = np.abs(amplitudes) ** 2
+        if tangent.finite:
+            power = 2 * np.real(modes.amplitudes(left).conj() * amplitudes) - power
         sums += power, power**2
     mean, square = sums / probes
     return mean, np.sqrt(np.maximum(square - mean**2, 0) / (probes - 1))

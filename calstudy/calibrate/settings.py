@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from calstudy.base.schema import UNKEYED, Section, choice
+from calstudy.base.schema import UNKEYED, Section, choice, fault
 from calstudy.base.units import Delay, FluxDensity, Length
 from calstudy.calibrate.interface import Calibrator
 
@@ -190,13 +190,14 @@ class ForegroundPrior(Section):
     def _consistent(self) -> Self:
         own, shared = self.deviation, self.shared_deviation
         if own == "infinite" and shared != 0:
-            raise ValueError("shared_deviation: must be 0 where deviation is infinite, which leaves nothing to share")
+            raise fault("shared_deviation", "must be 0 where deviation is infinite, which leaves nothing to share")
         if shared == "infinite" and own != 0:
-            raise ValueError("deviation: must be 0 where shared_deviation is infinite, or both must be finite")
+            raise fault("deviation", "must be 0 where shared_deviation is infinite, or both must be finite")
         if self.mean == "none" and "infinite" not in (own, shared):
-            raise ValueError(
-                "mean: finite deviations need `mean: sky-model`; around nothing the best foregrounds are ever smaller, "
-                "and the gains ever larger"
+            raise fault(
+                "mean",
+                "finite deviations need `mean: sky-model`; around nothing the best foregrounds are ever smaller, and "
+                "the gains ever larger",
             )
         return self
 
@@ -273,11 +274,9 @@ class ForegroundFit(GainFit):
     def _possible(self) -> Self:
         prior = self.foreground_prior
         if prior.finite and self.joint_basis is not None:
-            raise ValueError("joint_basis: has no finite prior; leave it out, or make `deviation` infinite")
+            raise fault("joint_basis", "has no finite prior; leave it out, or make `deviation` infinite")
         if prior.finite and isinstance(self.solver, FirstOrderSettings):
-            raise ValueError(f"solver: {self.solver.name} cannot fit a finite prior; use gauss-newton or lbfgs")
-        if self.prior == "sky-model" and prior.mean == "none":
-            raise ValueError("prior: 'sky-model' needs `foreground_prior.mean: sky-model`")
+            raise fault("solver", f"{self.solver.name} cannot fit a finite prior; use gauss-newton or lbfgs")
         return self
 
     @property

@@ -14,6 +14,8 @@ Name = Annotated[str, typer.Argument(help="Of the experiment; the file is NAME.y
 Example = Annotated[
     str | None, typer.Option(metavar="NAME", help="Copy a published experiment instead; see `calstudy examples`.")
 ]
+KINDS = {"experiments": "collection", "runtime": "run times", "calibrators": "comparison"}
+"""Files that are not one experiment, by the key that says so."""
 
 
 def examples() -> None:
@@ -25,7 +27,7 @@ def examples() -> None:
     rows = []
     for name in experiment_names():
         content = read_mapping(published("experiments") / f"{name}.yaml")
-        kind = "collection" if "experiments" in content else "run times" if "runtime" in content else "experiment"
+        kind = next((kind for key, kind in KINDS.items() if key in content), "experiment")
         rows.append((name, kind, " ".join(str(content.get("description", "")).split())))
     Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False))
 

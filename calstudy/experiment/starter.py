@@ -79,8 +79,8 @@ def copy_text(example: str, name: str, schema: Path) -> str:
     """Return the text of a published experiment under another name; parameters and errors as `starter_text`."""
     _require_name(name)
     path = find_experiment(Path(example))
-    if "experiments" in read_mapping(path):
-        raise InputError(f"--example {example}: is a collection of other files; copy one of its members")
+    if {"experiments", "calibrators"} & set(read_mapping(path)):
+        raise InputError(f"--example {example}: is made of other files; copy one of those")
     lines = path.read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line.startswith(MODELINE)]
     text = re.sub(r"^name: .*$", f"name: {name}", "\n".join(kept), count=1, flags=re.MULTILINE)

@@ -16,7 +16,7 @@ from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import FIGURES, Experiment
 from calstudy.run.task import Job, Stage, Task
-from calstudy.verdicts.tolerances import Rules
+from calstudy.verdicts.tolerances import Drawn, Rules, spread_of_scale
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -142,6 +142,26 @@ class ComparisonFigure(StudyFigure):
         return {}
 
 
+class CasesFigure(StudyFigure):
+    """A figure of a comparison: calibrators in worlds.
+
+    Its `draw` reads the scores of all cases with `calstudy.products.comparison.read_cases`.
+    """
+
+    tolerances = ((r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),)
+
+    def refusal(self, experiment: Experiment) -> str:
+        """Refuse: a single experiment has nothing to compare."""
+        return "compares calibrators, and cannot be drawn of a single experiment"
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the scores of one case."""
+        from calstudy.products.graph import required
+        from calstudy.products.score import score
+
+        return {"score": required(score(graph))}
+
+
 def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:
     """Return the figures that an experiment asks for; their registry lets no other plug-ins in."""
     return cast(tuple[StudyFigure, ...], experiment.outputs.figures)
@@ -219,3 +239,24 @@ def _task(
 ) -> Task:
     notes = list(stand_ins) if figure.shows_sky else []
     return Task(DRAW, figure.label, {"figure": figure, "notes": notes, **settings}, inputs)
+
+
+def cases_task(
+    figure: CasesFigure, graphs: Mapping[str, Graph], labels: Mapping[str, Sequence[str]], stand_ins: Sequence[str]
+) -> Task:
+    """Return the task that draws one figure of a comparison.
+
+    Parameters
+    ----------
+    figure
+        Which.
+    graphs
+        Of all cases, by `calstudy.products.comparison.case_name`.
+    labels
+        Of the calibrators and the worlds.
+    stand_ins
+        To be printed on it, if it shows the sky.
+    """
+    with guarded(figure):
+        inputs = {name: figure.inputs(graph)["score"] for name, graph in graphs.items()}
+    return _task(figure, stand_ins, labels, inputs)

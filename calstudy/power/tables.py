@@ -12,11 +12,12 @@ import h5py
 import numpy as np
 
 from calstudy.power.expected import ExpectedBins
+from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.power.transfer import TransferFunction, TransferMap
 
 Spectrum = TypeVar(
-    "Spectrum", DelaySpectra, SphericalSpectrum, CylindricalSpectrum, TransferFunction, TransferMap, ExpectedBins
+    "Spectrum", DelaySpectra, SphericalSpectrum, CylindricalSpectrum, TransferFunction, TransferMap, ExpectedBins, Score
 )
 
 CSV_COLUMNS = {

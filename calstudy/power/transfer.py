@@ -238,6 +238,22 @@ def flux_scale(even: np.ndarray, odd: np.ndarray, weights: np.ndarray) -> float:
     return float(mean**-0.5) if mean > 0 else np.nan
 
 
+def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
+    """Return how modes fall into bins of |k|, outside or inside the wedge, each unit being a sample.
+
+    Parameters
+    ----------
+    spectra
+        Whose modes.
+    edges, buffer, inside
+        As for `spherical_transfer`.
+    """
+    bins = np.searchsorted(edges, np.hypot(spectra.k_perp[:, None], spectra.k_parallel), side="left") - 1
+    bins[(bins >= edges.size - 1) | (outside_wedge(spectra, buffer) == inside)] = -1
+    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
+    return Clusters.of(spectra, bins, samples, edges.size - 1)
+
+
 def spherical_transfer(
     injection: Injection, edges: ArrayLike, buffer: float, inside: bool, flux_scale: float = np.nan
 ) -> TransferFunction:
@@ -258,10 +274,7 @@ def spherical_transfer(
     """
     limits = np.asarray(edges, dtype=float)
     signal = injection.signal
-    bins = np.searchsorted(limits, np.hypot(signal.k_perp[:, None], signal.k_parallel), side="left") - 1
-    bins[(bins >= limits.size - 1) | (outside_wedge(signal, buffer) == inside)] = -1
-    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
-    clusters = Clusters.of(signal, bins, samples, limits.size - 1)
+    clusters = clusters_in_k(signal, limits, buffer, inside)
     of_signal, response, cross = (clusters.powers(part) for part in (signal, injection.response, injection.cross))
     transfer, transfer_error = response.ratio(of_signal)
     cross_transfer, cross_transfer_error = cross.ratio(of_signal)

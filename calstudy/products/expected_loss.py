@@ -10,7 +10,8 @@ from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.products import calibration, corruption, sky_model
-from calstudy.products.files import DATA, MODEL, VISIBILITIES, read_visibilities
+from calstudy.products.corruption import LEVELS
+from calstudy.products.files import DATA, MODEL, VISIBILITIES, read_json, read_visibilities
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
 
@@ -30,6 +31,8 @@ def expected_loss(graph: Graph) -> Task:
     }
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
+    if graph.experiment.calibration.needs_noise:
+        inputs["levels"] = corruption.levels(graph)
     settings = {
         "calibration": graph.experiment.calibration.reset("assumed"),
         "power": graph.experiment.power.reset("pairs", "redundancy_tolerance"),
@@ -62,7 +65,8 @@ def expect(job: Job) -> Mapping[str, Any]:
     if "sky_model" in job.inputs:
         sky = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
         sky = sky.select(blt_inds=chosen, inplace=False, run_check=False)
-    assumed = Assumed(None if sky is None else Observation(sky))
+    noise = read_json(job.inputs["levels"] / LEVELS)["noise_std"] if "levels" in job.inputs else None
+    assumed = Assumed(None if sky is None else Observation(sky), noise=noise)
     chosen_data = Observation(data.select(blt_inds=chosen, inplace=False, run_check=False))
     prepared = prepare(chosen_data, settings, assumed)
     problem = make_problem(prepared, settings, slice(0, 1), 0)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import Component, Variant
 from calstudy.products import calibration, corruption
@@ -115,14 +117,25 @@ def make_average(job: Job) -> Mapping[str, Any]:
 
 
 def estimate(job: Job) -> Mapping[str, Any]:
-    """Write the delay spectra even x odd to delay-spectra.h5, and what the estimator itself exports."""
+    """Write the delay spectra even x odd to delay-spectra.h5, and what the estimator itself exports.
+
+    Where all is flagged, because no solve gave gains, they are NaN.
+    """
+    import numpy as np
+
     from calstudy.instrument.beams import make_beam
     from calstudy.power.interface import estimate_spectra
     from calstudy.power.tables import save_spectrum
 
-    even, odd = (read_visibilities(job.inputs[parity] / AVERAGE) for parity in PARITIES)
+    even, odd = averages = [read_visibilities(job.inputs[parity] / AVERAGE) for parity in PARITIES]
     beam = make_beam(job.settings["beam"], job.settings["channels"])
+    empty = any(uvd.flag_array.all() for uvd in averages)
+    if empty:
+        for uvd in averages:
+            uvd.flag_array[:] = False
     found = estimate_spectra(even, odd, beam, job.settings["power"], job.output)
+    if empty:
+        found = replace(found, power=np.full_like(found.power, np.nan))
     save_spectrum(job.output / DELAY_SPECTRA, found)
     return {"units": len(found.n_pairs), "pairs": int(found.n_pairs.sum())}
 
@@ -141,6 +154,8 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
     The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
     (paper section Reduction of Simulation Products); each enters the variants that contain its component.
     """
+    import numpy as np
+
     from calstudy.power.cylindrical import cylindrical_average
     from calstudy.power.errors import noise_level, with_errors
     from calstudy.power.spherical import spherical_average
@@ -151,6 +166,8 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
     sigma_noise = noise_level(delays[NOISE_REFERENCE]) if NOISE_REFERENCE in delays else 0.0
     signals = {name: spherical_average(delays[EOR_REFERENCE], settings, excise) for name, excise in EXCISION.items()}
     for name, variant in job.settings["variants"].items():
+        if not np.isfinite(delays[name].power).any():
+            raise InputError(f"variants.{name}: all data are flagged, because no solve of the calibration gave gains")
         save_spectrum(job.output / spectrum_file(name, "wedge"), cylindrical_average(delays[name], settings))
         for modes, excise in EXCISION.items():
             spectrum = with_errors(

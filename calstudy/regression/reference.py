@@ -24,6 +24,8 @@ from calstudy.verdicts.tolerances import Rules
 EXPERIMENT, MANIFEST = "experiment.yaml", "manifest.json"
 KEPT = ("png", "npz")
 """Endings of a figure's files that are kept: the picture and its arrays."""
+TABLES = ("realizations.md", "comparison.md")
+"""Tables that are kept."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +137,12 @@ def accept(run: Path, reference: Path) -> None:
     """
     sources = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
     sources |= {name: run / name for name in (*CLAIMS_FILES, MANIFEST) if (run / name).is_file()}
+    sources |= {name: run / "tables" / name for name in TABLES if (run / "tables" / name).is_file()}
     description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
     try:
         reference.mkdir(parents=True, exist_ok=True)
         kept = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
-        for old in [*kept, *(reference / name for name in CLAIMS_FILES)]:
+        for old in [*kept, *(reference / name for name in (*CLAIMS_FILES, *TABLES))]:
             if old.name not in sources:
                 old.unlink(missing_ok=True)
         for name, source in sources.items():
@@ -158,9 +161,7 @@ def _replace(path: Path, content: bytes) -> None:
 def _experiment(run: Path) -> dict[str, Any]:
     """Return what the run was of, without the folders of the machine where it was made."""
     if (run / EXPERIMENT).is_file():
-        experiment = read_mapping(run / EXPERIMENT)
-        outputs = {key: value for key, value in experiment.get("outputs", {}).items() if key not in ("store", "runs")}
-        return {**experiment, "outputs": outputs}
+        return _without_folders(read_mapping(run / EXPERIMENT))
     manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))
     drawn = sorted(path.stem for path in (run / "figures").glob("*.npz"))
     return {
@@ -170,3 +171,15 @@ def _experiment(run: Path) -> dict[str, Any]:
         "figures": manifest.get("figures", drawn),
         "roles": manifest["roles"],
     }
+
+
+def _without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an experiment, or a comparison with one in it, without its store and folder of runs."""
+    if isinstance(content.get("experiment"), Mapping):
+        worlds = {
+            world: {path: value for path, value in changes.items() if path not in ("outputs.store", "outputs.runs")}
+            for world, changes in content["worlds"].items()
+        }
+        return {**content, "experiment": _without_folders(content["experiment"]), "worlds": worlds}
+    outputs = {key: value for key, value in content.get("outputs", {}).items() if key not in ("store", "runs")}
+    return {**content, "outputs": outputs}

@@ -13,6 +13,7 @@ from calstudy.base.errors import InputError
 from calstudy.run.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
+COMPARISON = "comparison.csv"
 REALIZATIONS = "realizations.json"
 CLAIMS_TITLE = "Claims of the paper"
 REGIONS = {"outside-wedge": "outside the wedge", "inside-wedge": "inside the wedge"}
@@ -104,6 +105,7 @@ def read_contents(folder: Path) -> Contents:
     tables = [
         _claims(folder, products),
         _summary(folder),
+        _comparison(folder),
         _realizations(folder),
         _signal_loss(folder, sky_model),
         _convergence(products, sky_model),
@@ -261,6 +263,29 @@ def _summary(folder: Path) -> Table | None:
     return Table(
         "Signal loss of every point", columns, cells, "T = P^R / P^S outside the wedge, one standard deviation."
     )
+
+
+def _comparison(folder: Path) -> Table | None:
+    """Return the scores of every calibrator in every world, a row each."""
+    path = folder / "tables" / COMPARISON
+    if not path.is_file():
+        return None
+    rows = _read_csv(path)
+    bands = list(dict.fromkeys((row["k from [h/Mpc]"], row["k to [h/Mpc]"]) for row in rows))
+    cells: dict[tuple[str, str], list[str]] = {}
+    for name in ("transfer", "bias"):
+        for row in rows:
+            cell = with_error(float(row[name]), float(row[f"{name} error"])) if row[name] else "-"
+            cells.setdefault((row["world"], row["calibrator"]), []).append(cell)
+    last = {(row["world"], row["calibrator"]): row["solves"] for row in rows}
+    measured = [f"{symbol}, k = {low} to {high}" for symbol in ("T", "bias") for low, high in bands]
+    note = (
+        "T is the part of the EoR's power that is left, the bias the power of the residual without EoR over that of "
+        "the EoR, both free of the flux scale, outside the wedge, k in h/Mpc, one standard deviation. All numbers are "
+        "in comparison.md and comparison.csv."
+    )
+    columns = ("world", "calibrator", *measured, "solves")
+    return Table("Calibrators compared", columns, [(*case, *found, last[case]) for case, found in cells.items()], note)
 
 
 def _realizations(folder: Path) -> Table | None:

@@ -20,8 +20,8 @@ from calstudy.run.task import Task
 from calstudy.verdicts.tables import CLAIMS_FILES
 
 MANIFEST, EXPERIMENT, LOG = "manifest.json", "experiment.yaml", "run.log"
-POINTS = "points"
-"""Folder of the run folders of a sweep's points."""
+POINTS, CASES = "points", "cases"
+"""Folders of the run folders of a sweep's points, and of the experiments of a comparison's cases."""
 
 
 def run_folder(runs: Path, name: str, content: Any) -> Path:
@@ -43,7 +43,7 @@ def run_folder(runs: Path, name: str, content: Any) -> Path:
 
 def open_folder(folder: Path) -> None:
     """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
-    results = {"report.html", "figures", "tables", POINTS, "regression.json"}
+    results = {"report.html", "figures", "tables", POINTS, CASES, "regression.json"}
     known = results | {MANIFEST, EXPERIMENT, LOG, *CLAIMS_FILES}
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -9,8 +9,9 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from calstudy.experiment.model import Experiment
-from calstudy.studies import collection, runtime
+from calstudy.studies import collection, comparison, runtime
 from calstudy.studies.collection import CollectionFile
+from calstudy.studies.comparison import ComparisonFile
 from calstudy.studies.runtime import RuntimeFile
 
 SCHEMA_FILE = "experiment.schema.json"
@@ -19,11 +20,15 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def experiment_schema() -> str:
-    """Return the JSON schema of experiments, collections and run-time studies as text.
+    """Return the JSON schema of experiments, collections, comparisons and run-time studies as text.
 
     Quantities are strings there; units and what depends on several fields are checked by ``calstudy plan`` alone.
     """
-    kinds: dict[type[BaseModel], str] = {CollectionFile: collection.KEY, RuntimeFile: runtime.KEY}
+    kinds: dict[type[BaseModel], str] = {
+        CollectionFile: collection.KEY,
+        RuntimeFile: runtime.KEY,
+        ComparisonFile: comparison.KEY,
+    }
     models: list[type[BaseModel]] = [Experiment, *kinds]
     references, found = models_json_schema([(model, "validation") for model in models])
     schema: dict[str, Any] = references[Experiment, "validation"]

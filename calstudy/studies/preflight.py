@@ -67,6 +67,17 @@ def require_calibration(experiment: Experiment) -> None:
             _require_same_antennas(make_array(experiment.instrument), make_array(world.instrument))
 
 
+def refusal_of_calibrator(experiment: Experiment) -> str:
+    """Return why the calibrator cannot work on the antennas, baselines and channels of an experiment, or nothing."""
+    has_sky_model = SKY_MODEL in assumed_changes(experiment.calibration.assumed)
+    has_sky_model = has_sky_model or assumed_world(experiment).sky.has_foregrounds
+    try:
+        require_calibratable(experiment.calibration, frame_of(experiment.instrument), has_sky_model)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
 def _require_same_antennas(true: Layout, assumed: Layout) -> None:
     """Raise InputError unless an assumed layout has the antennas of the true one at the same site."""
     field = f"{FIELD}.instrument.layout"

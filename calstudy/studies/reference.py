@@ -17,6 +17,7 @@ from calstudy.experiment.model import Experiment, RealizationBlock, Variant
 from calstudy.instrument.as_built import DeadDipoles
 from calstudy.instrument.settings import AntennaBeam
 from calstudy.studies.collection import CollectionFile, Member
+from calstudy.studies.comparison import ComparisonFile
 from calstudy.studies.runtime import RuntimeFile
 
 
@@ -204,6 +205,14 @@ def field_reference() -> str:
         "## `experiments`: each",
         "",
         *_section(Member, "experiments", listed),
+        "",
+        "# Comparison files",
+        "",
+        "A file with the key `calibrators` is a comparison. `python -m calstudy run` calibrates the data of each world",
+        "with each calibrator, and compares the results in tables and figures; `--set` changes the experiment of every",
+        "case.",
+        "",
+        *_section(ComparisonFile, "", listed),
         "",
         "# Run-time files",
         "",

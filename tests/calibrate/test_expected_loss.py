@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_calibration_loss import redundant_structure
+from test_foreground_prior import dense_covariance, prior_structure, turned
 from test_joint_basis import joined
 from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
@@ -121,6 +122,81 @@ def test_random_probes_agree_with_the_exact_diagonal_within_their_errors(kind):
     assert 0.8 < np.std(pull) < 1.25
     assert abs(np.mean(pull)) < 0.3
     assert np.mean(probed.error[known]) < 0.08
+
+
+def prior_case(prior):
+    """A hexagon with a finite prior whose deviation lies between noise and foregrounds, and the solution."""
+    toy = make_toy(HEX, noise=0.0)
+    structure = prior_structure(toy, prior)
+    sky = turned(structure, toy.foregrounds)
+    shape, rms = sky.shape, np.sqrt(np.mean(np.abs(sky) ** 2))
+    flags = np.zeros(shape, bool)
+    flags[2, 10:14] = flags[:, 40] = True
+    deviations = (0.02 * rms, 0.1 * rms)
+    problem = toy.problem(
+        structure,
+        visibilities=gain_products(toy.gains, structure.antennas) * sky,
+        weights=np.where(flags, 0, (0.01 * rms) ** -2),
+        sky_model=sky,
+        deviations=deviations,
+    )
+    return problem, toy.gains, sky
+
+
+def dense_residual_power(problem, gains, model):
+    """<f|M^2|f> / <f|f> with M = W - W J (J^T W J)^-1 J^T W and W = (1 + C)^-1, the whitened covariance of all samples.
+
+    With a Gaussian prior, the foregrounds are those of a Wiener filter, which leaves (1 + C)^-1 y.
+    """
+    structure, shape = problem.structure, model.shape
+    n = shape[0] * shape[1]
+    antennas, used = structure.antennas, problem.weights.ravel() > 0
+    roots = np.sqrt(problem.weights) * np.abs(gain_products(gains, antennas))
+    # Real and imaginary part of the sample of a turned baseline are those of the conjugate.
+    sign = np.where(structure.conjugated, -1.0, 1.0)[:, None] * np.ones(shape)
+    columns = []
+    for unit in (1, 1j):
+        for antenna in range(structure.n_antennas):
+            for channel in range(shape[1]):
+                change = np.zeros(gains.shape, complex)
+                change[antenna, channel] = unit
+                moved = roots * model * (change[antennas[:, 0]] + change[antennas[:, 1]].conj())
+                columns.append(np.concatenate([moved.real.ravel(), (sign * moved.imag).ravel()]))
+    jacobian = np.array(columns).T
+    own, shared = problem.deviations
+    covariance = dense_covariance(structure, own, shared)
+    covariance *= np.outer(roots.ravel(), roots.ravel())
+    both = np.zeros((2 * n, 2 * n))
+    both[:n, :n] = both[n:, n:] = covariance
+    whitened = np.linalg.inv(np.eye(2 * n) + both)
+    image = whitened @ jacobian
+    left = whitened - image @ np.linalg.pinv(jacobian.T @ image, rcond=1e-10, hermitian=True) @ image.T
+    left[:, ~np.tile(used, 2)] = 0
+    phases = MODES.amplitudes(np.eye(shape[1])).T
+    found, norm = np.empty((shape[0], MODES.delay.size)), np.sum(MODES.weights**2 * used.reshape(shape), axis=1)
+    for p in range(shape[0]):
+        rows = slice(p * shape[1], (p + 1) * shape[1])
+        # f* x = f* (Re x + i Im x), of what is left of white noise in all samples.
+        real, imaginary = left[:n][rows], sign[p, 0] * left[n:][rows]
+        response = phases @ real + 1j * (phases @ imaginary)
+        found[p] = np.sum(np.abs(response) ** 2, axis=1) / 2 / norm[p]
+    return found
+
+
+@pytest.mark.parametrize("prior", ["own", "shared", "both"])
+def test_a_finite_prior_leaves_what_the_dense_posterior_mean_leaves(prior):
+    problem, gains, model = prior_case(prior)
+    found = expected_transfer(problem, gains, model, MODES)
+    dense = dense_residual_power(problem, gains, model)
+    assert np.allclose(found.transfer, dense, rtol=0, atol=2e-4)
+    assert np.max(dense) - np.min(dense) > 0.5
+    inside = np.abs(MODES.delay) < 50e-9
+    # Between keeping the delays of the foregrounds, as a complete sky model does, and giving them up.
+    assert 0.01 < np.mean(dense[:, inside]) < 0.5
+    probed = expected_transfer(problem, gains, model, MODES, probes=64)
+    pull = (probed.transfer - found.transfer) / probed.error
+    assert 0.8 < np.std(pull) < 1.25
+    assert abs(np.mean(pull)) < 0.3
 
 
 def test_far_from_the_foregrounds_gains_take_their_share_of_the_degrees_of_freedom():

@@ -49,7 +49,7 @@ def problem(request, hexagon) -> CalibrationProblem:
     return CalibrationProblem(structure, data, weights, start, sky, deviations=(OWN, SHARED))
 
 
-def dense_covariance(structure):
+def dense_covariance(structure, own=OWN, shared=SHARED):
     """C of all samples, (Nbls Nfreqs) squared, for visibilities of which conjugated ones are turned back."""
     vectors = [None] * structure.basis.n_models
     for bucket in structure.basis.buckets:
@@ -60,10 +60,10 @@ def dense_covariance(structure):
     for p, group in enumerate(structure.groups):
         covariance = vectors[group] @ vectors[group].T
         if structure.prior in ("own", "both"):
-            result[p, :, p] += OWN**2 * covariance
+            result[p, :, p] += own**2 * covariance
         if structure.prior in ("shared", "both"):
             for q in np.flatnonzero(structure.groups == group):
-                result[p, :, q] += SHARED**2 * covariance
+                result[p, :, q] += shared**2 * covariance
     return result.reshape(structure.n_baselines * n, -1)
 
 

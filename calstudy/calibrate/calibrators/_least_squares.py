@@ -40,8 +40,10 @@ class LeastSquares(GainFit):
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return why no foreground model can be made for these baselines and channels, or None."""
-        if isinstance(self, ForegroundFit) and self.foreground_prior.mean == "sky-model" and not has_sky_model:
-            return "foreground_prior.mean: 'sky-model' needs a sky model, and there is none"
+        if isinstance(self, ForegroundFit) and not has_sky_model:
+            for field, value in (("foreground_prior.mean", self.foreground_prior.mean), ("prior", self.prior)):
+                if value == "sky-model":
+                    return f"{field}: 'sky-model' needs a sky model, and there is none"
         from calstudy.calibrate.problem import fitted_baselines
 
         try:

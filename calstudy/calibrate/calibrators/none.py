@@ -1,0 +1,26 @@
+"""No calibration: what gains that are left alone do to a perfect subtraction of the sky model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calstudy.base.observation import Frame, Observation
+from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Outcome, Progress
+
+
+class NoCalibration(Calibrator):
+    """All gains are one, and the sky model is subtracted."""
+
+    calibrator: str = "none"
+
+    def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
+        """Return that there is no sky model to subtract, if there is none."""
+        return None if has_sky_model else "needs a sky model, and there is none"
+
+    def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
+        """Return gains of one."""
+        shape = observation.visibilities.shape
+        n_times, n_polarizations = shape[0], shape[-1]
+        gains = np.ones((observation.numbers.size, shape[2], n_times, n_polarizations), complex)
+        outcome = Outcome(status="converged", message="gains of one: nothing is fitted")
+        return Calibration(gains=gains, outcomes=[outcome] * (n_polarizations * len(self.solves(n_times))))

@@ -1,0 +1,146 @@
+"""The tangent space of a fit at its solution: what gains and foregrounds can do to a small change of the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calstudy.calibrate.problem import CalibrationProblem, gain_products
+
+# Singular values of weighted sequences below this, relative to the largest, belong to what flags left undetermined; the
+# solvers' ridge on their squares is the square of it.
+SPAN_CUTOFF = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What the foregrounds of some baselines absorb of a whitened change y: own own^T y + common common^T y.
+
+    Attributes
+    ----------
+    members
+        The baselines.
+    common
+        Sequences on all of them together, (Nmembers, Nfreqs, Nvec), real; orthonormal unless there is a finite prior.
+    own
+        Sequences of each baseline by itself, of the same kind; None if there are none.
+    """
+
+    members: np.ndarray
+    common: np.ndarray
+    own: np.ndarray | None = None
+
+    @property
+    def sequences(self) -> np.ndarray:
+        """Those of each baseline by itself and the common ones, (Nmembers, Nfreqs, Nall)."""
+        return self.common if self.own is None else np.concatenate([self.own, self.common], axis=2)
+
+    def absorb(self, rows: np.ndarray) -> np.ndarray:
+        """Return what is absorbed of changes of the members, (Nmembers, Nfreqs, ...)."""
+        flat = rows.reshape(*rows.shape[:2], -1)
+        found = self.common @ np.einsum("pfv,pfc->vc", self.common, flat, optimize=True)
+        if self.own is not None:
+            found = found + self.own @ (np.swapaxes(self.own, 1, 2) @ flat)
+        return found.reshape(rows.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class TangentSpace:
+    """The tangent space of a fit, in units in which the noise of the likelihood is white.
+
+    Attributes
+    ----------
+    roots
+        Square root of D, (Nbls, Nfreqs).
+    slope
+        sqrt(D) F: what a relative change of a gain does to the baseline, (Nbls, Nfreqs), complex.
+    conjugated
+        Baselines that see the conjugate of their model, (Nbls,) bool.
+    responses
+        Of the foregrounds: one for each model, or joint bucket of models.
+    finite
+        Whether the foregrounds have a finite prior.
+    """
+
+    roots: np.ndarray
+    slope: np.ndarray
+    conjugated: np.ndarray
+    responses: tuple[Response, ...]
+    finite: bool
+
+    @classmethod
+    def at(cls, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) -> TangentSpace:
+        """Return the tangent space at a solution.
+
+        Parameters
+        ----------
+        problem
+            What was fitted.
+        gains, model
+            The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
+        """
+        structure = problem.structure
+        curvature = problem.weights * np.abs(gain_products(gains, structure.antennas)) ** 2
+        roots = np.sqrt(curvature)
+        responses = []
+        for bucket in () if problem.frozen else structure.basis.buckets:
+            if bucket.joint:
+                row, members = np.nonzero(structure.groups == bucket.members[:, None])
+                responses.append(Response(members, _orthonormal(roots[members], bucket.vectors[row])))
+                continue
+            for index in bucket.members:
+                members = np.flatnonzero(structure.groups == index)
+                responses.append(_respond(problem, members, roots[members], bucket.vectors))
+        return cls(roots, roots * model, structure.conjugated, tuple(responses), structure.prior != "none")
+
+    def without_foregrounds(self, values: np.ndarray) -> np.ndarray:
+        """Return W y of whitened changes y, (1 - P_F) y if foregrounds are free; complex, (Nbls, Nfreqs, ...)."""
+        result = values.copy()
+        result[self.conjugated] = result[self.conjugated].conj()
+        for response in self.responses:
+            rows = result[response.members]
+            result[response.members] = rows - response.absorb(rows)
+        result[self.conjugated] = result[self.conjugated].conj()
+        return result
+
+
+def _respond(problem: CalibrationProblem, members: np.ndarray, roots: np.ndarray, vectors: np.ndarray) -> Response:
+    """Return the response of one foreground model, with the sequences (Nfreqs, Nvec), on its baselines.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    members, roots
+        The baselines, and square root of D on them, (Nmembers, Nfreqs).
+    vectors
+        For coefficients of unit variance, in units of the prior's deviation, if it is finite.
+    """
+    prior, (own, shared) = problem.structure.prior, problem.deviations
+    if prior == "none":
+        return Response(members, _orthonormal(roots, vectors))
+    weighted = roots[:, :, None] * vectors
+    if prior != "both":
+        weighted = weighted * (own if prior == "own" else shared)
+        return Response(members, _smoothing(weighted, weighted))
+    alone = np.stack([_smoothing(own * part[None], own * part[None])[0] for part in weighted])
+    left = weighted - alone @ (np.swapaxes(alone, 1, 2) @ weighted)
+    return Response(members, _smoothing(shared * weighted, shared * left), alone)
+
+
+def _smoothing(sequences: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Return Q with Q Q^T = W B (1 + B^T W B)^-1 B^T W, for B and W B of shape (Nmembers, Nfreqs, Nvec)."""
+    values, turned = np.linalg.eigh(np.einsum("pfv,pfu->vu", sequences, left, optimize=True))
+    return left @ (turned / np.sqrt(1 + np.maximum(values, 0)))
+
+
+def _orthonormal(roots: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of the sequences, weighted by `roots` (Nmembers, Nfreqs).
+
+    The sequences are (Nfreqs, Nvec), the same on all members, or (Nmembers, Nfreqs, Nvec).
+    """
+    weighted = (roots[:, :, None] * vectors).reshape(-1, vectors.shape[-1])
+    left, singular, _ = np.linalg.svd(weighted, full_matrices=False)
+    kept = singular > SPAN_CUTOFF * max(singular[0], np.finfo(float).tiny)
+    return left[:, kept].reshape(*roots.shape, -1)

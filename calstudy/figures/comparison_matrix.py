@@ -1,0 +1,111 @@
+"""Bias and transfer function of calibrators in worlds, as a matrix for each band of k."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from calstudy.figures import CasesFigure, Drawing
+from calstudy.plotting import style
+from calstudy.products.comparison import Case, read_cases
+from calstudy.run.task import Job
+
+SHADES = LogNorm(1e-2, 1e2)
+COLOURS = colormaps["YlOrRd"]
+DARK = 10.0
+"""Above this bias the text is white."""
+ROW_HEIGHT, HEADING_HEIGHT = 0.3, 0.45
+LABELS_WIDTH = 72
+"""Characters that fit below the matrix."""
+SIGNIFICANT = 2.0
+"""A bias of fewer standard deviations is written and coloured as that many of them."""
+
+
+@style.journal_style()
+def draw_matrix(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw a matrix for each band of k: worlds from left to right, calibrators from top to bottom.
+
+    The colour is the bias. A bias within two standard deviations of zero is shown as an upper limit of two of them.
+
+    Parameters
+    ----------
+    cases
+        By world and calibrator.
+    calibrators
+        Their labels, in order; a case that is not there is left white.
+    stand_ins
+        See `calstudy.plotting.style.note_stand_ins`.
+    """
+    worlds = list(cases)
+    edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
+    n_bands = edges.size - 1
+    height = n_bands * (HEADING_HEIGHT + ROW_HEIGHT * len(calibrators)) + 0.4
+    figure = style.new_figure(style.TWO_COLUMNS if len(worlds) > 2 else style.ONE_COLUMN + 1, height)
+    panels = figure.subplots(n_bands, 1, squeeze=False, sharex=True)[:, 0]
+    for band, axes in enumerate(panels):
+        _draw_band(axes, cases, calibrators, band)
+        axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
+    panels[-1].set_xticks(range(len(worlds)), [textwrap.fill(world, LABELS_WIDTH // len(worlds)) for world in worlds])
+    bar = figure.colorbar(ScalarMappable(SHADES, COLOURS), ax=panels, extend="both", aspect=40, pad=0.01)
+    bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$")
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_band(axes: Axes, cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], band: int) -> None:
+    colours = np.full((len(calibrators), len(cases), 4), 1.0)
+    for column, found in enumerate(cases.values()):
+        for name, case in found.items():
+            row = calibrators.index(name)
+            bias, error = case.bands.bias[band], case.bands.bias_error[band]
+            shown = max(abs(bias), SIGNIFICANT * error) if np.isfinite(error) else abs(bias)
+            if np.isfinite(shown):
+                colours[row, column] = COLOURS(SHADES(shown))
+            axes.text(
+                column,
+                row,
+                f"{_bias_text(bias, error)}\n$T$ = {case.bands.transfer[band]:.2f}",
+                ha="center",
+                va="center",
+                fontsize=style.SMALL_SIZE,
+                color="white" if shown > DARK else style.BLACK,
+                linespacing=1.1,
+            )
+    axes.imshow(colours, aspect="auto")
+    axes.set_yticks(range(len(calibrators)), calibrators)
+    axes.tick_params(length=0)
+
+
+def _bias_text(bias: float, error: float) -> str:
+    if np.isfinite(error) and abs(bias) < SIGNIFICANT * error:
+        return f"bias < {_digits(SIGNIFICANT * error)}"
+    return f"bias {_digits(bias)}"
+
+
+def _digits(value: float) -> str:
+    if not np.isfinite(value):
+        return "–"
+    if abs(value) >= 1e4:
+        return f"{value:.0e}".replace("e+0", "e")
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}"
+
+
+class ComparisonMatrix(CasesFigure):
+    """A matrix of calibrators and worlds for each band of k: colour and number are the bias, T is written below it."""
+
+    caption = "Bias of every calibrator in every world, in units of the EoR, and the part T of the EoR that is left."
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the matrices."""
+        cases = read_cases(job)
+        shown = {world: {name: case.bands for name, case in found.items()} for world, found in cases.items()}
+        return Drawing(draw_matrix(cases, job.settings["calibrators"], job.settings["notes"]), shown)

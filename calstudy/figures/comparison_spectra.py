@@ -1,0 +1,93 @@
+"""Recovered power and bias of calibrators against k, a row for each world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from calstudy.figures import CasesFigure, Drawing
+from calstudy.figures.signal_loss import SIGMAS_95
+from calstudy.plotting import style
+from calstudy.products.comparison import Case, read_cases
+from calstudy.run.task import Job
+
+COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+LINEAR = {"recovered": 2.0, "bias": 0.1}
+"""An axis is linear up to this, and logarithmic beyond where there is more."""
+ROW_HEIGHT, LARGEST_K = 1.7, 1.0
+
+
+def look(place: int) -> dict[str, Any]:
+    """Return colour, marker and line of one of several calibrators or worlds."""
+    lines = ("-", "--", ":")
+    return {
+        "color": COLOURS[place % len(COLOURS)],
+        "marker": MARKERS[place % len(MARKERS)],
+        "linestyle": lines[place // len(COLOURS) % len(lines)],
+    }
+
+
+@style.journal_style()
+def draw_spectra(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, outside the wedge, with 95 % bars.
+
+    Parameters
+    ----------
+    cases
+        By world and calibrator.
+    calibrators
+        Their labels, in order.
+    stand_ins
+        See `calstudy.plotting.style.note_stand_ins`.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(cases))
+    grid = figure.subplots(len(cases), 2, squeeze=False, sharex=True)
+    for (left, right), (world, found) in zip(grid, cases.items(), strict=True):
+        for name, case in found.items():
+            place = calibrators.index(name)
+            shift = 0.15 * (place - (len(calibrators) - 1) / 2) / len(calibrators)
+            _draw_points(left, case, "recovered", place, shift)
+            _draw_points(right, case, "bias", place, shift)
+        for axes, name in ((left, "recovered"), (right, "bias")):
+            if max(np.abs(axes.get_ylim())) > 2 * LINEAR[name]:
+                axes.set_yscale("symlog", linthresh=LINEAR[name])
+        left.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
+        right.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
+        left.set_title(world, loc="left")
+        left.set_ylabel(r"$P^R / P^S$")
+        right.set_ylabel(r"$s^2 P^{R_0} / P^S$")
+    for axes in grid[-1]:
+        axes.set_xlabel(style.WAVENUMBER)
+    handles = [Line2D([], [], linewidth=0.6, markersize=2.5, **look(place)) for place in range(len(calibrators))]
+    figure.legend(handles, list(calibrators), loc="outside upper center", ncols=min(len(calibrators), 5))
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_points(axes: Axes, case: Case, name: str, place: int, shift: float) -> None:
+    bins = case.bins
+    values, errors = getattr(bins, name), getattr(bins, f"{name}_error")
+    used = np.isfinite(values) & (bins.k <= LARGEST_K)
+    k = bins.k + shift * np.diff(bins.bin_edges)
+    bars = SIGMAS_95 * np.nan_to_num(errors[used])
+    axes.errorbar(k[used], values[used], yerr=bars, elinewidth=0.5, linewidth=0.6, markersize=2.5, **look(place))
+
+
+class ComparisonSpectra(CasesFigure):
+    """P^R / P^S and s^2 P^R0 / P^S of every calibrator against k, a row for each world."""
+
+    caption = "Recovered power (left) and bias (right) outside the wedge in units of the EoR, with 95 % bars."
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a row for each world."""
+        cases = read_cases(job)
+        shown = {world: {name: case.bins for name, case in found.items()} for world, found in cases.items()}
+        return Drawing(draw_spectra(cases, job.settings["calibrators"], job.settings["notes"]), shown)

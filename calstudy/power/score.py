@@ -1,0 +1,108 @@
+"""Scores of a calibration in bins of k: the signal that it leaves, the power that it adds, and what comes out.
+
+Of the calibrated residual R of data with the EoR, and R0 of data without it:
+
+- the transfer function T of the signal, free of the flux scale (`calstudy.power.transfer`);
+- the bias s^2 P^R0 / P^S, power that is there without any EoR: foregrounds that are left, in units of the EoR, and
+  free of the flux scale s as well, for a calibration that makes everything smaller must not look better for it;
+- the recovered power P^R / P^S, as it comes out.
+
+Noise is in the errors of the last two, and not in their means, because spectra are crossed between two realizations of
+the noise. Errors are found by leaving out antennas (`calstudy.power.clusters`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calstudy.power.spectra import DelaySpectra
+from calstudy.power.transfer import clusters_in_k
+
+BANDS = (0.1, 0.2, 0.5, 1.0)
+"""Edges in h/Mpc of the bands in which calibrations are compared."""
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """Delay spectra of the same units and delays.
+
+    Attributes
+    ----------
+    signal
+        Of the EoR alone.
+    response
+        Of what the EoR changes in the residual.
+    residual, residual_without_eor
+        Of the calibrated residual of data with the EoR and without.
+    """
+
+    signal: DelaySpectra
+    response: DelaySpectra
+    residual: DelaySpectra
+    residual_without_eor: DelaySpectra
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a calibration does in Nk bins of |k|, outside the wedge. Bins without signal hold NaN.
+
+    Attributes
+    ----------
+    k, bin_edges
+        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
+    transfer, transfer_error
+        T s^2, free of the flux scale s, and its standard deviation, (Nk,); NaN if s is not known.
+    bias, bias_error
+        s^2 P^R0 / P^S, free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
+    recovered, recovered_error
+        P^R / P^S, (Nk,).
+    flux_scale
+        s: fitted gain products over the true ones; NaN if not known.
+    """
+
+    k: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    transfer: np.ndarray = field(metadata={"unit": ""})
+    transfer_error: np.ndarray = field(metadata={"unit": ""})
+    bias: np.ndarray = field(metadata={"unit": ""})
+    bias_error: np.ndarray = field(metadata={"unit": ""})
+    recovered: np.ndarray = field(metadata={"unit": ""})
+    recovered_error: np.ndarray = field(metadata={"unit": ""})
+    flux_scale: float = field(metadata={"unit": ""})
+
+
+def score(spectra: Calibrated, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
+    """Return the scores in bins of |k|.
+
+    Parameters
+    ----------
+    spectra
+        Of the calibrated residuals and the EoR.
+    edges
+        Bin edges, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
+    buffer
+        Modes with |tau| <= |b|/c + buffer (s) are left out.
+    flux_scale
+        s of the calibration; NaN if not known.
+    """
+    limits, signal = np.asarray(edges, dtype=float), spectra.signal
+    clusters = clusters_in_k(signal, limits, buffer, inside=False)
+    of_signal = clusters.powers(signal)
+    (transfer, transfer_error), (bias, bias_error), (recovered, recovered_error) = (
+        clusters.powers(part).ratio(of_signal)
+        for part in (spectra.response, spectra.residual_without_eor, spectra.residual)
+    )
+    return Score(
+        k=(limits[1:] + limits[:-1]) / 2,
+        bin_edges=limits,
+        transfer=transfer * flux_scale**2,
+        transfer_error=transfer_error * flux_scale**2,
+        bias=bias * flux_scale**2,
+        bias_error=bias_error * flux_scale**2,
+        recovered=recovered,
+        recovered_error=recovered_error,
+        flux_scale=flux_scale,
+    )

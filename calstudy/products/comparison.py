@@ -1,0 +1,223 @@
+"""Calibrators in worlds side by side: the scores of all cases, and the table of them."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calstudy.base.resources import Cost
+from calstudy.products import score
+from calstudy.products.files import read_json
+from calstudy.products.tolerances import BAND, LIMIT, faults, tolerance
+from calstudy.run.task import Job, Stage, Task
+from calstudy.verdicts.tables import Table, number
+
+if TYPE_CHECKING:
+    from calstudy.power.score import Score
+
+CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
+QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
+"""What is compared in bands of k, and how it is headed."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One calibrator in one world.
+
+    Attributes
+    ----------
+    bins, bands
+        Its scores in the experiment's bins of k, and in wide bands.
+    summary
+        All of its numbers, as in score.json.
+    """
+
+    bins: Score
+    bands: Score
+    summary: Mapping[str, Any]
+
+
+def case_name(world: int, calibrator: int) -> str:
+    """Return the name of a case among the inputs of a task, from the places of world and calibrator."""
+    return f"{world:03d}:{calibrator:03d}"
+
+
+def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Task], notes: Sequence[str]) -> Task:
+    """Return the task of the table.
+
+    Parameters
+    ----------
+    title
+        Name of the study.
+    labels
+        ``calibrators`` and ``worlds`` in order, and ``refusals``: world, calibrator and why it cannot work there.
+    scores
+        Of all other cases, by `case_name`.
+    notes
+        What stands in for the papers' own ingredients.
+    """
+    return Task(COMPARISON, "comparison", {"title": title, **labels, "notes": list(notes)}, scores)
+
+
+def read_cases(job: Job) -> dict[str, dict[str, Case]]:
+    """Return the cases of a job by the labels of world and calibrator, in the order of the file; none if refused."""
+    return {
+        world: {
+            calibrator: _read(job.inputs[case_name(row, column)])
+            for column, calibrator in enumerate(job.settings["calibrators"])
+            if case_name(row, column) in job.inputs
+        }
+        for row, world in enumerate(job.settings["worlds"])
+    }
+
+
+def _read(folder: Path) -> Case:
+    from calstudy.power.score import Score
+    from calstudy.power.tables import load_spectrum
+
+    bins, bands = (load_spectrum(folder / name, Score) for name in (score.BINS, score.BANDS))
+    return Case(bins, bands, read_json(folder / score.SUMMARY))
+
+
+def make_tables(job: Job) -> Mapping[str, Any]:
+    """Write comparison.csv, comparison.json and comparison.md."""
+    import json
+
+    cases = read_cases(job)
+    with (job.output / CSV).open("w", newline="", encoding="utf-8") as file:
+        rows = list(_csv_rows(cases))
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    summaries = {world: {name: case.summary for name, case in found.items()} for world, found in cases.items()}
+    text = json.dumps(summaries, indent=1, ensure_ascii=False, allow_nan=False)
+    (job.output / JSON).write_text(text + "\n", encoding="utf-8")
+    (job.output / MARKDOWN).write_text(_markdown(cases, job.settings), encoding="utf-8")
+    return {}
+
+
+def _csv_rows(cases: Mapping[str, Mapping[str, Case]]) -> Iterator[dict[str, Any]]:
+    for world, found in cases.items():
+        for name, case in found.items():
+            summary = case.summary
+            for band in summary["bands"]:
+                yield {
+                    "world": world,
+                    "calibrator": name,
+                    "k from [h/Mpc]": band["k"][0],
+                    "k to [h/Mpc]": band["k"][1],
+                    **{key.replace("_", " "): value for key, value in band.items() if key != "k"},
+                    "flux scale": summary["flux_scale"],
+                    "sky model error": summary["sky_model_error"],
+                    "gain error aligned": summary["gain_error_aligned"],
+                    "gain error as fitted": summary["gain_error_as_fitted"],
+                    "chi squared of held-out data": summary["held_out_chi_squared"],
+                    "solves": _statuses(summary),
+                    "seconds per integration": summary["seconds_per_integration"],
+                    "peak memory [bytes]": summary["peak_memory"],
+                }
+
+
+def _statuses(summary: Mapping[str, Any]) -> str:
+    return ", ".join(f"{count} {status}" for status, count in summary["by_status"].items())
+
+
+def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, Any]) -> str:
+    lines = [
+        f"# Calibrators compared: {settings['title']}",
+        "",
+        "T is the part of the EoR's power that is left, and the bias the power of the residual without EoR over that "
+        "of the EoR, both free of the flux scale s, outside the wedge, in bands of k in h/Mpc, with one standard "
+        "deviation. The gain error is the median over antennas and integrations of the rms over channels, "
+        "free of what no fit can know, and as fitted. χ² is per sample of data that were not fitted, in units of the "
+        "noise. The time is that of a solve on one core of a machine that did other work besides.",
+        "",
+        *(f"Stand-in: {note}." for note in settings["notes"]),
+        *([""] if settings["notes"] else []),
+    ]
+    lines += _tolerances(cases, settings["calibrators"])
+    for world, found in cases.items():
+        lines += [f"## {world}", ""]
+        if found:
+            lines += [_sky_models(found), "", _table(found).markdown()]
+        refused = [(name, why) for place, name, why in settings["refusals"] if place == world]
+        lines += [f"- {name} cannot work here: {why}" for name, why in refused] + ([""] if refused else [])
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> list[str]:
+    """Return the severity of every fault at which the bias of each calibrator reaches the limit, as Markdown."""
+    rows = []
+    for fault in faults(list(cases)):
+        cells = []
+        for calibrator in calibrators:
+            there = [place for place, world in enumerate(fault.worlds) if calibrator in cases[world]]
+            bands = [cases[fault.worlds[place]][calibrator].bands for place in there]
+            if not bands:
+                cells.append("-")
+                continue
+            band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - BAND[0])))
+            bias, error = (np.array([getattr(item, name)[band] for item in bands]) for name in ("bias", "bias_error"))
+            found = tolerance([fault.severities[place] for place in there], bias, error)
+            known = "" if found.relation == "=" else f"{found.relation} "
+            cells.append("noise" if found.relation == "?" else f"{known}{found.severity:.2g} {fault.unit}".strip())
+        rows.append((fault.name, *cells))
+    if not rows:
+        return []
+    low, high = BAND
+    sentence = (
+        f"Severity of each fault at which the bias reaches {LIMIT:g} of the EoR at k from {low:g} to {high:g} h/Mpc. "
+        "Between two severities it is taken for a power law; `noise`: it cannot be told from the noise."
+    )
+    return ["## Tolerances", "", sentence, "", Table(("fault", *calibrators), rows).markdown()]
+
+
+def _sky_models(found: Mapping[str, Case]) -> str:
+    """Say in a sentence how wrong the sky models of a world are, which are the same for all calibrators as a rule."""
+    errors = {case.summary["sky_model_error"] for case in found.values()}
+    if errors == {0.0}:
+        return "The sky model is the truth."
+    known = [f"{100 * error:.2g} %" for error in sorted(error for error in errors if error is not None)]
+    return f"Error of the sky model, rms over that of the foregrounds: {', '.join(known) or 'not known'}."
+
+
+def _table(found: Mapping[str, Case]) -> Table:
+    bands = [band["k"] for band in next(iter(found.values())).summary["bands"]]
+    measured = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
+    headings = ("calibrator", *measured, "s", "gain error", "as fitted", "χ²", "solves", "s per integration", "memory")
+    rows = []
+    for name, case in found.items():
+        summary = case.summary
+        values = [_cell(band[key], band[f"{key}_error"]) for key in ("transfer", "bias") for band in summary["bands"]]
+        rows.append(
+            (
+                name,
+                *values,
+                _cell(summary["flux_scale"], decimals=4),
+                _percent(summary["gain_error_aligned"]),
+                _percent(summary["gain_error_as_fitted"]),
+                _cell(summary["held_out_chi_squared"], decimals=3),
+                _statuses(summary),
+                f"{summary['seconds_per_integration']:.2g}",
+                f"{summary['peak_memory'] / 1e9:.1f} GB",
+            )
+        )
+    return Table(headings, rows)
+
+
+def _cell(value: float | None, error: float | None = None, decimals: int | None = None) -> str:
+    if value is None:
+        return "-"
+    return number(value, error) if decimals is None else f"{value:.{decimals}f}" if abs(value) < 1e4 else f"{value:.2e}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.2g} %"
+
+
+COMPARISON = Stage(name="comparison", version=1, make=make_tables, cost=lambda task: Cost(2, disk=1e6))

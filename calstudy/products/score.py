@@ -1,0 +1,174 @@
+"""The scores of one experiment's calibrator: what all calibrators are compared by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.products import calibration, corruption, signal_loss, sky_model, spectra
+from calstudy.products.corruption import PARITIES
+from calstudy.products.files import DATA, MODEL, SOLUTION, read_json, read_visibilities, write_json
+from calstudy.products.graph import Graph, once, size_of
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from calstudy.power.score import Score
+    from calstudy.products.selection import Gains
+
+BINS, BANDS, SUMMARY = "score-bins.h5", "score-bands.h5", "score.json"
+
+
+@once
+def score(graph: Graph) -> Task | None:
+    """Return the task of the scores, or None if the experiment does not calibrate data with the EoR and without."""
+    if (loss := signal_loss.transfer(graph)) is None:
+        return None
+    residual, without, _ = SIGNAL_LOSS_VARIANTS
+    variant = graph.experiment.variants[residual]
+    inputs = {
+        **{name: loss.inputs[name] for name in ("signal", "response", "scale")},
+        "residual": spectra.power(graph, residual),
+        "residual_without_eor": spectra.power(graph, without),
+    }
+    for parity in PARITIES:
+        inputs[f"calibration:{parity}"] = calibration.calibration(graph, variant, parity)
+        inputs[f"data:{parity}"] = corruption.data(graph, variant, parity)
+    if variant.effects:
+        inputs["gains"] = corruption.gains(graph)
+    if (error := sky_model.error(graph)) is not None:
+        inputs["sky_model_error"] = error
+    return Task(SCORE, "score", {"power": graph.experiment.power}, inputs)
+
+
+def make_score(job: Job) -> Mapping[str, Any]:
+    """Write the scores in bins and in bands of k, and all numbers to score.json."""
+    from calstudy.power.score import BANDS as EDGES
+    from calstudy.power.score import Calibrated
+    from calstudy.power.score import score as measure
+    from calstudy.power.spherical import make_bin_edges
+    from calstudy.power.tables import save_spectrum
+
+    names = ("signal", "response", "residual", "residual_without_eor")
+    measured = Calibrated(**{name: spectra.read_delay_spectra(job.inputs[name]) for name in names})
+    known = read_json(job.inputs["scale"] / signal_loss.SCALE)["flux_scale"]
+    scale, power = math.nan if known is None else known, job.settings["power"]
+    save_spectrum(job.output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
+    bands = measure(measured, EDGES, power.wedge_buffer, scale)
+    save_spectrum(job.output / BANDS, bands)
+    summary = {
+        "bands": _in_bands(bands),
+        "flux_scale": known,
+        "sky_model_error": _sky_model_error(job),
+        **_gain_errors(job),
+        "held_out_chi_squared": _held_out_chi_squared(job),
+        **_solves(job),
+    }
+    write_json(job.output / SUMMARY, summary)
+    return {}
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _in_bands(bands: Score) -> list[dict[str, Any]]:
+    names = [f"{name}{kind}" for name in ("transfer", "bias", "recovered") for kind in ("", "_error")]
+    return [
+        {
+            "k": bands.bin_edges[band : band + 2].tolist(),
+            **{name: _number(getattr(bands, name)[band]) for name in names},
+        }
+        for band in range(bands.k.size)
+    ]
+
+
+def _sky_model_error(job: Job) -> float | None:
+    """Return the rms of the sky model's error over that of the true foregrounds; zero if it is the truth."""
+    if "sky_model_error" not in job.inputs:
+        return 0.0
+    return read_json(job.inputs["sky_model_error"] / sky_model.ERROR)["relative_error"]
+
+
+def _known_gains(job: Job, parity: str) -> tuple[Gains, np.ndarray]:
+    """Return fitted gains, and the true ones of the same antennas and integrations."""
+    import numpy as np
+
+    from calstudy.products.selection import read_gains
+
+    fitted = read_gains(job.inputs[f"calibration:{parity}"])
+    if "gains" not in job.inputs:
+        return fitted, np.ones(fitted.values.shape)
+    return fitted, read_gains(job.inputs["gains"]).over(len(fitted.values), fitted.numbers)
+
+
+def _gain_errors(job: Job) -> dict[str, float | None]:
+    """Return the median relative errors of the gains, free of what no fit can know and as they were fitted."""
+    import numpy as np
+
+    from calstudy.calibrate.agreement import aligned_gains, gain_errors
+
+    fitted, true = _known_gains(job, PARITIES[0])
+    solved = ~fitted.flags.all(axis=(1, 2))
+    if not solved.any():
+        return {"gain_error_aligned": None, "gain_error_as_fitted": None}
+    found, true = (np.where(fitted.flags, 0, gains)[solved] for gains in (fitted.values, true))
+    return {
+        "gain_error_aligned": float(np.median(gain_errors(aligned_gains(found, true), true))),
+        "gain_error_as_fitted": float(np.median(gain_errors(found, true))),
+    }
+
+
+def _held_out_chi_squared(job: Job) -> float | None:
+    """Return chi^2 per sample of the odd data under gains and model that were fitted to the even data.
+
+    The variance of the noise is half the mean square of the difference of the two. It is 1 for the true gains and
+    foregrounds, but for the power of the EoR.
+    """
+    import numpy as np
+
+    from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+
+    fitted, _ = _known_gains(job, PARITIES[0])
+    even, odd = (read_visibilities(job.inputs[f"data:{parity}"] / DATA) for parity in PARITIES)
+    model = read_visibilities(job.inputs[f"calibration:{PARITIES[0]}"] / MODEL)
+    pairs = antenna_pairs(even).tolist()
+    rows = [pairs.index(pair) for pair in antenna_pairs(model).tolist()]
+    first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
+    misfit = noise = 0.0
+    cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
+    flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
+    unsolved = flag_cube(model)[..., 0]
+    for time, gains in enumerate(fitted.values):
+        lacking = fitted.flags[time][first] | fitted.flags[time][second]
+        used = ~(flags[time][rows] | unsolved[time] | lacking)
+        predicted = gains[first] * gains[second].conj() * cubes[2][time]
+        misfit += float(np.sum(np.abs(cubes[1][time][rows] - predicted)[used] ** 2))
+        noise += float(np.sum(np.abs(cubes[1][time][rows] - cubes[0][time][rows])[used] ** 2)) / 2
+    return misfit / noise if noise > 0 else None
+
+
+def _solves(job: Job) -> dict[str, Any]:
+    """Return how the solves of the data with the EoR ended, and what one integration took."""
+    records = [
+        record for parity in PARITIES for record in read_json(job.inputs[f"calibration:{parity}"] / SOLUTION)["records"]
+    ]
+    statuses = [record["status"] for record in records]
+    integrations = sum(record["n_integrations"] for record in records)
+    return {
+        "by_status": {status: statuses.count(status) for status in sorted(set(statuses))},
+        "seconds_per_integration": sum(record["seconds"] for record in records) / integrations,
+        "peak_memory": max(record["peak_memory"] for record in records),
+    }
+
+
+def _cost(task: Task) -> Cost:
+    samples = size_of(task).samples
+    return Cost(4 + samples * 1e-6, LIBRARIES_MEMORY + 8 * samples * COMPLEX128, 1e6)
+
+
+SCORE = Stage(name="score", version=1, make=make_score, cost=_cost)

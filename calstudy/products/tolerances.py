@@ -1,0 +1,108 @@
+"""Up to which severity of a fault a calibrator can be trusted, from worlds that differ in the severity alone.
+
+Worlds with labels such as ``positions: 2 cm`` and ``positions: 5 cm`` are severities of one fault: the text before the
+colon names it, the number after it is the severity. A world without a colon belongs to all faults, as severity zero.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+LIMIT = 0.1
+"""Bias over the EoR that is tolerated."""
+BAND = (0.2, 0.5)
+"""Band of k, h/Mpc, in which it is."""
+SIGMAS = 2.0
+"""A bias of fewer standard deviations may be none."""
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Worlds that differ in how severe one fault is.
+
+    Attributes
+    ----------
+    name, unit
+        What it is, and the text behind the numbers.
+    worlds
+        Labels, by ascending severity.
+    severities
+        Ascending; zero for worlds without the fault.
+    """
+
+    name: str
+    unit: str
+    worlds: tuple[str, ...]
+    severities: tuple[float, ...]
+
+
+def faults(worlds: Sequence[str]) -> list[Fault]:
+    """Return the faults that the labels of worlds name, in their order."""
+    without = [(0.0, world, "") for world in worlds if ":" not in world]
+    found: dict[str, list[tuple[float, str, str]]] = {}
+    for world in worlds:
+        name, colon, severity = world.partition(":")
+        if colon and (number := _NUMBER.search(severity)):
+            entry = (float(number.group()), world, severity[number.end() :].strip())
+            found.setdefault(name.strip(), []).append(entry)
+    result = []
+    for name, entries in found.items():
+        ordered = sorted([*without, *entries])
+        severities, labels, _ = zip(*ordered, strict=True)
+        result.append(Fault(name, entries[0][2], labels, severities))
+    return result
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """The severity of a fault at which the bias of a calibrator reaches `LIMIT`.
+
+    Attributes
+    ----------
+    severity
+        In the fault's unit; NaN if it is not known.
+    relation
+        ``=``; ``<`` if the bias is above the limit at the lowest severity other than zero; ``>`` if it is below it at
+        the highest; ``?`` if the noise is too large to tell.
+    """
+
+    severity: float
+    relation: str
+
+
+def tolerance(severities: Sequence[float], bias: np.ndarray, error: np.ndarray) -> Tolerance:
+    """Return where a bias that grows with the severity of a fault reaches `LIMIT`.
+
+    Between two severities it is a power law.
+
+    Parameters
+    ----------
+    severities
+        Ascending; zero may be the first.
+    bias, error
+        At these, and its standard deviations.
+    """
+    used = [place for place, severity in enumerate(severities) if severity > 0 and np.isfinite(bias[place])]
+    reached = [place for place in used if abs(bias[place]) >= LIMIT and abs(bias[place]) >= SIGMAS * error[place]]
+    unclear = [place for place in used if place not in reached and abs(bias[place]) + SIGMAS * error[place] > LIMIT]
+    if not used:
+        return Tolerance(math.nan, "?")
+    if unclear and (not reached or unclear[0] < reached[0]):
+        if not reached:
+            return Tolerance(math.nan, "?")
+        return Tolerance(float(severities[reached[0]]), "<")
+    if not reached:
+        return Tolerance(float(severities[used[-1]]), ">")
+    place = used.index(reached[0])
+    if place == 0:
+        return Tolerance(float(severities[used[0]]), "<")
+    low, high = used[place - 1], used[place]
+    below = max(abs(bias[low]), SIGMAS * error[low], np.finfo(float).tiny)
+    part = math.log(LIMIT / below) / math.log(abs(bias[high]) / below)
+    return Tolerance(float(severities[low] * (severities[high] / severities[low]) ** part), "=")

@@ -1,0 +1,38 @@
+"""From worlds of growing severity to the severity at which a bias is no longer tolerated."""
+
+import numpy as np
+import pytest
+
+from calstudy.products.tolerances import LIMIT, Tolerance, faults, tolerance
+
+SEVERITIES = (0.0, 0.1, 1.0, 10.0)
+
+
+def test_worlds_are_grouped_by_fault_and_ordered_by_severity():
+    found = faults(["ideal", "positions: 2 cm", "flux: 1e-3", "positions: 0.5 cm", "a world apart: no number"])
+    assert [(fault.name, fault.unit) for fault in found] == [("positions", "cm"), ("flux", "")]
+    assert found[0].worlds == ("ideal", "positions: 0.5 cm", "positions: 2 cm")
+    assert found[0].severities == (0.0, 0.5, 2.0)
+
+
+@pytest.mark.parametrize("power", [1, 2, 4])
+def test_of_a_bias_that_is_a_power_of_the_severity_the_crossing_is_exact(power):
+    wanted = 0.37
+    bias = LIMIT * (np.array(SEVERITIES) / wanted) ** power
+    found = tolerance(SEVERITIES, bias, np.full(4, 1e-9))
+    assert found.relation == "="
+    assert found.severity == pytest.approx(wanted, rel=1e-6)
+
+
+def test_limits_where_the_bias_does_not_cross():
+    small = np.full(4, 1e-4)
+    assert tolerance(SEVERITIES, np.array([0, 1e-4, 1e-3, 1e-2]), small) == Tolerance(10.0, ">")
+    assert tolerance(SEVERITIES, np.array([0, 1, 10, 100]), small) == Tolerance(0.1, "<")
+
+
+def test_noise_that_hides_the_limit_is_said():
+    noisy = np.full(4, 0.2)
+    assert tolerance(SEVERITIES, np.array([0.1, 0.2, -0.1, 0.3]), noisy).relation == "?"
+    found = tolerance(SEVERITIES, np.array([0.1, 0.2, -0.1, 30.0]), noisy)
+    assert (found.relation, found.severity) == ("<", 10.0)
+    assert tolerance(SEVERITIES, np.full(4, np.nan), noisy).relation == "?"

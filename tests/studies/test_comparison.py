@@ -1,0 +1,179 @@
+"""Calibrators in worlds: which one stands, and that all are held to the same yardstick."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import yaml
+from test_signal_loss import small
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.experiment.files import load
+from calstudy.power.score import BANDS, Score
+from calstudy.power.tables import load_spectrum
+from calstudy.power.transfer import TransferFunction
+from calstudy.products.graph import Graph
+from calstudy.products.score import score
+from calstudy.products.signal_loss import transfer
+from calstudy.regression.comparison import compare_figures
+from calstudy.regression.reference import accept, read_reference, read_run
+from calstudy.studies.load import load_study
+from calstudy.studies.study import Run, run_study
+
+CALIBRATORS = {
+    "sky-based": "sky-based",
+    "trusting": {"calibrator": "delay-weighted", "foreground_prior": {"deviation": 0.03}},
+    "CALAMITY": {"calibrator": "calamity", "prior": "sky-model"},
+    "none": "none",
+}
+FIGURES = ("comparison-matrix", "comparison-spectra", "comparison-curves", "comparison-tolerances")
+WORLDS = {"ideal": {}, "flux errors: 20 %": {"calibration.assumed.sky.foregrounds.errors": {"flux_scatter": 0.2}}}
+
+
+def comparison_file(folder, **fields):
+    """A comparison of three calibrators in two worlds, with 12 antennas, in `folder`."""
+    base = small(folder, instrument__layout={"kind": "mwa-compact-minredundant", "count": 12})
+    base["calibration"] = {"calibrator": "lbfgs-of-nobody"}
+    (folder / "base.yaml").write_text(yaml.safe_dump(base))
+    data = {
+        "name": "compared",
+        "experiment": "base.yaml",
+        "calibrators": CALIBRATORS,
+        "worlds": WORLDS,
+        "figures": list(FIGURES),
+        **fields,
+    }
+    path = folder / "comparison.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    return path
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory) -> Run:
+    return run_study(load_study(comparison_file(tmp_path_factory.mktemp("comparison"))))
+
+
+@pytest.fixture(scope="module")
+def summaries(compared) -> dict:
+    return json.loads((compared.folder / "tables" / "comparison.json").read_text())
+
+
+def test_a_wrong_sky_model_spoils_only_those_who_trust_it(summaries):
+    ideal, wrong = (summaries[world] for world in WORLDS)
+    bias = {name: wrong[name]["bands"][1]["bias"] for name in CALIBRATORS}
+    error = {name: wrong[name]["bands"][1]["bias_error"] for name in CALIBRATORS}
+    assert wrong["sky-based"]["sky_model_error"] > 0.05
+    assert bias["sky-based"] > 100
+    assert bias["trusting"] < 0.01 * bias["sky-based"]
+    assert abs(bias["CALAMITY"]) < max(1, 4 * error["CALAMITY"])
+    # With a complete sky model nobody has a bias beyond the noise.
+    for name in ("sky-based", "trusting", "CALAMITY"):
+        band = ideal[name]["bands"][1]
+        assert abs(band["bias"]) < 4 * band["bias_error"] + 0.1, name
+    assert ideal["CALAMITY"]["sky_model_error"] == 0
+
+
+def test_a_sky_model_that_is_the_truth_keeps_more_of_the_signal_than_none(summaries):
+    kept = {name: summaries["ideal"][name]["bands"][1]["transfer"] for name in CALIBRATORS}
+    assert kept["sky-based"] > kept["CALAMITY"]
+    # What the gains of 12 antennas absorb at least: (2 N - 1) / (N (N - 1)) = 0.174.
+    assert kept["CALAMITY"] < 0.9
+
+
+def test_held_out_data_are_fitted_to_the_noise_unless_the_sky_is_wrong(summaries):
+    ideal, wrong = (summaries[world] for world in WORLDS)
+    # Unknowns that fit the noise of the even data add as much to the odd: between 1 and 2.
+    assert 1 < ideal["CALAMITY"]["held_out_chi_squared"] < 2
+    assert 1 < ideal["sky-based"]["held_out_chi_squared"] < ideal["CALAMITY"]["held_out_chi_squared"]
+    assert wrong["sky-based"]["held_out_chi_squared"] > 100
+
+
+def test_without_calibration_gain_errors_times_foregrounds_are_the_bias(summaries):
+    """Gains of 1 + 0.1 (n + i n') times a perfect sky model: the error of g g* has the power 4 sigma^2 of F, white."""
+    found = summaries["ideal"]["none"]
+    assert found["gain_error_as_fitted"] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    assert found["bands"][2]["bias"] > 1e3
+    # T is measured of the response, and so is the power of g g* in the signal: 1 + 4 sigma^2 + ...
+    assert found["bands"][2]["transfer"] * found["flux_scale"] ** -2 == pytest.approx(1.04, abs=0.1)
+
+
+def test_tolerances_name_each_fault_and_calibrator(compared):
+    text = (compared.folder / "tables" / "comparison.md").read_text()
+    row = next(line for line in text.splitlines() if line.startswith("| flux errors |"))
+    cells = dict(zip(CALIBRATORS, (cell.strip() for cell in row.split("|")[2:-1]), strict=True))
+    assert cells["sky-based"] == "< 20 %"
+    assert cells["CALAMITY"] in ("noise", "> 20 %")
+
+
+def test_scores_are_those_of_the_experiments_own_products(compared):
+    """T s^2 of the score in the experiment's bins is that of its signal loss."""
+    experiment = load(compared.folder / "cases" / "002.yaml")
+    graph = Graph(experiment, keep_visibilities=False)
+    keys = {task.key for task in compared.tasks}
+    assert score(graph).key in keys
+    product = compared.made.products[score(graph).key]
+    found = load_spectrum(product.path / "score-bins.h5", Score)
+    full = run_study(load_study(compared.folder / "cases" / "002.yaml"))
+    folder = full.made.products[transfer(graph).key].path
+    own = load_spectrum(folder / "transfer.outside-wedge.h5", TransferFunction)
+    known = np.isfinite(own.scale_free_transfer)
+    assert known.any()
+    assert np.allclose(found.transfer[known], own.scale_free_transfer[known], rtol=1e-9)
+
+
+def test_tables_and_figures_hold_every_case(compared):
+    folder = compared.folder
+    with (folder / "tables" / "comparison.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cases = {(row["world"], row["calibrator"]) for row in rows}
+    assert cases == {(world, name) for world in WORLDS for name in CALIBRATORS}
+    assert len(rows) == len(cases) * (len(BANDS) - 1)
+    text = (folder / "tables" / "comparison.md").read_text()
+    assert all(f"| {name} |" in text for name in CALIBRATORS)
+    for figure in FIGURES:
+        arrays = np.load(folder / "figures" / f"{figure}.npz")
+        assert {name.split(".")[0] for name in arrays.files} == set(WORLDS)
+    assert "flux errors: 20 %" in (folder / "report.html").read_text()
+
+
+def test_faults_name_the_case_and_the_field(tmp_path):
+    path = comparison_file(tmp_path, worlds={"a": {"sky.foregrounds.flux_limit": "8 parsec"}})
+    with pytest.raises(ExperimentError, match=r"flux_limit: '8 parsec'.*in 'sky-based in a' and 3 other"):
+        load_study(path)
+    with pytest.raises(ExperimentError, match=r"calibration.sovler: unknown.*CALAMITY in ideal"):
+        load_study(
+            comparison_file(
+                tmp_path, calibrators={"CALAMITY": {"calibrator": "calamity", "sovler": 1}}, worlds={"ideal": {}}
+            )
+        )
+    with pytest.raises(ExperimentError, match="'wedge' does not compare calibrators"):
+        load_study(comparison_file(tmp_path, figures=["wedge"]))
+    with pytest.raises(ExperimentError, match="wrlds: unknown key, did you mean 'worlds'"):
+        load_study(comparison_file(tmp_path, wrlds={}))
+    with pytest.raises(InputError, match="--scale large"):
+        load_study(comparison_file(tmp_path), "large")
+
+
+def test_scales_of_the_file_and_of_its_experiment_go_together(tmp_path):
+    path = comparison_file(tmp_path, scales={"short": {"worlds": {"ideal": {}}, "overrides": {"sky.eor.seed": 9}}})
+    study = load_study(path, "short")
+    assert [case.world for case in study.cases] == ["ideal"] * len(CALIBRATORS)
+    assert {case.experiment.sky.eor.seed for case in study.cases} == {9}
+
+
+def test_the_file_in_the_run_folder_is_the_same_comparison(compared, tmp_path):
+    again = load_study(compared.folder / "experiment.yaml")
+    assert again.table.key in compared.made.products
+    assert again.folder.name == compared.folder.name
+    # As a reference it has no folders of this machine, and can be made again with those of another.
+    accept(compared.folder, tmp_path / "reference")
+    text = (tmp_path / "reference" / "experiment.yaml").read_text()
+    assert str(compared.folder.parent) not in text
+    moved = load_study(tmp_path / "reference" / "experiment.yaml", overrides=[f"outputs.store={tmp_path}"])
+    assert moved.table.key == again.table.key
+    assert (tmp_path / "reference" / "comparison.md").is_file()
+    reference = read_reference(tmp_path / "reference")
+    found = compare_figures(reference.figures, read_run(compared.folder).figures, reference.tolerances)
+    assert found
+    assert all(item.status == "same" for item in found)
