@@ -24,6 +24,7 @@ from calstudy.calibrate.interface import (
     Status,
 )
 from calstudy.calibrate.records import CalibrationResult, SolveRecord
+from calstudy.calibrate.smoothing import smooth
 from calstudy.instrument.size import Size
 
 if TYPE_CHECKING:
@@ -255,6 +256,8 @@ class _Returned:
                 flags[self.groups[group], :, :, p] = True
                 self.gain_flags[:, :, self.groups[group], p] = True
         gains = np.where(self.gain_flags, 1, self.gains)
+        if self.calibrator.smooth_gains is not None:
+            gains = smooth(gains, self.gain_flags, self.fitted, self.numbers, self.calibrator.smooth_gains)
         residual = self._residual(gains, flags)
         template = self.fitted.uvd
         return CalibrationResult(

@@ -9,14 +9,16 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.schema import Section, choice
+from calstudy.base.units import Frequency, Time
 from calstudy.instrument.size import Size
 
 if TYPE_CHECKING:
@@ -137,6 +139,82 @@ class Outline:
     notes: tuple[str, ...] = ()
 
 
+class Smoothing(Section):
+    """What all ways to smooth gains have in common."""
+
+    reference_antenna: int | None = Field(
+        None,
+        ge=0,
+        description="Number of the antenna whose phase is made zero in every channel before; null: phases are smoothed "
+        "as the calibrator leaves them.",
+    )
+
+    @property
+    def over_time(self) -> bool:
+        """Whether integrations are smoothed together."""
+        raise NotImplementedError
+
+
+class DpssSmoothing(Smoothing):
+    """Least-squares fit of discrete prolate spheroidal sequences in frequency and in time."""
+
+    kind: Literal["dpss"]
+    frequency_scale: Frequency | None = Field(
+        None, gt=0, description="Delays beyond its inverse are removed; null: channels are left as they are."
+    )
+    time_scale: Time | None = Field(
+        None, gt=0, description="Rates beyond its inverse are removed; null: integrations are left as they are."
+    )
+
+    @model_validator(mode="after")
+    def _smooths(self) -> Self:
+        if self.frequency_scale is None and self.time_scale is None:
+            raise ValueError("needs a frequency_scale, a time_scale, or both")
+        return self
+
+    @property
+    def over_time(self) -> bool:
+        """Whether there is a time scale."""
+        return self.time_scale is not None
+
+
+class PolynomialSmoothing(Smoothing):
+    """Least-squares fit of polynomials in frequency and in time."""
+
+    kind: Literal["polynomial"]
+    frequency_degree: int | None = Field(None, ge=0, description="Null: channels are left as they are.")
+    time_degree: int | None = Field(None, ge=0, description="Null: integrations are left as they are.")
+
+    @model_validator(mode="after")
+    def _smooths(self) -> Self:
+        if self.frequency_degree is None and self.time_degree is None:
+            raise ValueError("needs a frequency_degree, a time_degree, or both")
+        return self
+
+    @property
+    def over_time(self) -> bool:
+        """Whether there is a degree in time."""
+        return self.time_degree is not None
+
+
+class SmoothCal(Smoothing):
+    """hera_cal's smooth_cal: sequences in time and frequency, with the mean delay of each antenna taken out."""
+
+    kind: Literal["smooth-cal"]
+    frequency_scale: Frequency = Field(10e6, gt=0, description="Delays beyond its inverse are removed.")
+    time_scale: Time = Field(1800.0, gt=0, description="Rates beyond its inverse are removed.")
+
+    @property
+    def over_time(self) -> bool:
+        """Always."""
+        return True
+
+
+SmoothGains = Annotated[
+    DpssSmoothing | PolynomialSmoothing | SmoothCal, Field(discriminator="kind"), choice("kind", "dpss")
+]
+
+
 class Calibrator(Plugin):
     """A way to find gains. Fields of a subclass are its settings; `calibrate` is what it does."""
 
@@ -159,6 +237,9 @@ class Calibrator(Plugin):
         description="What the calibrator takes for granted that is not true: fields of `sky` and `instrument` (dotted "
         "path: value), from which its sky model is simulated; or `sky_model: PATH`, a file of visibilities. Empty: the "
         "sky model is the true foregrounds.",
+    )
+    smooth_gains: SmoothGains | None = Field(
+        None, description="Smooth the gains once they are found, and calibrate with those; the model stays as it is."
     )
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:

@@ -20,6 +20,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.cli.bench import bench_app
 from calstudy.cli.calibrate import calibrate
 from calstudy.cli.check import check_app
+from calstudy.cli.compare_gains import compare_gains
 from calstudy.cli.regress import regress
 from calstudy.cli.start import examples, init, schema
 from calstudy.cli.storage import runs, store
@@ -35,6 +36,7 @@ data_app = typer.Typer(help="Files that are downloaded once.", no_args_is_help=T
 app.add_typer(data_app, name="data")
 app.command()(calibrate)
 app.command()(regress)
+app.command()(compare_gains)
 # Step -1 is an argument, not an option.
 app.command(context_settings={"ignore_unknown_options": True})(validate)
 app.command()(examples)

@@ -47,7 +47,9 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     # What is assumed decides the sky model, which is an input, and nothing else.
     settings = graph.experiment.calibration.reset("assumed")
     solves = -(-graph.experiment.instrument.times.count // settings.integrations_per_solve)
-    count = min(settings.chunks, solves)
+    # Gains that are smoothed in time are those of all integrations.
+    together = settings.smooth_gains is not None and settings.smooth_gains.over_time
+    count = 1 if together else min(settings.chunks, solves)
     inputs = {"data": data}
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -109,6 +110,14 @@ def _errors_written_to(path: Path) -> Iterator[None]:
         os.close(kept)
 
 
+def _import_units() -> None:
+    """Import what orders need when they arrive, in one thread of a worker, and stages need in another.
+
+    Two threads that import it at once can lock each other out (`_frozen_importlib._DeadlockError`).
+    """
+    import_module("astropy.units")
+
+
 @contextmanager
 def _local_client(workers: int, log: Path) -> Iterator[Client]:
     """Start workers on this machine: a thread of this process if there is one, else processes that share the cores."""
@@ -140,6 +149,7 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     ):
         if workers > 1:
             client.run(_write_errors_to, log)
+            client.run(_import_units)
         with _errors_written_to(log) if workers == 1 else nullcontext():
             yield client
 

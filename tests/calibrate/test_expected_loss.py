@@ -16,6 +16,7 @@ from calstudy.calibrate.gain_space import gain_vectors
 from calstudy.calibrate.problem import flag_weights, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import WarmStart, solve_warm
+from calstudy.calibrate.solvers.reduced import ReducedKernels
 
 MODES = DelayModes(FREQUENCIES)
 
@@ -240,3 +241,30 @@ def test_a_frozen_sky_leaves_the_foreground_delays():
     assert not found.foregrounds.any()
     probed = expected_transfer(frozen, gains, model, MODES, probes=64)
     assert np.std((probed.transfer - found.transfer) / probed.error) < 1.25
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.03, 0.1])
+def test_gains_that_are_white_in_frequency_leak_the_signal_into_the_wedge(sigma):
+    """The fit weights channels by |g_a g_b*|^2, whose relative variance is 8 sigma^2.
+
+    The calibrated residual, without these weights, is therefore not orthogonal to the foreground sequences: what is left
+    of the signal beyond them leaks in with that part of its power, uncorrelated with the signal that was there.
+    """
+    toy = make_toy(scattered(8), noise=0.0)
+    kernels, inside = ReducedKernels(toy.structure), np.abs(MODES.delay) < 30e-9
+    left, put_in, crossed = np.zeros(10), np.zeros(10), np.zeros(10)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        gains = 1 + sigma * np.sqrt(2) * complex_normal(rng, toy.gains.shape)
+        signal = complex_normal(rng, toy.foregrounds.shape)
+        problem = toy.problem(visibilities=gain_products(gains, toy.antennas) * signal, initial_gains=gains)
+        reduced = kernels.reduce(problem, gains)
+        model = kernels.tensors.unload(kernels.project(reduced.gains, *reduced.data).model, reduced.scale)
+        residual, true = (MODES.amplitudes(values)[:, inside] for values in (signal - model, signal))
+        left[seed], put_in[seed] = np.sum(np.abs(residual) ** 2), np.sum(np.abs(true) ** 2)
+        crossed[seed] = np.sum((residual * true.conj()).real)
+    sequences = np.mean([bucket.vectors.shape[1] for bucket in toy.basis.buckets for _ in bucket.members])
+    beyond = 1 - sequences / FREQUENCIES.size
+    # One draw of the gains scatters by 0.22 of it: ten are averaged, and three standard errors allowed.
+    assert left.sum() / put_in.sum() == pytest.approx(8 * sigma**2 * beyond, rel=0.21, abs=1e-4)
+    assert abs(crossed.sum() / put_in.sum()) < 0.01

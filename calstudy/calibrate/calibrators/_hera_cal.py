@@ -1,0 +1,155 @@
+"""What the calibrators of the package hera_cal have in common."""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Frame, Observation
+from calstudy.base.resources import Usage
+from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Outcome, Progress
+from calstudy.calibrate.settings import FlagWeights, Weights
+
+# hera_cal wants a name for the polarization; each is calibrated by itself.
+POL, FEED = "nn", "Jnn"
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """The data of one polarization, without autocorrelations.
+
+    Attributes
+    ----------
+    frame
+        Antennas, baselines and channels.
+    visibilities, sky
+        Data and sky model, complex128, (Ntimes, Nbls, Nfreqs).
+    weights
+        Of each sample, (Ntimes, Nbls, Nfreqs); zero for those that have no influence.
+    """
+
+    frame: Frame
+    visibilities: np.ndarray
+    sky: np.ndarray
+    weights: np.ndarray
+
+    def keys(self, rows: np.ndarray) -> list[tuple[int, int, str]]:
+        """Return what hera_cal calls some baselines."""
+        return [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
+
+
+class HeraCal(Calibrator):
+    """A calibrator of hera_cal, which subtracts the sky model from the calibrated data."""
+
+    weights: Weights = FlagWeights()
+
+    def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
+        """Return that there is no sky model, or nothing to calibrate."""
+        if not has_sky_model:
+            return "needs a sky model, and there is none"
+        return (
+            "the data hold no cross-correlations, so that there is nothing to calibrate" if frame.autos.all() else None
+        )
+
+    @abstractmethod
+    def solve(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+        """Return gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how each solve ended.
+
+        Parameters
+        ----------
+        measured
+            Data of one polarization; there are some with weight in each group.
+        groups
+            Integrations that share their gains.
+        """
+
+    def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
+        """Solve every polarization, and flag the gains of antennas and channels without data."""
+        from calstudy.calibrate.standard_formats import require_parallel_hands
+        from calstudy.calibrate.weights import make_weights
+
+        if assumed.sky_model is None:
+            raise InputError(f"{self.label}: needs a sky model, and there is none")
+        require_parallel_hands(observation.uvd)
+        crosses = ~observation.autos
+        weights = make_weights(observation, crosses, self.weights)
+        data, sky = observation.baselines(crosses), assumed.sky_model.baselines(crosses)
+        if not (np.isfinite(data.visibilities) | data.flags).all():
+            raise InputError(f"{self.label}: unflagged visibilities are not finite; flag them")
+        groups = self.solves(data.n_times)
+        gains = np.full((data.n_antennas, data.n_channels, len(groups), data.n_polarizations), np.nan, complex)
+        outcomes: list[Outcome] = []
+        for p in range(data.n_polarizations):
+            used = (weights[..., p] > 0) & (sky.visibilities[..., p] != 0) & (data.visibilities[..., p] != 0)
+            visibilities = np.where(used, data.visibilities[..., p], 0).astype(complex)
+            model = np.nan_to_num(sky.visibilities[..., p].astype(complex))
+            measured = Measured(data, visibilities, model, np.where(used, weights[..., p], 0.0))
+            gains[..., p], ended = self._solve_timed(measured, groups)
+            outcomes += ended
+            if progress is not None:
+                progress((p + 1) * len(groups), data.n_polarizations * len(groups))
+        unknown = ~np.isfinite(gains) | (gains == 0)
+        gains = _turned(np.where(unknown, 0, gains))
+        return Calibration(
+            gains=np.where(unknown, 1, gains),
+            gain_flags=unknown,
+            flags=weights == 0,
+            baselines=crosses,
+            outcomes=outcomes,
+        )
+
+    def _solve_timed(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+        """Solve the groups that have data; the others are skipped."""
+        full = [number for number, times in enumerate(groups) if measured.weights[times].any()]
+        shape = (measured.frame.n_antennas, measured.frame.n_channels, len(groups))
+        gains = np.full(shape, np.nan, complex)
+        ended = [Outcome(status="skipped", message="every sample is flagged or has no weight")] * len(groups)
+        if full:
+            with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
+                # hera_cal divides by what may be zero, and tells of numbers that it replaces itself.
+                warnings.simplefilter("ignore")
+                gains[:, :, full], found = self.solve(measured, [groups[number] for number in full])
+            for number, outcome in zip(full, found, strict=True):
+                ended[number] = _with_usage(outcome, usage, len(full))
+        return gains, ended
+
+
+def _turned(gains: np.ndarray) -> np.ndarray:
+    """Return gains, zero where there are none, whose sum over antennas is real and positive in every channel."""
+    flat = gains.reshape(len(gains), -1)
+    return fix_phase(flat, np.ones_like(flat)).reshape(gains.shape)
+
+
+def _with_usage(outcome: Outcome, usage: Usage, count: int) -> Outcome:
+    return Outcome(
+        status=outcome.status,
+        message=outcome.message,
+        steps=outcome.steps,
+        seconds=usage.seconds / count,
+        peak_memory=usage.peak_memory,
+        diagnostics=outcome.diagnostics,
+    )
+
+
+def patterns(used: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return which baselines are used together, and in which channels.
+
+    Parameters
+    ----------
+    used
+        (Nbls, Ncells) bool, where a cell is a channel, or a channel of an integration.
+
+    Returns
+    -------
+    For each set of baselines that occurs, the set as bool (Nbls,), and the indices of its cells.
+    """
+    packed = np.ascontiguousarray(np.packbits(used, axis=0).T)
+    sets, number = np.unique(packed, axis=0, return_inverse=True)
+    number = number.ravel()
+    first = [int(np.flatnonzero(number == index)[0]) for index in range(len(sets))]
+    return [(used[:, cell], np.flatnonzero(number == index)) for index, cell in enumerate(first)]

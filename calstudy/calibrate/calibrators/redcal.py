@@ -1,0 +1,286 @@
+"""Gains from the redundancy of the array, and what that cannot know from the sky model, as hera_cal finds them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from calstudy.base.observation import Frame
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.units import Length
+from calstudy.calibrate.calibrators._hera_cal import FEED, POL, HeraCal, Measured, patterns
+from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.calibrate.interface import Outcome
+from calstudy.instrument.layouts import RedundantGroups, redundant_groups
+from calstudy.instrument.size import Size
+
+Step = Literal["firstcal", "logcal", "omnical", "abscal"]
+STEPS: tuple[Step, ...] = ("firstcal", "logcal", "omnical", "abscal")
+SAMPLES_AT_ONCE = 4e6
+NEGLIGIBLE = 1e-14
+"""Weight of what stands for samples without weight, over the largest weight."""
+PERFECT = 10 * NEGLIGIBLE
+"""chi^2, over that of no model, below which nothing but rounding and such samples is left to fit."""
+STEP_LENGTH, CHECK_EVERY = 0.3, 10
+"""Of omnical: part of the way to the next solution, and after how many steps it looks at chi^2."""
+
+Gains = dict[tuple[int, str], np.ndarray]
+Visibilities = dict[tuple[int, int, str], np.ndarray]
+"""In the terms of hera_cal, (Ntimes, Nfreqs)."""
+
+
+class Redcal(HeraCal):
+    """hera_cal's redundant calibration: firstcal, logcal and omnical, then abscal against the sky model.
+
+    Redundant baselines are taken to see the same; what redundancy leaves open in each channel, an amplitude and a phase
+    gradient, comes from the sky model (Liu et al. 2010; Kern et al. 2020; Byrne et al. 2019).
+    """
+
+    calibrator: str = "redcal"
+    redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
+    steps: Annotated[tuple[Step, ...], Field(strict=False, min_length=1)] = Field(
+        STEPS,
+        description="What is done: a delay and a phase per antenna; a linear fit of logarithms; a fit of the "
+        "visibilities themselves; amplitude and phase gradient from the sky model. Any of them, in this order.",
+    )
+    tolerance: float = Field(
+        1e-8, gt=0, lt=1, description="Stop omnical when gains and visibilities change by less, relative to their norm."
+    )
+    max_steps: int = Field(1000, ge=1, description="Of omnical, in each channel.")
+
+    @field_validator("steps")
+    @classmethod
+    def _in_order(cls, steps: tuple[Step, ...]) -> tuple[Step, ...]:
+        if list(steps) != [step for step in STEPS if step in steps]:
+            raise ValueError(f"must be some of {', '.join(STEPS)}, each once, in this order")
+        return steps
+
+    def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
+        """Return why redundancy does not tie the gains of all antennas to each other, or None."""
+        if (reason := super().refusal(frame, has_sky_model)) is not None:
+            return reason
+        crosses = frame.baselines(~frame.autos)
+        groups = redundant_groups(crosses.vectors, self.redundancy_tolerance)
+        return _undetermined(crosses.antennas, groups)
+
+    def cost(self, size: Size) -> Cost:
+        """Return what the solves take, for some hundred steps of omnical."""
+        cells = size.channels.count * size.times * size.polarizations
+        seconds = 15 + 1.5e-5 * size.samples + (3e-3 * cells if "abscal" in self.steps else 0)
+        at_once = max(SAMPLES_AT_ONCE, size.baselines * size.channels.count)
+        return Cost(seconds, LIBRARIES_MEMORY + COMPLEX128 * (6 * size.samples + 25 * min(size.samples, at_once)))
+
+    def solve(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+        """Solve every integration by itself; gains of those that share them are averaged, phases aligned."""
+        found = redundant_groups(measured.frame.vectors, self.redundancy_tolerance)
+        n_times, n_baselines, n_channels = measured.visibilities.shape
+        step = max(int(SAMPLES_AT_ONCE // (n_baselines * n_channels)), 1)
+        blocks = [
+            _Redundant(self, measured, found, slice(first, min(first + step, n_times))).solve()
+            for first in range(0, n_times, step)
+        ]
+        gains, status, steps = (np.concatenate(parts, axis=-2) for parts in zip(*blocks, strict=True))
+        shared = np.stack([_average(gains[:, times]) for times in groups], axis=2)
+        return shared, [self._outcome(status[times], steps[times]) for times in groups]
+
+    def _outcome(self, status: np.ndarray, steps: np.ndarray) -> Outcome:
+        """Return how a solve ended, from the marks of its channels in `_Redundant.solve`."""
+        marks, longest = set(status.ravel()), int(steps.max())
+        count = {mark: int(np.sum(status == mark)) for mark in ("max-steps", "stalled", "failed")}
+        if not marks & {"converged", "max-steps", "stalled"}:
+            message = "redundant baselines that are not flagged do not tie the antennas to each other in any channel"
+            return Outcome(status="failed", message=message)
+        if count["max-steps"]:
+            message = f"omnical did not converge within {self.max_steps} steps in {count['max-steps']} channels"
+            return Outcome(status="max-steps", message=message, steps=longest)
+        if count["stalled"] or count["failed"]:
+            message = (
+                f"omnical found nothing better in {count['stalled']} channels before it converged, and "
+                f"{count['failed']} without a solution are flagged"
+            )
+            return Outcome(status="stalled", message=message, steps=longest)
+        if "omnical" not in self.steps:
+            return Outcome(status="converged", message=f"{', '.join(self.steps)}: linear fits, without iteration")
+        return Outcome(status="converged", message=f"omnical changed by less than {self.tolerance:g}", steps=longest)
+
+
+def _average(gains: np.ndarray) -> np.ndarray:
+    """Return the mean of gains (Nants, Ntimes, Nfreqs) over the integrations in which there are any."""
+    known = np.isfinite(gains)
+    values = np.where(known, gains, 0)
+    reference = values[:, 0]
+    for t in range(1, values.shape[1]):
+        # An integration without data has no phase to align; where the first has none, the next is the reference.
+        values[:, t] = np.where(reference.any(axis=0), fix_phase(values[:, t], reference), values[:, t])
+        reference = np.where(reference.any(axis=0), reference, values[:, t])
+    count = known.sum(axis=1)
+    return np.where(count > 0, values.sum(axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _undetermined(antennas: np.ndarray, groups: RedundantGroups) -> str | None:
+    """Return what redundancy leaves open besides one amplitude, one phase and a phase gradient, or None.
+
+    Parameters
+    ----------
+    antennas
+        (Nbls, 2).
+    groups
+        Of these baselines. Each has an unknown visibility, which is eliminated.
+    """
+    present, places = np.unique(antennas, return_inverse=True)
+    first, second = places.reshape(-1, 2).T
+    open_ = []
+    for sign in (1, -1):
+        rows = np.zeros((len(first), present.size))
+        np.add.at(rows, (np.arange(len(first)), first), 1)
+        np.add.at(rows, (np.arange(len(first)), second), sign)
+        if sign < 0:
+            rows[groups.conjugated] *= -1
+        size = np.bincount(groups.index)
+        means = np.stack([np.bincount(groups.index, column) for column in rows.T], axis=1) / size[:, None]
+        rest = rows - means[groups.index]
+        open_.append(present.size - np.linalg.matrix_rank(rest.T @ rest, hermitian=True))
+    amplitudes, phases = open_
+    if amplitudes > 1 or phases > 3:
+        return (
+            f"redundant baselines leave {amplitudes} amplitudes and {phases} phases of {present.size} antennas open in "
+            "each channel, and may leave 1 and 3; the array is not redundant enough (see redundancy_tolerance)"
+        )
+    return None
+
+
+def _solvable(antennas: np.ndarray, groups: RedundantGroups, used: np.ndarray) -> np.ndarray:
+    """Return in which cells, (Ntimes, Nfreqs), the baselines that are used, (Nbls, Ntimes, Nfreqs), suffice."""
+    found = np.zeros(used[0].size, bool)
+    for chosen, cells in patterns(used.reshape(len(used), -1)):
+        if chosen.any():
+            part = RedundantGroups(np.unique(groups.index[chosen], return_inverse=True)[1], groups.conjugated[chosen])
+            found[cells] = _undetermined(antennas[chosen], part) is None
+    return found.reshape(used.shape[1:])
+
+
+class _Redundant:
+    """Some integrations of redundant baselines, in the terms of hera_cal.
+
+    hera_cal stumbles over samples without weight. The sky model with a negligible weight stands for them, and, with any
+    weight, for all samples of a cell (a channel of an integration) that cannot be solved; cells do not know each other.
+    """
+
+    def __init__(self, settings: Redcal, measured: Measured, groups: RedundantGroups, times: slice) -> None:
+        self.settings, self.frame, index = settings, measured.frame, groups.index
+        weights = measured.weights[times].swapaxes(0, 1)
+        self.empty = ~weights.any(axis=0)
+        self.solvable = _solvable(measured.frame.antennas, groups, weights > 0)
+        used = (weights > 0) & self.solvable
+        anywhere = used.any(axis=(1, 2))
+        shared = np.bincount(index[anywhere], minlength=index.max() + 1)[index] > 1
+        self.rows = np.flatnonzero(anywhere & shared)
+        self.keys = {}
+        data, sky, weight = {}, {}, {}
+        for row in self.rows:
+            back = groups.conjugated[row]
+            a, b = measured.frame.antennas[row][:: -1 if back else 1]
+            key = self.keys[row] = (int(a), int(b), POL)
+            model = np.where(measured.sky[times, row] == 0, 1, measured.sky[times, row])
+            measurement = np.where(used[row], measured.visibilities[times, row], model)
+            data[key], sky[key] = (values.conj() if back else values for values in (measurement, model))
+            weight[key] = np.where(self.solvable, weights[row], 1.0)
+        self.data, self.sky, self.weights = data, sky, weight
+        self.reds = [
+            [self.keys[row] for row in self.rows[index[self.rows] == group]] for group in np.unique(index[self.rows])
+        ]
+
+    def solve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return gains (Nants, Ntimes, Nfreqs), NaN without a solution, and status and steps of each cell.
+
+        The status is "" where there are no data, and "failed" where they do not suffice.
+        """
+        gains = np.full((self.frame.n_antennas, *self.solvable.shape), np.nan, complex)
+        status, steps = np.full(self.solvable.shape, "converged", "U9"), np.zeros(self.solvable.shape, int)
+        if self.reds:
+            found = self._delays() if "firstcal" in self.settings.steps else self._unity()
+            found, status, steps = self._by_channel(found)
+            if "abscal" in self.settings.steps:
+                found = self._absolute(found)
+            for (antenna, _), gain in found.items():
+                seen = np.any([self.weights[key] > 0 for key in self.data if antenna in key[:2]], axis=0)
+                gains[antenna] = np.where(seen, gain, np.nan)
+        broken = np.any([~np.isfinite(gain) for gain in found.values()], axis=0) if self.reds else True
+        status = np.where(self.empty, "", np.where(self.solvable & ~broken, status, "failed"))
+        return np.where((status == "") | (status == "failed"), np.nan, gains), status, np.where(self.solvable, steps, 0)
+
+    def _unity(self) -> Gains:
+        antennas = sorted({antenna for key in self.data for antenna in key[:2]})
+        return {(antenna, FEED): np.ones(self.solvable.shape, complex) for antenna in antennas}
+
+    def _delays(self) -> Gains:
+        """Return a delay and a phase for each antenna and integration."""
+        from hera_cal.datacontainer import DataContainer
+        from hera_cal.redcal import RedundantCalibrator
+
+        found = self._unity()
+        for t in range(len(self.solvable)):
+            # All integrations at once would share what hera_cal decides on antennas with a wrong sign.
+            data = DataContainer({key: values[t : t + 1] for key, values in self.data.items()})
+            for antenna, gain in RedundantCalibrator(self.reds).firstcal(data, self.frame.frequencies)[1].gains.items():
+                found[antenna][t] = gain[0]
+        return found
+
+    def _by_channel(self, first: Gains) -> tuple[Gains, np.ndarray, np.ndarray]:
+        """Return gains, those of firstcal included and free of degeneracies, and status and steps of each cell."""
+        from hera_cal.datacontainer import DataContainer
+        from hera_cal.redcal import RedSol, RedundantCalibrator
+
+        calibrator = RedundantCalibrator(self.reds)
+        rest = DataContainer(_calibrated(self.data, first))
+        floor = NEGLIGIBLE * max(float(values.max()) for values in self.weights.values())
+        weights = DataContainer({key: np.maximum(values, floor) for key, values in self.weights.items()})
+        solution = RedSol(self.reds, gains=self._unity())
+        solution.update_vis_from_data(rest, wgts=weights)
+        if "logcal" in self.settings.steps:
+            _, solution = calibrator.logcal(rest, wgts=weights)
+        status, steps = np.full(self.solvable.shape, "converged", "U9"), np.zeros(self.solvable.shape, int)
+        if "omnical" in self.settings.steps:
+            told, solution = calibrator.omnical(
+                rest,
+                solution,
+                wgts=weights,
+                gain=STEP_LENGTH,
+                conv_crit=self.settings.tolerance,
+                maxiter=self.settings.max_steps,
+                check_every=CHECK_EVERY,
+            )
+            steps = told["iter"]
+            perfect = told["chisq"] < PERFECT * sum(weights[key] * np.abs(rest[key]) ** 2 for key in self.data)
+            short = (told["conv_crit"] > self.settings.tolerance) & ~perfect
+            status[short] = np.where(steps[short] >= self.settings.max_steps, "max-steps", "stalled")
+        solution.remove_degen(degen_sol=self._unity())
+        return {key: gain * first[key] for key, gain in solution.gains.items()}, status, steps
+
+    def _absolute(self, gains: Gains) -> Gains:
+        """Return gains whose phase gradient and amplitude fit the sky model best, in each channel."""
+        from hera_cal.abscal import abs_amp_lincal, complex_phase_abscal
+        from hera_cal.datacontainer import DataContainer
+
+        calibrated = _calibrated(self.data, gains)
+        # All that the phase gradient depends on: the sum over each group. It is of group members on one grid point.
+        heads = [group[0] for group in self.reds]
+        overlap = {
+            group[0]: sum(self.weights[key] * calibrated[key] * self.sky[key].conj() for key in group)
+            for group in self.reds
+        }
+        ones = {key: np.ones(self.solvable.shape, complex) for key in heads}
+        _, turns = complex_phase_abscal(DataContainer(overlap), DataContainer(ones), self.reds, heads, heads)
+        gains = {key: gain * turns[key] for key, gain in gains.items()}
+        data, sky, weights = (
+            DataContainer(values) for values in (_calibrated(self.data, gains), self.sky, self.weights)
+        )
+        scales = abs_amp_lincal(sky, data, wgts=weights, verbose=False, return_gains=True, gain_ants=list(gains))
+        return {key: gain * scales[key] for key, gain in gains.items()}
+
+
+def _calibrated(data: Visibilities, gains: Gains) -> Visibilities:
+    """Return V / (g_a g_b*)."""
+    return {(a, b, pol): values / (gains[a, FEED] * gains[b, FEED].conj()) for (a, b, pol), values in data.items()}

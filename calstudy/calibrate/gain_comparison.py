@@ -1,0 +1,183 @@
+"""Two sets of gains compared, free of what no calibration of the data can know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyuvdata import UVCal
+
+from calstudy.base.errors import InputError
+from calstudy.calibrate.agreement import TAPER, aligned_gains
+from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.power.delay import channel_width, delay_transform, delays
+
+SAME_CHANNEL = 0.1
+"""Channels of two files are the same if they differ by less than this, in units of their width."""
+GRADIENT_STEPS, GRADIENT_TOLERANCE = 50, 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class GainPair:
+    """Gains of the same antennas, integrations and channels from two sources; zero where either has none.
+
+    Attributes
+    ----------
+    antennas
+        Names, (Nants,).
+    positions
+        East and north, m, (Nants, 2).
+    frequency
+        Channel centres, Hz, (Nfreqs,).
+    polarization
+        Name of the feed.
+    first, second
+        Complex, (Ntimes, Nants, Nfreqs), of the convention "divide".
+    """
+
+    antennas: np.ndarray
+    positions: np.ndarray
+    frequency: np.ndarray
+    polarization: str
+    first: np.ndarray
+    second: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class GainDifference:
+    """How far two sets of gains differ: rms of the difference over the rms of the second.
+
+    Attributes
+    ----------
+    pair
+        What was compared, the first gains brought closest to the second.
+    as_given
+        Before that, of all antennas together.
+    of_antenna, of_channel
+        (Nants,) and (Nfreqs,); NaN where there are no gains.
+    delay, of_delay
+        s, ascending, and the ratio of the Blackman-Harris tapered transforms, (Ndelays,).
+    """
+
+    pair: GainPair
+    as_given: float
+    of_antenna: np.ndarray
+    of_channel: np.ndarray
+    delay: np.ndarray
+    of_delay: np.ndarray
+
+
+def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
+    """Return the gains that two files have in common.
+
+    Parameters
+    ----------
+    first, second
+        Of either convention. An integration of the first is compared with the closest of the second.
+    polarization
+        Place among the feeds that both have.
+
+    Raises
+    ------
+    InputError
+        If they hold delays, or have no antennas, no feed, or not the same channels in common.
+    """
+    for cal in (first, second):
+        if cal.cal_type != "gain":
+            raise InputError(f"a file holds {cal.cal_type} solutions; gains by channel are needed")
+    numbers = np.intersect1d(first.ant_array, second.ant_array)
+    feeds = [int(feed) for feed in first.jones_array if feed in second.jones_array]
+    if not numbers.size or polarization >= len(feeds):
+        raise InputError("the two files have no antenna in common" if not numbers.size else "have no feed in common")
+    frequencies = [np.sort(np.ravel(cal.freq_array)) for cal in (first, second)]
+    width = float(np.min(first.channel_width))
+    if len(frequencies[0]) != len(frequencies[1]) or np.abs(np.subtract(*frequencies)).max() > SAME_CHANNEL * width:
+        raise InputError("the two files do not have the same channels")
+    times = [cal.time_array if cal.time_array is not None else cal.time_range.mean(axis=1) for cal in (first, second)]
+    closest = np.abs(times[1][None] - times[0][:, None]).argmin(axis=1)
+    values, known = zip(*(_gains(cal, numbers, feeds[polarization]) for cal in (first, second)), strict=True)
+    used = known[0] & known[1][closest]
+    telescope = first.telescope
+    rows = [int(np.flatnonzero(telescope.antenna_numbers == number)[0]) for number in numbers]
+    return GainPair(
+        antennas=np.array([telescope.antenna_names[row] for row in rows]),
+        positions=telescope.get_enu_antpos()[rows, :2],
+        frequency=frequencies[0],
+        polarization={-5: "x", -6: "y", -1: "r", -2: "l"}.get(feeds[polarization], str(feeds[polarization])),
+        first=np.where(used, values[0], 0),
+        second=np.where(used, values[1][closest], 0),
+    )
+
+
+def _gains(cal: UVCal, numbers: np.ndarray, feed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return gains and where there are any, (Ntimes, Nants, Nfreqs), channels ascending."""
+    rows = [int(np.flatnonzero(cal.ant_array == number)[0]) for number in numbers]
+    column = int(np.flatnonzero(cal.jones_array == feed)[0])
+    order = np.argsort(np.ravel(cal.freq_array))
+    gains, flags = (np.moveaxis(array[rows][..., column][:, order], 2, 0) for array in (cal.gain_array, cal.flag_array))
+    known = ~flags & np.isfinite(gains) & (gains != 0)
+    values = np.where(known, gains, 1)
+    return np.where(known, 1 / values if cal.gain_convention == "multiply" else values, 0), known
+
+
+def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
+    """Compare two sets of gains, free of one phase per channel and one real scale for each integration.
+
+    Parameters
+    ----------
+    pair
+        What is compared. Not mutated.
+    redundant
+        Whether one amplitude and one phase gradient across the array in every channel are left out as well, which the
+        redundancy of an array does not determine. Gradients must be below about half a turn across the array.
+
+    Raises
+    ------
+    InputError
+        If the two have no gains in common.
+    """
+    if not pair.first.any():
+        raise InputError("all gains that the two files have in common are flagged in either")
+    first = pair.first
+    if redundant:
+        both = zip(first, pair.second, strict=True)
+        first = np.stack([_without_gradients(*gains, pair.positions) for gains in both])
+    solved = first.any(axis=(1, 2))
+    aligned = np.zeros_like(first)
+    aligned[solved] = aligned_gains(first[solved], pair.second[solved])
+    difference = aligned - pair.second
+    width = channel_width(pair.frequency)
+    power = [
+        np.mean(np.abs(delay_transform(values, pair.frequency, TAPER)) ** 2, axis=(0, 1))
+        for values in (difference, pair.second)
+    ]
+    return GainDifference(
+        pair=GainPair(pair.antennas, pair.positions, pair.frequency, pair.polarization, aligned, pair.second),
+        as_given=float(_relative(pair.first - pair.second, pair.second, (0, 1, 2))),
+        of_antenna=_relative(difference, pair.second, (0, 2)),
+        of_channel=_relative(difference, pair.second, (0, 1)),
+        delay=delays(pair.frequency.size, width),
+        of_delay=np.sqrt(power[0] / power[1]),
+    )
+
+
+def _relative(difference: np.ndarray, gains: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
+    above, below = (np.sum(np.abs(values) ** 2, axis=axes) for values in (difference, gains))
+    return np.sqrt(np.divide(above, below, out=np.full(np.shape(above), np.nan), where=below > 0))
+
+
+def _without_gradients(first: np.ndarray, second: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Return the first gains (Nants, Nfreqs) with amplitude and phase gradient of each channel as the second's."""
+    design = np.column_stack([positions - positions.mean(axis=0), np.ones(len(positions))])
+    turned = fix_phase(first, second)
+    for _ in range(GRADIENT_STEPS):
+        overlap = turned * second.conj()
+        normal = np.einsum("ai,af,aj->fij", design, np.abs(overlap), design)
+        slope = np.einsum("fij,aj,af->fi", np.linalg.pinv(normal, hermitian=True), design, overlap.imag)
+        phase = design @ slope.T
+        turned = turned * np.exp(-1j * phase)
+        if np.abs(phase).max() < GRADIENT_TOLERANCE:
+            break
+    size = np.sum(np.abs(turned) ** 2, axis=0)
+    amplitude = np.sum((turned.conj() * second).real, axis=0) / np.where(size > 0, size, 1)
+    return turned * np.where(amplitude > 0, amplitude, 1)

@@ -1,0 +1,70 @@
+"""``calstudy compare-gains``: how far the gains of two files differ, free of what no calibration can know."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from calstudy.calibrate.gain_comparison import GainDifference
+
+NAME = "gain-comparison"
+
+First = Annotated[Path, typer.Argument(help="Gains, a CalH5 or calfits file.", show_default=False)]
+Second = Annotated[Path, typer.Argument(help="Gains that they are compared with, such as the true ones.")]
+Redundant = Annotated[
+    bool,
+    typer.Option(
+        "--redundant", help="Also leave out an amplitude and a phase gradient in every channel, as redundancy does."
+    ),
+]
+Feed = Annotated[int, typer.Option(min=0, help="Which of the feeds that both files have, counted from 0.")]
+Folder = Annotated[Path, typer.Option("--output", help="Folder for figure, arrays and numbers.")]
+
+
+def compare_gains(
+    first: First, second: Second, redundant: Redundant = False, feed: Feed = 0, folder: Folder = Path("checks")
+) -> None:
+    """Compare two files of gains by antenna, channel and delay.
+
+    One phase in every channel and one real scale are taken out in every integration, for no data determine them.
+    """
+    from calstudy.base.gains import read_gains
+    from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
+    from calstudy.observed.gain_comparison_figure import draw_gain_difference
+    from calstudy.plotting.save import figure_arrays, save_figure
+    from calstudy.products.files import quiet_libraries
+
+    with quiet_libraries():
+        pair = pair_gains(read_gains(first, "the first file"), read_gains(second, "the second file"), feed)
+        found = compare_gains(pair, redundant)
+    numbers = _numbers(found)
+    for name, value in numbers.items():
+        typer.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
+    for path in save_figure(draw_gain_difference(found), figure_arrays(found), folder, NAME):
+        typer.echo(f"{path}")
+    path = folder / f"{NAME}.json"
+    path.write_text(json.dumps(numbers, indent=1), encoding="utf-8")
+    typer.echo(f"{path}")
+
+
+def _numbers(found: GainDifference) -> dict[str, float | str]:
+    import numpy as np
+
+    from calstudy.observed.gain_comparison_figure import together
+
+    worst = int(np.nanargmax(found.of_antenna))
+    return {
+        "difference": together(found),
+        "difference as given": found.as_given,
+        "median over antennas": float(np.nanmedian(found.of_antenna)),
+        "worst antenna": str(found.pair.antennas[worst]),
+        "difference of the worst antenna": float(found.of_antenna[worst]),
+        "worst channel [MHz]": float(found.pair.frequency[np.nanargmax(found.of_channel)] / 1e6),
+        "difference of the worst channel": float(np.nanmax(found.of_channel)),
+        "worst delay [ns]": float(1e9 * found.delay[np.argmax(found.of_delay)]),
+        "difference at the worst delay": float(found.of_delay.max()),
+    }

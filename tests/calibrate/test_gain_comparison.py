@@ -1,0 +1,110 @@
+"""Two files of gains: what no calibration knows does not count, everything else does, where it is."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from command_line import run_command
+from test_calamity import make_uvdata
+from toy import FREQUENCIES, complex_normal, make_toy, scattered
+
+from calstudy.base.errors import InputError
+from calstudy.base.gains import make_uvcal
+from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
+
+N_ANTENNAS = 9
+
+
+@pytest.fixture(scope="module")
+def template():
+    return make_uvdata(make_toy(scattered(N_ANTENNAS)), n_times=2)
+
+
+@pytest.fixture(scope="module")
+def gains():
+    rng = np.random.default_rng(1)
+    return 1 + 0.1 * complex_normal(rng, (N_ANTENNAS, FREQUENCIES.size, 2, 1))
+
+
+def differ(template, first, second, redundant=False, flags=None):
+    pair = pair_gains(make_uvcal(template, first, flags), make_uvcal(template, second))
+    return compare_gains(pair, redundant)
+
+
+def test_a_phase_for_every_channel_and_a_scale_do_not_count(template, gains):
+    rng = np.random.default_rng(2)
+    phase = np.exp(2j * np.pi * rng.random((1, FREQUENCIES.size, 2, 1)))
+    found = differ(template, 1.3 * phase * gains, gains)
+    assert found.as_given > 1
+    assert max(found.of_antenna.max(), found.of_channel.max(), found.of_delay.max()) < 1e-12
+
+
+def test_amplitudes_and_gradients_count_unless_the_array_is_redundant(template, gains):
+    rng = np.random.default_rng(3)
+    positions = template.telescope.get_enu_antpos()[:, :2]
+    slopes = 0.03 * rng.standard_normal((2, FREQUENCIES.size))
+    changed = gains * np.exp(1j * positions @ slopes)[:, :, None, None]
+    changed = changed * (1 + 0.1 * rng.random((1, FREQUENCIES.size, 1, 1)))
+    assert np.median(differ(template, changed, gains).of_antenna) > 0.05
+    found = differ(template, changed, gains, redundant=True)
+    assert max(found.of_antenna.max(), found.of_channel.max()) < 1e-10
+
+
+def test_an_error_is_found_where_it_is(template, gains):
+    changed = gains.copy()
+    # A reflection of 1 % at 600 ns in one antenna.
+    changed[4, :, :, 0] *= 1 + 0.01 * np.exp(2j * np.pi * 600e-9 * FREQUENCIES)[:, None]
+    found = differ(template, changed, gains)
+    assert found.of_antenna.argmax() == 4
+    # Its phase is shared by all antennas once each channel is aligned: a ninth is taken out.
+    assert found.of_antenna[4] == pytest.approx(0.01, rel=0.15)
+    assert abs(found.delay[found.of_delay.argmax()]) == pytest.approx(600e-9, abs=100e-9)
+    changed = gains.copy()
+    changed[:, 20] *= np.linspace(0.9, 1.1, N_ANTENNAS)[:, None, None]
+    assert differ(template, changed, gains).of_channel.argmax() == 20
+
+
+def test_flagged_gains_do_not_count_and_conventions_do_not_matter(template, gains):
+    flags = np.zeros(gains.shape, bool)
+    flags[2], flags[:, 7] = True, True
+    found = differ(template, np.where(flags, 1e3, gains), gains, flags=flags)
+    assert np.isnan(found.of_antenna[2])
+    assert np.isnan(found.of_channel[7])
+    assert np.nanmax(found.of_antenna) < 1e-12
+    multiply = make_uvcal(template, 1 / gains)
+    multiply.gain_convention = "multiply"
+    assert compare_gains(pair_gains(multiply, make_uvcal(template, gains))).of_antenna.max() < 1e-12
+    # One gain for the whole run is compared with every integration.
+    constant = make_uvcal(template, gains[:, :, :1])
+    assert pair_gains(make_uvcal(template, gains), constant).second.shape == (2, N_ANTENNAS, FREQUENCIES.size)
+
+
+def test_files_that_have_nothing_in_common_are_refused(template, gains):
+    cal = make_uvcal(template, gains)
+    fewer = cal.select(freq_chans=np.arange(32), inplace=False)
+    with pytest.raises(InputError, match="do not have the same channels"):
+        pair_gains(cal, fewer)
+    with pytest.raises(InputError, match="flagged in either"):
+        differ(template, gains, gains, flags=np.ones(gains.shape, bool))
+    left, right = (cal.select(antenna_nums=cal.ant_array[part], inplace=False) for part in (slice(4), slice(4, None)))
+    with pytest.raises(InputError, match="no antenna in common"):
+        pair_gains(left, right)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_command_writes_numbers_and_a_figure(template, gains, tmp_path, capsys):
+    changed = gains * (1 + 0.01 * complex_normal(np.random.default_rng(4), gains.shape))
+    for name, values in (("a", changed), ("b", gains)):
+        make_uvcal(template, values).write_calh5(tmp_path / f"{name}.calh5")
+    out = tmp_path / "out"
+    status, told = run_command(capsys, "compare-gains", tmp_path / "a.calh5", tmp_path / "b.calh5", "--output", out)
+    assert status == 0, told
+    numbers = json.loads((out / "gain-comparison.json").read_text())
+    # Of nine antennas, the phase of each channel takes a ninth of the imaginary parts.
+    assert numbers["difference"] == pytest.approx(0.01, rel=0.1)
+    assert {path.suffix for path in out.iterdir()} == {".json", ".npz", ".pdf", ".png"}
+    status, told = run_command(capsys, "compare-gains", tmp_path / "a.calh5", tmp_path / "c.calh5")
+    assert status == 2
+    assert "the second file" in told

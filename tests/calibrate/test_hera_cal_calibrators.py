@@ -1,0 +1,228 @@
+"""hera_cal's calibrators: exact where they must be, wrong where they are known to be, and honest about either."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_calamity import make_uvdata
+from toy import HEX, complex_normal, make_toy, scattered
+
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Observation
+from calstudy.base.visibilities import from_cube, to_cube
+from calstudy.calibrate.calibrators.redcal import Redcal
+from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.calibrators.skycal import Skycal
+from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.calibrate.execution import run_calibrator
+
+LARGE_HEX = 14.0 * np.array(
+    [[x + y / 2, y * np.sqrt(0.75), 0] for y in range(-2, 3) for x in range(-2, 3) if abs(x + y) < 3]
+)
+EXACT = 1e-7
+"""Of noiseless fits, which stop when gains change by 1e-8."""
+CASES = {"redcal": (Redcal(), LARGE_HEX), "skycal": (Skycal(), scattered(8))}
+
+
+@pytest.fixture(scope="module", params=list(CASES))
+def case(request):
+    calibrator, positions = CASES[request.param]
+    return calibrator, make_toy(positions, noise=0.0)
+
+
+def sky_of(uvd, foregrounds):
+    """A sky model with the samples of the data."""
+    return from_cube(uvd, np.broadcast_to(foregrounds[None, :, :, None], to_cube(uvd).shape))
+
+
+def turned(toy):
+    """The toy with every second baseline reversed."""
+    antennas, foregrounds = toy.antennas.copy(), toy.foregrounds.copy()
+    antennas[::2] = antennas[::2, ::-1]
+    foregrounds[::2] = foregrounds[::2].conj()
+    noise = toy.noise.copy()
+    noise[::2] = noise[::2].conj()
+    return replace(toy, antennas=antennas, foregrounds=foregrounds, noise=noise)
+
+
+def errors(result, toy, integration=0, polarization=0):
+    """Difference of the gains from the truth, phases aligned, NaN where they are flagged, (Nants, Nfreqs)."""
+    rows = np.isin(result.gains.ant_array, 10 + 2 * np.arange(len(toy.positions)))
+    gains = result.gains.gain_array[rows, :, integration, polarization]
+    flags = result.gains.flag_array[rows, :, integration, polarization]
+    aligned = fix_phase(np.where(flags, 0, gains), np.where(flags, 0, toy.gains))
+    return np.where(flags, np.nan, aligned - toy.gains)
+
+
+def statuses(result):
+    return [record.status for record in result.solutions]
+
+
+def test_noiseless_gains_are_exact(case):
+    calibrator, toy = case
+    toy = turned(toy)
+    uvd = make_uvdata(toy, n_times=1, polarizations=(-5, -6))
+    result = run_calibrator(calibrator, uvd, sky_of(uvd, toy.foregrounds))
+    assert statuses(result) == ["converged"] * 2
+    for polarization in (0, 1):
+        # Data of the toys' polarizations differ by 1e-4 in amplitude, and so do gains by half of that.
+        size = abs(to_cube(uvd)[0, ..., polarization] / toy.visibilities).mean() ** 0.5
+        found = errors(result, replace(toy, gains=size * toy.gains), polarization=polarization)
+        assert np.abs(found).max() < EXACT
+    rms = np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))
+    assert np.abs(result.residual.data_array).max() < 10 * EXACT * rms
+    total = result.gains.gain_array[~result.gains.flag_array.all(axis=(1, 2, 3))].sum(axis=0)
+    assert np.abs(total.imag).max() < 1e-10
+    assert total.real.min() > 0
+
+
+def test_flags_have_no_influence_and_gains_without_data_are_flagged(case):
+    calibrator, toy = case
+    uvd = make_uvdata(toy, n_times=1)
+    cube, flags = to_cube(uvd).copy(), np.zeros(to_cube(uvd).shape, bool)
+    dead = (toy.antennas == 3).any(axis=1)
+    flags[:, dead] = True
+    flags[:, :, 10:12] = True
+    # Antenna 5 lacks a channel, and one sample in fifty is flagged on its own.
+    flags[:, (toy.antennas == 5).any(axis=1), 20] = True
+    flags |= np.random.default_rng(1).random(flags.shape) < 0.02
+    cube[flags] = 1e6
+    uvd = from_cube(uvd, cube)
+    uvd.flag_array = flags.reshape(uvd.data_array.shape)
+    # Sky models may be anything where the data are flagged.
+    sky = sky_of(uvd, np.where(flags[0, :, :, 0], np.nan, toy.foregrounds))
+    result = run_calibrator(calibrator, uvd, sky)
+    found = errors(
+        result, replace(toy, gains=toy.gains * abs(to_cube(uvd)[0, 7, 0, 0] / toy.visibilities[7, 0]) ** 0.5)
+    )
+    expected = np.zeros(found.shape, bool)
+    expected[3], expected[:, 10:12], expected[5, 20] = True, True, True
+    np.testing.assert_array_equal(np.isnan(found), expected)
+    assert np.nanmax(np.abs(found)) < EXACT
+    assert statuses(result) == ["converged"]
+
+
+def test_integrations_that_share_their_gains(case):
+    calibrator, toy = case
+    uvd = make_uvdata(toy, n_times=5)
+    # The third has no data, the last is a group of its own.
+    uvd.flag_array[2 * uvd.Nbls : 3 * uvd.Nbls] = True
+    shared = calibrator.model_copy(update={"integrations_per_solve": 2})
+    result = run_calibrator(shared, uvd, sky_of(uvd, toy.foregrounds))
+    assert statuses(result) == ["converged"] * 3
+    gains = result.gains.gain_array
+    np.testing.assert_array_equal(gains[:, :, 0], gains[:, :, 1])
+    assert np.abs(errors(result, toy, 0)).max() < 1e-3
+    assert not result.gains.flag_array[:, :, 3].all()
+
+
+def test_skycal_is_sky_based_calibration_of_several_integrations(toy):
+    rng = np.random.default_rng(2)
+    uvd = make_uvdata(toy, n_times=3)
+    cube = to_cube(uvd) + 0.05 * np.abs(toy.foregrounds).mean() * complex_normal(rng, to_cube(uvd).shape)
+    uvd = from_cube(uvd, cube)
+    wrong = toy.foregrounds + 0.1 * np.abs(toy.foregrounds).mean() * complex_normal(rng, toy.foregrounds.shape)
+    ours = SkyBased.model_validate({"integrations_per_solve": 3, "solver": {"precision": "double", "tolerance": 1e-13}})
+    found = [
+        run_calibrator(settings, uvd, sky_of(uvd, wrong)).gains.gain_array[:, :, 0, 0]
+        for settings in (Skycal(integrations_per_solve=3), ours)
+    ]
+    assert np.abs(fix_phase(*found) - found[1]).max() < 1e-6
+
+
+def test_logcal_pulls_weak_antennas_up_and_omnical_does_not():
+    """E ln |V + n| > ln |V|, more so where V is small: the amplitudes of weak antennas come out too large."""
+    toy = make_toy(LARGE_HEX, noise=0.0)
+    weak = np.arange(len(LARGE_HEX)) % 2 == 1
+    toy = replace(toy, gains=np.where(weak, 0.5, 1.0)[:, None] * np.exp(1j * np.angle(toy.gains)))
+    uvd = make_uvdata(toy, n_times=2)
+    noise = 0.3 * np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))
+    cube = to_cube(uvd) + noise * complex_normal(np.random.default_rng(3), to_cube(uvd).shape)
+    uvd = from_cube(uvd, cube)
+    ratios, scatter = {}, {}
+    for steps in (("logcal", "abscal"), ("logcal", "omnical", "abscal")):
+        result = run_calibrator(Redcal(steps=steps), uvd, sky_of(uvd, toy.foregrounds))
+        rows = np.isin(result.gains.ant_array, 10 + 2 * np.arange(len(weak)))
+        amplitude = np.abs(result.gains.gain_array[rows, :, :, 0])
+        ratio = amplitude[weak].mean(axis=0) / amplitude[~weak].mean(axis=0)
+        ratios[steps[1]], scatter[steps[1]] = ratio.mean(), ratio.std() / np.sqrt(ratio.size)
+    assert ratios["abscal"] > 0.5 + 10 * scatter["abscal"]
+    assert ratios["abscal"] - 0.5 > 5 * abs(ratios["omnical"] - 0.5)
+
+
+def test_abscal_turns_the_sky_to_where_the_model_has_it():
+    """Sources that the model has elsewhere by one angle are a phase gradient of the gains, which redundancy allows."""
+    toy = make_toy(LARGE_HEX, noise=0.0)
+    uvd = make_uvdata(toy, n_times=1)
+    gradient = 0.02 * np.array([0.8, 0.6, 0.0])
+    model = toy.foregrounds * np.exp(1j * (toy.vectors @ gradient))[:, None]
+    result = run_calibrator(Redcal(), uvd, sky_of(uvd, model))
+    assert statuses(result) == ["converged"]
+    expected = toy.gains * np.exp(1j * (toy.positions @ gradient))[:, None]
+    size = abs(to_cube(uvd)[0, ..., 0] / toy.visibilities).mean() ** 0.5
+    assert np.abs(errors(result, replace(toy, gains=size * expected))).max() < EXACT
+    # The data fit perfectly, with gains that are wrong by a tenth and more.
+    assert np.abs(result.residual.data_array).max() < 1e-5 * np.abs(model).max()
+    assert np.abs(fix_phase(expected, toy.gains) - toy.gains).mean() > 0.1
+
+
+def test_without_abscal_a_phase_gradient_and_the_amplitude_stay_open():
+    toy = make_toy(LARGE_HEX, noise=0.0)
+    uvd = make_uvdata(toy, n_times=1)
+    result = run_calibrator(Redcal(steps=("logcal", "omnical")), uvd, sky_of(uvd, toy.foregrounds))
+    rows = np.isin(result.gains.ant_array, 10 + 2 * np.arange(len(toy.positions)))
+    ratio = result.gains.gain_array[rows, :, 0, 0] / toy.gains
+    np.testing.assert_allclose(np.abs(ratio / ratio[:1]), 1, atol=EXACT)
+    design = np.column_stack([toy.positions[:, :2], np.ones(len(toy.positions))])
+    phases = np.unwrap(np.angle(ratio / ratio[:1]), axis=0)
+    fitted = design @ np.linalg.lstsq(design, phases, rcond=None)[0]
+    assert np.abs(np.exp(1j * (phases - fitted)) - 1).max() < EXACT
+    assert np.abs(np.abs(ratio) - 1).max() > 1e-3
+
+
+def test_statuses_are_those_of_the_fits():
+    toy = make_toy(LARGE_HEX, noise=0.0)
+    uvd = make_uvdata(toy, n_times=2)
+    cube = to_cube(uvd) * (1 + 0.1 * complex_normal(np.random.default_rng(4), to_cube(uvd).shape))
+    uvd, sky = from_cube(uvd, cube), sky_of(uvd, toy.foregrounds)
+    result = run_calibrator(Redcal(max_steps=10), uvd, sky)
+    assert statuses(result) == ["max-steps"] * 2
+    assert "did not converge within 10 steps" in result.solutions[0].message
+    result = run_calibrator(Skycal(max_steps=1), uvd, sky)
+    assert statuses(result) == ["failed"] * 2
+    assert result.gains.flag_array.all()
+    uvd.flag_array[: uvd.Nbls] = True
+    # A single row of antennas is left in the second integration: nothing ties its amplitudes together.
+    kept = np.isin(toy.antennas, [0, 1, 2]).all(axis=1)
+    uvd.flag_array[uvd.Nbls :][~kept] = True
+    result = run_calibrator(Redcal(), uvd, sky)
+    assert statuses(result) == ["skipped", "failed"]
+    assert "do not tie" in result.solutions[1].message
+
+
+@pytest.mark.parametrize("calibrator", [Redcal(), Skycal()])
+def test_a_sky_model_is_needed(calibrator, hexagon):
+    with pytest.raises(InputError, match="needs a sky model"):
+        run_calibrator(calibrator, make_uvdata(hexagon))
+
+
+def test_arrays_that_are_not_redundant_are_refused(toy, hexagon):
+    uvd = make_uvdata(toy)
+    with pytest.raises(InputError, match=r"leave 8 amplitudes and 8 phases of 8 antennas open .* not redundant enough"):
+        run_calibrator(Redcal(), uvd, sky_of(uvd, toy.foregrounds))
+    assert Redcal().refusal(Observation(make_uvdata(hexagon)), True) is None
+    # Two hexagons far apart, with nothing between that repeats: each is redundant, and they know nothing of each other.
+    far = make_toy(np.concatenate([HEX, 1.3 * HEX + [300, 100, 0]]), noise=0.0)
+    reason = Redcal().refusal(Observation(make_uvdata(far, n_times=1)), True)
+    assert reason is not None
+    assert "leave 2 amplitudes and 6 phases of 14 antennas" in reason
+
+
+@pytest.mark.parametrize(
+    ("steps", "told"), [(["omnical", "logcal"], "in this order"), (["lincal"], "lincal"), ([], "at least 1")]
+)
+def test_steps_that_make_no_sense_are_refused(steps, told):
+    with pytest.raises(ValueError, match=told):
+        Redcal.model_validate({"steps": steps})
