@@ -247,8 +247,8 @@ def test_a_frozen_sky_leaves_the_foreground_delays():
 def test_gains_that_are_white_in_frequency_leak_the_signal_into_the_wedge(sigma):
     """The fit weights channels by |g_a g_b*|^2, whose relative variance is 8 sigma^2.
 
-    The calibrated residual, without these weights, is therefore not orthogonal to the foreground sequences: what is left
-    of the signal beyond them leaks in with that part of its power, uncorrelated with the signal that was there.
+    The calibrated residual, without these weights, is therefore not orthogonal to the foreground sequences: what is
+    left of the signal beyond them leaks in with that part of its power, uncorrelated with the signal that was there.
     """
     toy = make_toy(scattered(8), noise=0.0)
     kernels, inside = ReducedKernels(toy.structure), np.abs(MODES.delay) < 30e-9
