@@ -26,8 +26,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, Generic, TypeVar
 
-from pydantic import ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    GetJsonSchemaHandler,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from calstudy.base.errors import InputError, nearest
 from calstudy.base.schema import Section, fault
@@ -90,6 +98,23 @@ class PluginField(WrapValidator):
     """The validator of a field that holds a thing of one kind, from `Registry.field`."""
 
     registry: Registry[Any]
+    default: str | None = None
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON schema of the names, of the blocks of built-in things, and of what refers to a file."""
+        del core
+        tag, file = self.registry.tag, {"type": "string", "pattern": r"\.py(:\w+)?$"}
+        allowed: list[JsonSchemaValue] = [{"enum": self.registry.names()}, file]
+        for name in self.registry.built_in():
+            block = handler.resolve_ref_schema(handler(self.registry.find(name).__pydantic_core_schema__))
+            required = [field for field in block.get("required", []) if field != tag]
+            properties = {**block.get("properties", {}), tag: {"const": name}}
+            tagged = required if name == self.default else [*required, tag]
+            allowed.append({**block, "properties": properties, "required": tagged})
+        installed = {"enum": sorted(set(self.registry.installed()) - set(self.registry.built_in()))}
+        others = {"anyOf": [file, installed]} if installed["enum"] else file
+        allowed.append({"type": "object", "properties": {tag: others}, "required": [tag]})
+        return {"anyOf": allowed}
 
 
 class Registry(Generic[P]):
@@ -248,7 +273,7 @@ class Registry(Generic[P]):
                 path = self.tag if isinstance(value, Mapping) else ""
                 raise fault(path, str(error)) from None
 
-        return PluginField(validate, registry=self)
+        return PluginField(validate, registry=self, default=default)
 
     def identity(self, reference: str) -> str:
         """Return what identifies the code of a thing: its name, its package's version, or the digest of its file."""

@@ -25,6 +25,11 @@ def free_memory() -> int:
     return psutil.virtual_memory().available
 
 
+def total_memory() -> int:
+    """Return the bytes of memory of this machine."""
+    return psutil.virtual_memory().total
+
+
 def parse_memory(text: str) -> float:
     """Return the bytes that a text such as ``6 GB`` or ``500MB`` stands for.
 

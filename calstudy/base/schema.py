@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler
 from pydantic.config import JsonDict
-from pydantic_core import PydanticCustomError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 UNKEYED: JsonDict = {"keyed": False}
 """`json_schema_extra` of a field that changes how results are made, and not what they are (but for rounding)."""
@@ -40,6 +42,26 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+@dataclass(frozen=True, kw_only=True)
+class ChoiceValidator(BeforeValidator):
+    """The validator of a choice between blocks, from `choice`."""
+
+    key: str
+    default: str | None
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON schema of the blocks, of their names, and of the default block without its name."""
+        found = dict(handler(core))
+        tags = found.pop("discriminator", {"mapping": {}})["mapping"]
+        blocks = found.pop("oneOf", None) or [handler(core)]
+        names: JsonSchemaValue = {"enum": list(tags)} if tags else {"type": "string"}
+        allowed = [names, *blocks]
+        if self.default in tags:
+            block = handler.resolve_ref_schema({"$ref": tags[self.default]})
+            allowed.append({**block, "required": [name for name in block.get("required", []) if name != self.key]})
+        return {"anyOf": allowed}
+
+
 def choice(key: str, default: str | None = None) -> BeforeValidator:
     """Make the tag `key` of a choice between blocks easy to write.
 
@@ -54,7 +76,7 @@ def choice(key: str, default: str | None = None) -> BeforeValidator:
             return {key: default, **value}
         return value
 
-    return BeforeValidator(expand)
+    return ChoiceValidator(expand, key=key, default=default)
 
 
 def fault(path: str, sentence: str) -> PydanticCustomError:

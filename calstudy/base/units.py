@@ -138,5 +138,5 @@ Phase = _quantity("rad", "0.01 rad")
 HourAngle = _field(parse_hour_angle, "h", "1.8 h")
 Temperature = _quantity("K", "180 K")
 Wavenumber = _field(parse_wavenumber, "h/Mpc", "0.2 h/Mpc")
-Fraction = Annotated[float, BeforeValidator(parse_fraction, json_schema_input_type=str)]
+Fraction = Annotated[float, BeforeValidator(parse_fraction, json_schema_input_type=float | str)]
 Decibel = _field(parse_decibel, "dB", "-40 dB")

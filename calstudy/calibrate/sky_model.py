@@ -59,6 +59,55 @@ def read_sky_model(path: Path, template: UVData) -> UVData:
     return from_cube(template, cube)
 
 
+def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UVData, list[str]]:
+    """Return a prepared sky model and prepared data with the same baselines, and what was changed in words.
+
+    Cross-correlations that the sky model lacks are left out of the data. Autocorrelations that it lacks stay, with a
+    sky model of zero, unless they are to be fitted: weights may need them.
+
+    Parameters
+    ----------
+    sky, data
+        From `calstudy.observed.reading.prepare`; not changed.
+    autos
+        Whether autocorrelations are to be fitted.
+
+    Returns
+    -------
+    sky
+        With the samples of the data, in their order.
+    data
+        Perhaps without some baselines.
+    notes
+        One sentence for each thing that was left out.
+
+    Raises
+    ------
+    InputError
+        If no cross-correlation is in both, or as `match_sky_model`.
+    """
+    known = {frozenset(pair) for pair in zip(sky.ant_1_array.tolist(), sky.ant_2_array.tolist(), strict=True)}
+    pairs = list(zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True))
+    modelled = np.array([frozenset(pair) in known for pair in pairs])
+    are_autos = np.array([a == b for a, b in pairs])
+    if not (modelled & ~are_autos).any():
+        raise InputError(
+            "sky model: has none of the cross-correlations of the data (antennas are told by their numbers)"
+        )
+    kept, notes = modelled | (are_autos & (not autos)), []
+    if not kept.all():
+        lost = sorted({pair for pair, keep in zip(pairs, kept, strict=True) if not keep})
+        notes.append(f"{len(lost)} baselines that the sky model lacks are left out, such as {lost[0]}.")
+        data = data.select(blt_inds=np.flatnonzero(kept), inplace=False)
+        modelled = modelled[kept]
+    if modelled.all():
+        return match_sky_model(sky, data), data, notes
+    part = match_sky_model(sky, data.select(blt_inds=np.flatnonzero(modelled), inplace=False))
+    filled = from_cube(data, np.zeros((data.Ntimes, data.Nbls, data.Nfreqs, data.Npols), complex))
+    filled.data_array[modelled] = part.data_array
+    return filled, data, notes
+
+
 def match_sky_model(sky: UVData, data: UVData) -> UVData:
     """Return the part of a prepared sky model that belongs to prepared data, in their order.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,15 +16,17 @@ from rich.console import Console
 from calstudy.base.errors import InputError
 
 if TYPE_CHECKING:
-    from pyuvdata import UVData
+    from pyuvdata import UVCal, UVData
 
     from calstudy.calibrate.interface import Calibrator
     from calstudy.calibrate.records import CalibrationResult
     from calstudy.calibrate.settings import GainFit
+    from calstudy.observed.pieces import Given
 
 EXIT_UNCONVERGED = 3
 # More solves than this that did not converge are counted instead of named.
 NAMED = 5
+SECONDS_BETWEEN_LINES = 10.0
 # Real data of few baselines have directions that converge slowly, at next to no cost.
 PATIENT = {"name": "gauss-newton", "max_steps": 500}
 
@@ -55,6 +58,7 @@ ExpectedLoss = Annotated[
 MaxMemory = Annotated[
     str | None, typer.Option(metavar="SIZE", help="Memory to use at most, such as '6 GB'; by default what is free.")
 ]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Read and check everything, say what would be done, and stop.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of an earlier calibration.")]
 
 
@@ -75,11 +79,13 @@ def calibrate(
     expected_loss: ExpectedLoss = False,
     overwrite: Overwrite = False,
     max_memory: MaxMemory = None,
+    dry_run: DryRun = False,
 ) -> None:
     """Calibrate visibilities: solve for gains and foregrounds, write both and the residual.
 
-    Writes gains.calh5, model.uvh5, residual.uvh5, solution.json and a diagnostic figure. Exit status: 0 if every solve
-    converged, 3 if some did not, 2 if something given cannot be used.
+    Writes gains.calh5, model.uvh5, residual.uvh5, solution.json and a diagnostic figure, and warns of channels,
+    antennas and integrations that stand out. An interrupted calibration is resumed by the same command. Exit status: 0
+    if every solve converged, 3 if some did not, 2 if something given cannot be used.
     """
     from calstudy.base.resources import parse_memory
     from calstudy.observed.options import read_calibrator
@@ -100,7 +106,7 @@ def calibrate(
     calibrator = read_calibrator(settings_file, changes, defaults, overrides or [])
     budget = None if max_memory is None else parse_memory(max_memory)
     extras = [name for name, wanted in ((CALFITS, calfits), (EXPECTED, expected_loss)) if wanted]
-    request = _Request(data, sky_model, gains, select or [], output, budget, extras, overwrite)
+    request = _Request(data, sky_model, gains, select or [], output, budget, extras, overwrite, dry_run)
     sys.exit(_run(request, calibrator))
 
 
@@ -116,6 +122,12 @@ class _Request:
     budget: float | None
     extras: list[str]
     overwrite: bool
+    dry_run: bool
+
+    @property
+    def files(self) -> list[Path]:
+        """All input files."""
+        return [*self.paths, *(path for path in (self.sky_path, self.gains_path) if path is not None)]
 
 
 def _calibrator(redundant: bool, gains_only: bool) -> str | None:
@@ -139,23 +151,28 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
     if isinstance(calibrator, GainFit):
         load_tensorflow()
     from calstudy.observed.output import EXPECTED, describe, require_free, write_result
+    from calstudy.observed.pieces import Given, pieces_folder
     from calstudy.observed.selection import parse_selection
     from calstudy.products.files import quiet_libraries
 
     selection = parse_selection(request.selections)
+    if isinstance(calibrator, GainFit) and calibrator.weights.kind == "autos":
+        selection = replace(selection, autos=True)
     require_free(request.output, request.extras, request.overwrite)
     if EXPECTED in request.extras and not isinstance(calibrator, GainFit):
         raise InputError(f"--expected-loss: is known for fits by least squares, and {calibrator.label} is none")
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     started = time.perf_counter()
     with quiet_libraries():
-        data, sky, notes = _load(request.paths, request.sky_path, selection)
+        autos = isinstance(calibrator, GainFit) and calibrator.autos
+        data, sky, notes = _load(request.paths, request.sky_path, selection, autos)
         calibrator, plan = _plan(data, calibrator, sky is not None, notes, request.budget)
         for note in notes:
             console.print(note, markup=False)
         console.print(plan, markup=False)
-        result = _calibrate(data, sky, calibrator, request.gains_path, console)
-        context = {
+        if request.dry_run:
+            return 0
+        context: dict[str, Any] = {
             "data": [str(path) for path in request.paths],
             "sky_model": None if request.sky_path is None else str(request.sky_path),
             "gains": None if request.gains_path is None else str(request.gains_path),
@@ -164,18 +181,25 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
             "notes": notes,
             "plan": plan,
         }
+        settings = {name: context[name] for name in ("selection", "settings")}
+        folder = pieces_folder(request.output, request.files, settings)
+        result = _calibrate(Given(data, sky, _start(request.gains_path)), calibrator, folder, console)
+        context["quality"] = _qualities(data, result, console)
         expected = {}
         if EXPECTED in request.extras and isinstance(calibrator, GainFit):
             expected = _expected(data, sky, calibrator, result)
         figure, description = _figure(data, result, notes), describe(result, context)
         written = write_result(result, description, request.output, figure, request.extras, expected)
+        shutil.rmtree(folder, ignore_errors=True)
     console.print(f"{len(written)} files in {request.output}, {time.perf_counter() - started:.1f} s", markup=False)
     _tell_distance(result, console)
     return _verdict(result)
 
 
-def _load(paths: list[Path], sky_path: Path | None, selection: Any) -> tuple[UVData, UVData | None, list[str]]:
-    from calstudy.calibrate.sky_model import match_sky_model
+def _load(
+    paths: list[Path], sky_path: Path | None, selection: Any, autos: bool
+) -> tuple[UVData, UVData | None, list[str]]:
+    from calstudy.calibrate.sky_model import common_baselines
     from calstudy.observed.reading import prepare, read_visibilities
     from calstudy.observed.selection import Selection
 
@@ -183,7 +207,8 @@ def _load(paths: list[Path], sky_path: Path | None, selection: Any) -> tuple[UVD
     if sky_path is None:
         return data, None, notes
     sky, sky_notes = prepare(read_visibilities([sky_path]), Selection(polarizations=selection.polarizations))
-    return data, match_sky_model(sky, data), notes + [f"Sky model: {note}" for note in sky_notes]
+    sky, data, left_out = common_baselines(sky, data, autos)
+    return data, sky, notes + [f"Sky model: {note}" for note in sky_notes] + left_out
 
 
 def _plan(
@@ -219,9 +244,14 @@ def _plan(
     )
 
 
-def _calibrate(
-    data: UVData, sky: UVData | None, calibrator: Calibrator, gains_path: Path | None, console: Console
-) -> CalibrationResult:
+def _start(gains_path: Path | None) -> UVCal | None:
+    from calstudy.base.gains import read_gains
+
+    return None if gains_path is None else read_gains(gains_path, "--gains")
+
+
+def _calibrate(given: Given, calibrator: Calibrator, folder: Path, console: Console) -> CalibrationResult:
+    """Calibrate with a bar on a terminal, and with lines of text elsewhere."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -231,18 +261,53 @@ def _calibrate(
         TimeRemainingColumn,
     )
 
-    from calstudy.base.gains import read_gains
-    from calstudy.calibrate.execution import run_calibrator
+    from calstudy.observed.pieces import calibrate_in_pieces
 
-    start = None if gains_path is None else read_gains(gains_path, "--gains")
+    lines = _ProgressLines(console)
 
     def show(done: int, total: int) -> None:
         bar.update(task, completed=done, total=total)
+        if not console.is_terminal:
+            lines.tell(done, total)
 
     columns = (TextColumn("calibrating"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("calibrating", total=None)
-        return run_calibrator(calibrator, data, sky, start, show)
+        bar.update(task, completed=0, total=len(calibrator.solves(given.data.Ntimes)) * given.data.Npols)
+        return calibrate_in_pieces(calibrator, given, folder, show)
+
+
+class _ProgressLines:
+    """Says how far a calibration is, in a line of text at most every `SECONDS_BETWEEN_LINES`."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.started = self.told = time.perf_counter()
+        self.first: int | None = None
+
+    def tell(self, done: int, total: int) -> None:
+        """Print a line if it is time for one; the first call may be of solves that were done before."""
+        from calstudy.run.progress import duration
+
+        now = time.perf_counter()
+        if self.first is None:
+            self.first = done - 1
+        if now - self.told < SECONDS_BETWEEN_LINES or done >= total:
+            return
+        self.told = now
+        left = (now - self.started) * (total - done) / max(done - self.first, 1)
+        text = f"{done} of {total} solves, {duration(now - self.started)}, about {duration(left)} left"
+        self.console.print(text, markup=False)
+
+
+def _qualities(data: UVData, result: CalibrationResult, console: Console) -> list[dict[str, Any]]:
+    """Return what stands out, for each polarization, and warn of it."""
+    from calstudy.observed.quality import assess
+
+    found = [assess(data, result, index) for index in range(result.model.Npols)]
+    for warning in (sentence for quality in found for sentence in quality.warnings):
+        console.print(f"warning: {warning}", markup=False)
+    return [quality.described() for quality in found]
 
 
 def _figure(data: UVData, result: CalibrationResult, notes: list[str]) -> tuple[Any, dict[str, Any]]:

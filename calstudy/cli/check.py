@@ -153,11 +153,16 @@ def engine(
     Both are products in the store: what a run has made is not made again, and an interrupted check is resumed.
     """
     from calstudy.products.files import VISIBILITIES, read_visibilities, write_json
+    from calstudy.simulate.settings import ENGINES
     from calstudy.studies.components import make_component
     from calstudy.studies.study import Budget
     from calstudy.validation.engine_agreement import compare_simulations, draw_engine_agreement
 
     experiment = _load(file, scale, overrides)
+    try:
+        ENGINES.find(reference)
+    except InputError as error:
+        raise InputError(f"--reference {error}") from None
     other = _load(file, scale, [*(overrides or ()), f"simulation.engine={reference}", *(reference_set or ())])
     console = Console(soft_wrap=True, highlight=False)
     products = [

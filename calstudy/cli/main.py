@@ -1,10 +1,11 @@
-"""The command line: ``calstudy run | plan | calibrate | claims | report | regress | validate | data``.
+"""The command line: ``calstudy init | run | plan | calibrate | claims | report | regress | validate | data | ...``.
 
 Only light modules are imported here, so that ``calstudy --help`` answers at once.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 from pathlib import Path
@@ -21,12 +22,13 @@ from calstudy.cli.calibrate import calibrate
 from calstudy.cli.check import check_app
 from calstudy.cli.compare_gains import compare_gains
 from calstudy.cli.regress import regress
+from calstudy.cli.start import examples, init, schema
+from calstudy.cli.storage import runs, store
 from calstudy.cli.validate import validate
 
 app = typer.Typer(
     help="Simulation and validation studies of 21 cm interferometer calibration.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -37,6 +39,11 @@ app.command()(regress)
 app.command()(compare_gains)
 # Step -1 is an argument, not an option.
 app.command(context_settings={"ignore_unknown_options": True})(validate)
+app.command()(examples)
+app.command()(init)
+app.command()(schema)
+app.command()(runs)
+app.command()(store)
 app.add_typer(bench_app, name="bench")
 app.add_typer(check_app, name="check")
 
@@ -59,6 +66,11 @@ MaxMemory = Annotated[
     str | None,
     typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
 ]
+Output = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Where the run gets its folder: --set outputs.runs=FOLDER."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
 Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster instead.")]
 
 
@@ -83,6 +95,7 @@ def run(
     workers: Workers = None,
     max_memory: MaxMemory = None,
     scheduler: Scheduler = None,
+    output: Output = None,
 ) -> None:
     """Run an experiment or a collection: simulate, corrupt, calibrate, measure power spectra, draw figures.
 
@@ -93,7 +106,8 @@ def run(
     from calstudy.studies.study import Budget, run_study
 
     console = Console(soft_wrap=True, highlight=False)
-    study = load_study(file, scale, overrides or ())
+    changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
+    study = load_study(file, scale, changes)
     show_run(run_study(study, Budget(workers, max_memory, scheduler), console), console)
 
 
@@ -104,13 +118,18 @@ def plan(
     overrides: Set = None,
     workers: Workers = None,
     max_memory: MaxMemory = None,
+    as_json: AsJson = False,
 ) -> None:
     """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
     from calstudy.studies.load import load_study
-    from calstudy.studies.show import show_plan
+    from calstudy.studies.show import describe_plan, show_plan
     from calstudy.studies.study import Budget
 
-    show_plan(load_study(file, scale, overrides or ()), Budget(workers, max_memory), Console(highlight=False))
+    found = describe_plan(load_study(file, scale, overrides or ()), Budget(workers, max_memory))
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+    else:
+        show_plan(found, Console(highlight=False))
 
 
 @app.command()
@@ -119,6 +138,7 @@ def claims(
     paper: Annotated[
         list[str] | None, typer.Option(help="Name of a paper, or a file.py, in place of those that the run names.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare a finished run with published statements: the measured number, its threshold, PASS or FAIL.
 
@@ -126,9 +146,12 @@ def claims(
     and with another one claims-by-solver.json and claims-by-solver.md.
     """
     from calstudy.claims.folders import evaluate_folder
-    from calstudy.verdicts.tables import show_verdicts
+    from calstudy.verdicts.tables import show_verdicts, to_json
 
     console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or ())
+    if as_json:
+        typer.echo(to_json(evaluated.claims))
+        return
     if evaluated.claims:
         show_verdicts(evaluated.claims, evaluated.title, console)
     for sentence in evaluated.without_role:

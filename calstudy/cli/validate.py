@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,7 @@ def validate(
         list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field of all experiments.")
     ] = None,
     ladder: Annotated[Path | None, typer.Option(help="Folder of other steps than calstudy's own.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")] = False,
 ) -> None:
     """Run the validation ladder: experiments with criteria in numbers; PASS or FAIL, measured value, threshold, why.
 
@@ -30,12 +32,17 @@ def validate(
     from calstudy.validation.ladder import run_ladder
     from calstudy.validation.outcomes import show
     from calstudy.validation.steps import LADDER, load_ladder
+    from calstudy.verdicts.tables import as_json as verdicts_as_json
 
     chosen = load_ladder(steps or (), scale, overrides or (), LADDER if ladder is None else ladder)
     stores = dict.fromkeys(item.outputs.store for step in chosen for item in step.experiments.values())
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(soft_wrap=True, highlight=False, stderr=as_json)
     result = run_ladder(chosen, next(iter(stores), Path("store")), output, workers, console)
-    show(result.outcomes, scale, Console(highlight=False))
-    console.print(f"table: {result.folder / 'validation.md'}", markup=False)
+    if as_json:
+        found = {outcome.step.name: verdicts_as_json(outcome.verdicts) for outcome in result.outcomes}
+        typer.echo(json.dumps(found, indent=1))
+    else:
+        show(result.outcomes, scale, Console(highlight=False))
+        console.print(f"table: {result.folder / 'validation.md'}", markup=False)
     if not result.passed:
         raise typer.Exit(EXIT_FAILED)

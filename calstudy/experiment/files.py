@@ -44,8 +44,41 @@ _Loader.add_implicit_resolver(
     re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
     list("-+0123456789."),
 )
+OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
+def _whole_number(loader: _Loader, node: yaml.ScalarNode) -> int:
+    """Read a whole number; refuse what YAML 1.1 and a reader take for different numbers."""
+    text = str(node.value)
+    number = int(loader.construct_yaml_int(node))
+    if OCTAL.fullmatch(text):
+        hint = f"leave out the zero in front, or write {number} if that is meant"
+        raise yaml.MarkedYAMLError(
+            problem=f"{text} is an octal number in YAML, {number}; {hint}", problem_mark=node.start_mark
+        )
+    if ":" in text:
+        raise _base_60(node, number)
+    return number
+
+
+def _real_number(loader: _Loader, node: yaml.ScalarNode) -> float:
+    """Read a real number; refuse one to the base 60."""
+    number = float(loader.construct_yaml_float(node))
+    if ":" in str(node.value):
+        raise _base_60(node, number)
+    return number
+
+
+def _base_60(node: yaml.ScalarNode, number: float) -> yaml.MarkedYAMLError:
+    problem = f"{node.value} is a number to the base 60 in YAML, {number:g}; write a number with a unit, such as 6.4 h"
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
+_Loader.add_constructor("tag:yaml.org,2002:float", _real_number)
+
+
+KINDS_OF_YAML: dict[type, str] = {list: "a list", str: "a text", int: "a number", float: "a number", bool: "a word"}
 TAGS = {"solver": "name", "calibration": CALIBRATORS.tag}
 """What a bare string stands for, where a block may be written as one; elsewhere its `kind`."""
 UNKNOWN_TAG = re.compile(r"could not determine a constructor for the tag '(.*)'")
@@ -77,11 +110,14 @@ def read_mapping(path: Path) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder, not a file (YAML) of an experiment") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     data = parse_yaml(text, str(path))
     if not isinstance(data, dict):
-        raise InputError(f"{path}: must hold a block of keys such as 'name: quickstart', holds {type(data).__name__}")
+        held = "is empty" if data is None else f"holds {KINDS_OF_YAML.get(type(data), 'something else')}"
+        raise InputError(f"{path}: must hold a block of keys such as 'name: quickstart', and {held}")
     return data
 
 
@@ -187,6 +223,28 @@ def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
     for path, value in scales[scale].items():
         result = override(result, path, value)
     return result
+
+
+def _require_scales(data: Mapping[str, Any], base: Path) -> None:
+    """Raise ExperimentError if a scale that the file defines, asked for or not, sets what cannot be set."""
+    scales = data.get("scales")
+    if not isinstance(scales, dict):
+        return
+    faults: list[str] = []
+    try:
+        Experiment.model_validate(data, context={"folder": base})
+    except ValidationError:
+        return  # The faults of the file itself are told first.
+    for name in [name for name, changes in scales.items() if isinstance(changes, dict)]:
+        try:
+            changed = apply_scale(data, name)
+            Experiment.model_validate(changed, context={"folder": base})
+        except ValidationError as error:
+            faults += [f"scales.{name}: {sentence}" for sentence in sentences(error, Experiment, changed)]
+        except InputError as error:
+            faults.append(f"scales.{name}: {error}")
+    if faults:
+        raise ExperimentError(faults)
 
 
 def input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, BaseModel, str]]:
@@ -373,7 +431,9 @@ def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) ->
         If fields are unknown, missing, or hold values that are not allowed.
     """
     path = Path(path)
-    data = apply_scale(read_mapping(path), scale)
+    content = read_mapping(path)
+    _require_scales(content, path.resolve().parent)
+    data = apply_scale(content, scale)
     for text in overrides:
         data = override(data, *parse_override(text))
     return validate(data, path.resolve().parent)

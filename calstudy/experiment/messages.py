@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import types
 from collections.abc import Iterator
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -26,11 +27,14 @@ KINDS = {
     "int_parsing": "a whole number",
 }
 BOUNDS = {
-    "greater_than": "greater than {gt:g}{unit}",
-    "greater_than_equal": "at least {ge:g}{unit}",
-    "less_than": "less than {lt:g}{unit}",
-    "less_than_equal": "at most {le:g}{unit}",
+    "greater_than": ("greater than", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("less than", "lt"),
+    "less_than_equal": ("at most", "le"),
 }
+"""Words of a bound, and where its value is."""
+PREFIXED = ("Hz", "s", "m")
+PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "u", 1e-9: "n"}
 
 
 def _members(annotation: Any) -> list[Any]:
@@ -92,10 +96,19 @@ def _written(data: Any, path: str) -> str:
 
 
 def _unit(holder: type[BaseModel] | None, field: int | str) -> str:
-    """Return the unit in which a field's bounds are, with a space before it, or an empty string."""
+    """Return the unit in which a field's bounds are, or an empty string."""
     info = holder.model_fields.get(str(field)) if holder else None
     extra = info.json_schema_extra if info else None
-    return f" {extra['unit']}" if isinstance(extra, dict) and "unit" in extra else ""
+    return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
+
+
+def _bound(number: float, unit: str) -> str:
+    """Write a bound with its unit: 1e7 Hz as 10 MHz."""
+    largest = 1.0 if unit == "s" else math.inf
+    fitting = [factor for factor in PREFIXES if abs(number) >= factor and factor <= largest]
+    if unit not in PREFIXED or not fitting:
+        return f"{number:.10g} {unit}".strip()
+    return f"{number / fitting[0]:.10g} {PREFIXES[fitting[0]]}{unit}"
 
 
 def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:
@@ -115,6 +128,9 @@ def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:
     if kind == "union_tag_invalid":
         tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
         return f"{path}: {context['tag']!r} is not a choice{nearest(context['tag'], tags)} (allowed: {', '.join(tags)})"
+    if kind == "value_error":
+        field, colon, text = str(context["error"]).partition(": ")
+        return f"{path}.{field}: {text}" if colon and field.isidentifier() else f"{path}: {context['error']}"
     if kind in ("too_short", "too_long"):
         bound = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
         return f"{path}: must have {bound} item(s), has {context['actual_length']}"
@@ -126,9 +142,13 @@ def _wanted(error: Any, holder: type[BaseModel] | None) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind == "literal_error":
         allowed = [word.strip(" '") for word in context["expected"].replace(" or ", ", ").split(",")]
+        if str(error["input"]) in allowed:
+            what, how = ("a text", "without") if isinstance(error["input"], str) else ("a number", "in")
+            return f"is {what}; write it {how} quotes (allowed: {', '.join(allowed)})"
         return f"not a choice{nearest(error['input'], allowed)} (allowed: {', '.join(allowed)})"
     if kind in BOUNDS:
-        return f"must be {BOUNDS[kind].format(unit=_unit(holder, error['loc'][-1]), **context)}"
+        words, key = BOUNDS[kind]
+        return f"must be {words} {_bound(context[key], _unit(holder, error['loc'][-1]))}"
     if kind in KINDS:
         return f"must be {KINDS[kind]}"
     if kind == "string_pattern_mismatch":
@@ -136,8 +156,16 @@ def _wanted(error: Any, holder: type[BaseModel] | None) -> str:
     return str(error["msg"])
 
 
+def _is_inside(location: tuple[int | str, ...], above: tuple[int | str, ...]) -> bool:
+    return len(location) > len(above) and location[: len(above)] == above
+
+
 def _all(error: ValidationError, root: type[BaseModel], data: Any, prefix: str) -> Iterator[str]:
-    for item in error.errors():
+    found = error.errors()
+    for item in found:
+        # A list is too short for pydantic if one of its items is wrong, which has a sentence of its own.
+        if item["type"] == "too_short" and any(_is_inside(other["loc"], item["loc"]) for other in found):
+            continue
         if item["type"] == NESTED:
             path, context = f"{prefix}{_locate(root, item['loc'])[0]}.", item["ctx"]
             yield from _all(context["error"], context["model"], context["content"], path)

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, cast
 
-from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
@@ -28,6 +28,7 @@ PAPERS: Registry[Any] = Registry("paper", "calstudy.papers", "calstudy.claims.pa
 DEFAULT_FIGURES = ("layout", "gains", "model", "data", "baselines", "wedge", "spherical", "signal-loss")
 
 FIGURE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+STUDY_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
@@ -156,10 +157,19 @@ class RealizationBlock(Section):
         return self
 
 
+def _usable_name(text: str) -> str:
+    if not STUDY_NAME.fullmatch(text):
+        raise fault("", f"{text!r} cannot name a folder: use at most 64 letters, digits, '_', '.', '-'; no blank")
+    return text
+
+
+StudyName = Annotated[str, AfterValidator(_usable_name), Field(description="Names the run folder.")]
+
+
 class Experiment(Section):
     """One study: an instrument, a sky, what corrupts the data, the calibration under test, and what is measured."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", description="Names the run folder.")
+    name: StudyName
     description: str = ""
     instrument: InstrumentSettings = InstrumentSettings()
     sky: SkySettings = SkySettings()
@@ -176,12 +186,20 @@ class Experiment(Section):
         description="Published papers whose statements the run is compared with, such as [calamity2022]; none by "
         "default.",
     )
-    sweep: Annotated[tuple[SweepBlock, ...], Field(strict=False), BeforeValidator(_as_list)] = Field(
+    sweep: Annotated[
+        tuple[SweepBlock, ...],
+        Field(strict=False),
+        BeforeValidator(_as_list, json_schema_input_type=SweepBlock | tuple[SweepBlock, ...]),
+    ] = Field(
         (),
         description="Fields to vary (dotted path: list of values; several fields: all combinations), or a list of such "
         "blocks; a run makes every point and compares their signal loss.",
     )
-    realizations: Annotated[tuple[RealizationBlock, ...], Field(strict=False), BeforeValidator(_as_list)] = Field(
+    realizations: Annotated[
+        tuple[RealizationBlock, ...],
+        Field(strict=False),
+        BeforeValidator(_as_list, json_schema_input_type=RealizationBlock | tuple[RealizationBlock, ...]),
+    ] = Field(
         (),
         description="Draw the EoR, the gains or the noise several times, and pool what is measured: a block, or a list "
         "of blocks that draw different things.",
@@ -246,6 +264,17 @@ class Experiment(Section):
                 )
             if self.corruption.noise.kind == "times-foregrounds":
                 raise fault("corruption.noise", "is relative to foregrounds, but sky.foregrounds is 'none'")
+        return self
+
+    @model_validator(mode="after")
+    def _solves_fit_in_the_run(self) -> Experiment:
+        together, count = self.calibration.integrations_per_solve, self.instrument.times.count
+        if together > count and any(variant.calibrate for variant in self.variants.values()):
+            raise fault(
+                "calibration.integrations_per_solve",
+                f"{together} integrations cannot be solved together, for instrument.times.count is {count}; use at "
+                f"most {count}",
+            )
         return self
 
     @model_validator(mode="after")

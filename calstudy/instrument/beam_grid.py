@@ -52,7 +52,8 @@ def _read(path: Path, modified: int) -> UVBeam:
         warnings.simplefilter("ignore")
         try:
             beam = UVBeam.from_file(path, file_type="beamfits")
-        except (OSError, KeyError, ValueError) as error:
+        # A damaged file makes the reader raise whatever its libraries do.
+        except (OSError, KeyError, ValueError, IndexError, TypeError, AttributeError, NotImplementedError) as error:
             raise InputError(f"instrument.beam.path: {path} cannot be read as beamfits ({error})") from error
     feeds = _feeds(beam)
     described = f"it contains a {beam.beam_type} beam of feeds {', '.join(feeds)} on {beam.pixel_coordinate_system}"

@@ -17,10 +17,10 @@ from pyuvdata.uvbeam.mwa_beam import MWABeam
 from calstudy.base.errors import InputError
 from calstudy.instrument.as_built import FEEDS
 from calstudy.instrument.beam_file import find_beam
+from calstudy.instrument.beam_frequencies import fit_range
 from calstudy.instrument.tabulated import (
     PIXELS_PER_DEGREE,
     TabulatedBeam,
-    fit_range,
     read_mwa_embedded_element,
     tabulate,
     zenith_normalized,

@@ -89,6 +89,18 @@ class BeamModel(Plugin, ABC):
         """
         raise NotImplementedError(f"the beam {self.label} has no dipoles")
 
+    def require_usable(self, channels: Channels) -> None:
+        """Raise InputError if `make` would, as far as can be said in a second or two: before anything is simulated.
+
+        A beam that needs no file, or is made at once, need not do anything here.
+
+        Parameters
+        ----------
+        channels
+            As for `make`.
+        """
+        del channels
+
     @abstractmethod
     def make(self, channels: Channels) -> Beam:
         """Return the beam.

@@ -13,6 +13,9 @@ from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
 from calstudy.instrument.as_built import AsBuilt
 
+# s.
+LONGEST = 86_400.0
+
 
 class Site(Section):
     """A known site. By default HERA's own arrays are at its site, and all other layouts at the MWA's."""
@@ -56,7 +59,7 @@ class NamedLayout(ArrayLayout):
     def _enough_antennas(self) -> Self:
         size = self.sizes[self.kind]
         if self.count is not None and self.count > size:
-            raise ValueError(f"count = {self.count} is more than the {size} antennas of {self.kind}")
+            raise fault("count", f"{self.count} is more than the {size} antennas of {self.kind}")
         return self
 
 
@@ -108,32 +111,32 @@ class HexLayout(ArrayLayout):
     """A filled regular hexagon, flat."""
 
     kind: Literal["hex"]
-    side: int = Field(4, ge=2, description="Antennas along one side; 4 gives 37 antennas.")
-    spacing: Length = Field(14.0, gt=0, description="Distance between neighbours.")
+    side: int = Field(4, ge=2, le=26, description="Antennas along one side; 4 gives 37 antennas.")
+    spacing: Length = Field(14.0, ge=0.01, description="Distance between neighbours.")
 
 
 class LinearLayout(ArrayLayout):
     """An east-west line of equally spaced antennas (paper Fig. MAXBL_RUNTIME)."""
 
     kind: Literal["linear"]
-    count: int = Field(10, ge=2)
-    spacing: Length = Field(14.0, gt=0)
+    count: int = Field(10, ge=2, le=2000)
+    spacing: Length = Field(14.0, ge=0.01)
 
 
 class RectangularLayout(ArrayLayout):
     """Rows of eight antennas, spread so that the longest baseline is `max_baseline` (paper Fig. ANTPOS_RUNTIME)."""
 
     kind: Literal["rectangular"]
-    count: int = Field(16, ge=9, description="Number of antennas; at least nine, so that there are two rows.")
-    spacing: Length = Field(2.0, gt=0, description="Distance between neighbours in a row.")
+    count: int = Field(16, ge=9, le=2000, description="Number of antennas; at least nine, so that there are two rows.")
+    spacing: Length = Field(2.0, ge=0.01, description="Distance between neighbours in a row.")
     max_baseline: Length = Field(100.0, gt=0)
 
     @model_validator(mode="after")
     def _rows_fit(self) -> RectangularLayout:
         if self.max_baseline <= 7 * self.spacing:
-            raise ValueError(
-                f"max_baseline = {self.max_baseline:g} m must exceed the length of a row, 7 x spacing = "
-                f"{7 * self.spacing:g} m"
+            raise fault(
+                "max_baseline",
+                f"{self.max_baseline:g} m must exceed the length of a row, 7 x spacing = {7 * self.spacing:g} m",
             )
         return self
 
@@ -143,7 +146,7 @@ class GolombLayout(ArrayLayout):
 
     kind: Literal["golomb"]
     count: int = Field(8, ge=2, le=12, description="Number of antennas (marks of the ruler).")
-    spacing: Length = Field(4.0, gt=0, description="Length of one unit of the ruler.")
+    spacing: Length = Field(4.0, ge=0.01, description="Length of one unit of the ruler.")
 
 
 class CsvLayout(ArrayLayout):
@@ -180,9 +183,9 @@ class AntennaBeam(Section):
 class Channels(Section):
     """Equally spaced channel centres; the default is the paper's (384 x 80 kHz from 167.075 MHz)."""
 
-    first: Frequency = Field(167.075e6, gt=0, description="Centre of the first channel.")
-    width: Frequency = Field(80e3, gt=0)
-    count: int = Field(384, ge=8)
+    first: Frequency = Field(167.075e6, ge=10e6, description="Centre of the first channel.")
+    width: Frequency = Field(80e3, ge=100.0, le=10e6, description="Width of a channel, and distance to the next.")
+    count: int = Field(384, ge=8, le=65_536)
 
     @property
     def band(self) -> tuple[float, float]:
@@ -196,8 +199,18 @@ class Times(Section):
     start_lst: HourAngle = Field(
         1.8, ge=0, lt=24, description="Local sidereal time at the centre of the first integration."
     )
-    integration: Time = Field(2.0, gt=0)
-    count: int = Field(56, ge=1)
+    integration: Time = Field(2.0, ge=1e-3, le=3600.0, description="Duration of one, and distance to the next.")
+    count: int = Field(56, ge=1, le=100_000)
+
+    @model_validator(mode="after")
+    def _end_within_a_day(self) -> Times:
+        duration = self.integration * self.count
+        if duration > LONGEST:
+            raise fault(
+                "",
+                f"{self.count} integrations of {self.integration:g} s are {duration / 3600:.4g} h; a day is the most",
+            )
+        return self
 
 
 class InstrumentSettings(Section):

@@ -12,16 +12,11 @@ from scipy.interpolate import interp1d
 
 from calstudy.base.errors import InputError
 from calstudy.instrument.beam_file import find_beam
+from calstudy.instrument.beam_frequencies import FIT_BAND, choose_frequencies, fit_range, megahertz
 
 PIXELS_PER_DEGREE = 1
 
-# The tabulated MWA beam scatters from frequency to frequency by 2.4e-5 rms of the zenith value. A polynomial of order 8
-# over 36 MHz is the lowest that leaves no more than that; a higher one would follow the scatter. Narrower observations
-# keep the 36 MHz, so that the beam is as well determined and does not depend on how many channels are simulated.
-FIT_BAND = 36e6
 FIT_ORDER = 8
-FIT_MARGIN = 2.56e6
-POINTS_NEEDED = {"chebyshev": 1, "cubic": 4, "linear": 2, "nearest": 1}
 
 
 def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> UVBeam:
@@ -53,13 +48,6 @@ def _read_mwa(path: Path, low: float, high: float) -> UVBeam:
         raise InputError(f"instrument.beam.path: {path} cannot be read as an MWA beam file ({error})") from error
 
 
-def fit_range(band: tuple[float, float]) -> tuple[float, float]:
-    """Return the lowest and highest frequency (Hz) from which a beam is interpolated in a band."""
-    low, high = band[0] - FIT_MARGIN, band[1] + FIT_MARGIN
-    missing = max(0.0, FIT_BAND - (high - low))
-    return low - missing / 2, high + missing / 2
-
-
 class TabulatedBeam:
     """Jones components on a grid of directions, as continuous functions of frequency.
 
@@ -85,22 +73,8 @@ class TabulatedBeam:
     """
 
     def __init__(self, table: UVBeam, band: tuple[float, float], interpolation: str) -> None:
-        available, (low, high) = table.freq_array, fit_range(band)
-        # A coarse table may have its next frequency beyond the range.
-        start = min(np.searchsorted(available, low), np.searchsorted(available, band[0], side="right") - 1)
-        stop = max(np.searchsorted(available, high, side="right"), np.searchsorted(available, band[1]) + 1)
-        chosen = slice(max(start, 0), stop)
-        tabulated = available[chosen]
-        if start < 0 or stop > len(available):
-            raise InputError(
-                f"instrument.channels: {_megahertz(*band)} is not within the beam file's "
-                f"{_megahertz(table.freq_array[0], table.freq_array[-1])}"
-            )
-        if len(tabulated) < POINTS_NEEDED[interpolation]:
-            raise InputError(
-                f"instrument.beam.interpolation: {interpolation} needs {POINTS_NEEDED[interpolation]} tabulated "
-                f"frequencies near the channels, the beam file has {len(tabulated)}"
-            )
+        chosen = choose_frequencies(table.freq_array, band, interpolation)
+        tabulated = table.freq_array[chosen]
         self.zenith_angles = table.axis2_array
         self.template = table
         self._band = (float(tabulated[0]), float(tabulated[-1]))
@@ -118,8 +92,8 @@ class TabulatedBeam:
         low, high = self._band
         if frequencies.min() < low or frequencies.max() > high:
             raise InputError(
-                f"frequencies {_megahertz(frequencies.min(), frequencies.max())} are outside the band for which the "
-                f"beam was made, {_megahertz(low, high)}"
+                f"frequencies {megahertz(frequencies.min(), frequencies.max())} are outside the band for which the "
+                f"beam was made, {megahertz(low, high)}"
             )
         return frequencies
 
@@ -163,10 +137,6 @@ def tabulate(template: UVBeam, jones: np.ndarray, frequencies: np.ndarray) -> UV
         data_array=np.ascontiguousarray(jones),
         history=template.history,
     )
-
-
-def _megahertz(low: float, high: float) -> str:
-    return f"{low / 1e6:g} to {high / 1e6:g} MHz"
 
 
 def zenith_normalized(jones: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cub
 from calstudy.calibrate.basis import channel_grid
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.observed.diagnostics_figure import MAX_ANTENNAS, Diagnostics, delay_rms
+from calstudy.observed.quality import assess
 
 
 def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> Diagnostics:
@@ -38,6 +39,7 @@ def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> 
     antennas, gains = _shown_gains(result, polarization)
     number = int(model.polarization_array[polarization])
     records = [record for record in result.solutions if record.polarization == number]
+    quality = assess(data, result, polarization)
     return Diagnostics(
         polarization=model.get_pols()[polarization],
         unit=model.vis_units,
@@ -50,6 +52,10 @@ def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> 
         antennas=antennas,
         gains=gains,
         losses=tuple(record.loss_history / record.loss_history[0] for record in records if record.loss_history.size),
+        chi2_antennas=quality.antennas,
+        chi2_by_antenna=quality.chi2_by_antenna,
+        chi2_by_channel=quality.chi2_by_channel,
+        chi2_by_integration=quality.chi2_by_integration,
         converged=np.array([record.status == "converged" for record in records if record.loss_history.size]),
     )
 
@@ -65,4 +71,5 @@ def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarr
     values = np.where(flags[used], np.nan, gains.gain_array[used, :, :, polarization])
     times = np.flatnonzero(~flags.all(axis=(0, 1)))
     middle = times[times.size // 2] if times.size else 0
-    return gains.ant_array[used].astype(str), values[:, :, middle]
+    names = dict(zip(gains.telescope.antenna_numbers.tolist(), gains.telescope.antenna_names, strict=True))
+    return np.array([str(names[int(number)]) for number in gains.ant_array[used]]), values[:, :, middle]

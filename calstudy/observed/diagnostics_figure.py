@@ -16,6 +16,8 @@ from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
 
 NOTE_CHARACTERS = 150
+MAX_NAMES = 20
+LINEAR_RANGE = 5.0
 MAX_ANTENNAS = 8
 """Gains are drawn of at most so many antennas; more would be a tangle."""
 
@@ -46,6 +48,10 @@ class Diagnostics:
         Loss after each step over the first loss of its own solve, one array for each solve.
     converged
         Whether each solve did, (Nsolves,).
+    chi2_antennas
+        Names of all calibrated antennas, (Nants,).
+    chi2_by_antenna, chi2_by_channel, chi2_by_integration
+        As in `calstudy.observed.quality.Quality`.
     """
 
     polarization: str
@@ -60,6 +66,10 @@ class Diagnostics:
     gains: np.ndarray
     losses: tuple[np.ndarray, ...]
     converged: np.ndarray
+    chi2_antennas: np.ndarray
+    chi2_by_antenna: np.ndarray
+    chi2_by_channel: np.ndarray
+    chi2_by_integration: np.ndarray
 
 
 def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.ndarray:
@@ -89,13 +99,13 @@ def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.nd
 
 @style.journal_style()
 def draw_diagnostics(found: Diagnostics, notes: Sequence[str] = ()) -> Figure:
-    """Draw three rows: delay spectra by baseline length, their mean and convergence, and the gains.
+    """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 
     The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
     samples count as zero, which spreads over all delays.
     """
-    figure = style.new_figure(style.TWO_COLUMNS, 6.6)
-    grid = figure.subplot_mosaic([list("dddmmmrrr"), list("pppppllll"), list("aaaaaffff")])
+    figure = style.new_figure(style.TWO_COLUMNS, 8.4)
+    grid = figure.subplot_mosaic([list("dddmmmrrr"), list("pppppllll"), list("aaaaaffff"), list("xxxyyyzzz")])
     _draw_images(figure, [grid[key] for key in "dmr"], found)
     _draw_profile(grid["p"], found)
     _draw_convergence(grid["l"], found)
@@ -104,6 +114,8 @@ def draw_diagnostics(found: Diagnostics, notes: Sequence[str] = ()) -> Figure:
             grid[key].plot(found.frequency / 1e6, row, linewidth=0.7, label=str(name))
         grid[key].set(xlabel=style.FREQUENCY, ylabel=label)
         grid[key].margins(x=0)
+    _make_logarithmic(grid["a"], np.abs(found.gains))
+    _draw_chi2([grid[key] for key in "xyz"], found)
     grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, title="antenna", title_fontsize=style.SMALL_SIZE)
     if notes:
         lines = [line for note in notes for line in textwrap.wrap(note, width=NOTE_CHARACTERS)]
@@ -146,7 +158,30 @@ def _draw_profile(axes: Axes, found: Diagnostics) -> None:
     visible = found.data.max() > 0
     axes.set(xlabel=style.DELAY, ylabel=f"rms over baselines ({found.unit})", yscale="log" if visible else "linear")
     axes.margins(x=0)
-    axes.legend(loc="upper right")
+    axes.legend(loc="best")
+
+
+def _make_logarithmic(axes: Axes, values: np.ndarray) -> None:
+    """Make the vertical axis logarithmic if values differ by more than a factor of `LINEAR_RANGE`."""
+    positive = values[np.isfinite(values) & (values > 0)]
+    if positive.size and positive.max() > LINEAR_RANGE * positive.min():
+        axes.set_yscale("log")
+
+
+def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
+    antennas = np.arange(found.chi2_antennas.size)
+    integrations = np.arange(found.chi2_by_integration.size)
+    for axes, places, values, label in (
+        (panels[0], antennas, found.chi2_by_antenna, "antenna"),
+        (panels[1], found.frequency / 1e6, found.chi2_by_channel, style.FREQUENCY),
+        (panels[2], integrations, found.chi2_by_integration, "integration"),
+    ):
+        axes.plot(places, values, color=style.BLUE, linewidth=0.7, marker=".", markersize=2)
+        axes.set(xlabel=label, ylabel=r"mean $\chi^2$")
+        _make_logarithmic(axes, values)
+    shown = np.unique(np.linspace(0, antennas.size - 1, min(antennas.size, MAX_NAMES)).astype(int))
+    panels[0].set_xticks(shown, found.chi2_antennas[shown], rotation=90, fontsize=style.SMALL_SIZE - 1)
+    panels[2].xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _draw_convergence(axes: Axes, found: Diagnostics) -> None:

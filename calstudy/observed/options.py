@@ -37,7 +37,8 @@ def read_calibrator(
     InputError
         If the file cannot be read, there is no such calibrator, or a field holds what is not allowed.
     """
-    typed = [parse_override(text) for text in overrides]
+    # As in an experiment file, whose fields of the section have this in front.
+    typed = [(field.removeprefix("calibration."), value) for field, value in map(parse_override, overrides)]
     asked = [(field, value) for field, value in changes.items() if value is not None]
     try:
         found, _ = CALIBRATORS.class_of(_changed(path, [*asked, *typed]), DEFAULT, None)

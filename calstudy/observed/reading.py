@@ -23,6 +23,8 @@ logger = logging.getLogger(__name__)
 
 # With fewer of its samples present, a data set has no common times and baselines worth speaking of.
 MIN_PRESENT = 0.5
+# Hz. Those of radio telescopes; others are in another unit, or damaged.
+LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e6, 1e12
 EVERYTHING = Selection()
 
 
@@ -47,7 +49,35 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
         raise InputError(f"{', '.join(names)}: holds no visibilities")
     if not np.isfinite(data.telescope.antenna_positions).all():
         raise InputError(f"{', '.join(names)}: antenna positions are not finite")
+    _require_plausible(data, ", ".join(names))
     return data
+
+
+def _require_plausible(data: UVData, names: str) -> None:
+    """Raise InputError unless frequencies, channel widths, times and durations can be meant."""
+    frequencies, widths = np.ravel(data.freq_array), np.ravel(data.channel_width)
+    if not np.isfinite(frequencies).all():
+        count = np.sum(~np.isfinite(frequencies))
+        raise InputError(f"{names}: {count} of {frequencies.size} frequencies are not finite (NaN or infinite)")
+    if frequencies.min() < LOWEST_FREQUENCY or frequencies.max() > HIGHEST_FREQUENCY:
+        hint = " (they look like MHz)" if frequencies.min() > 1 and frequencies.max() < 1e4 else ""
+        raise InputError(
+            f"{names}: frequencies of {frequencies.min():g} to {frequencies.max():g} Hz{hint}; between "
+            f"{LOWEST_FREQUENCY:g} and {HIGHEST_FREQUENCY:g} Hz are allowed"
+        )
+    values, counts = np.unique(frequencies, return_counts=True)
+    if data.flex_spw_id_array is None or data.Nspws == 1:
+        for value in values[counts > 1][:1]:
+            raise InputError(f"{names}: the frequency {value / 1e6:g} MHz occurs {counts.max()} times; once is allowed")
+    if not np.isfinite(widths).all() or (widths == 0).any():
+        raise InputError(f"{names}: channel widths of {widths.min():g} to {widths.max():g} Hz; they must not be zero")
+    if not np.isfinite(data.time_array).all():
+        raise InputError(f"{names}: times are not finite (NaN or infinite); Julian dates are needed")
+    durations = np.asarray(data.integration_time)
+    if not np.isfinite(durations).all() or durations.min() <= 0:
+        raise InputError(
+            f"{names}: integration times of {durations.min():g} to {durations.max():g} s; they must be positive"
+        )
 
 
 def _first_sentence(error: Exception) -> str:

@@ -41,6 +41,8 @@ class Selection:
         Channel centres in Hz.
     polarizations
         Names such as ``xx`` or ``ee``.
+    autos
+        Whether a selection of lengths keeps the autocorrelations of the antennas that are left.
     """
 
     antennas: tuple[str, ...] | None = None
@@ -48,6 +50,7 @@ class Selection:
     times: tuple[int | None, int | None] | None = None
     frequencies: tuple[float | None, float | None] | None = None
     polarizations: tuple[str, ...] | None = None
+    autos: bool = False
 
 
 def parse_selection(texts: Sequence[str]) -> Selection:
@@ -115,7 +118,7 @@ def select(data: UVData, selection: Selection) -> UVData:
         chosen["polarizations"] = [_polarization(data, name) for name in selection.polarizations]
     lengths = chosen.pop("bl_lengths", None)
     if lengths is not None:
-        chosen["blt_inds"] = np.flatnonzero(_of_length(data, lengths))
+        chosen["blt_inds"] = np.flatnonzero(_of_length(data, lengths, selection.autos))
     if not chosen:
         return data
     try:
@@ -132,12 +135,19 @@ def _within(values: np.ndarray, ends: tuple[Any, Any], key: str, what: str) -> n
     return inside
 
 
-def _of_length(data: UVData, ends: tuple[float | None, float | None]) -> np.ndarray:
-    """Return which samples belong to baselines of these lengths; autocorrelations have length zero."""
+def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: bool) -> np.ndarray:
+    """Return which samples belong to baselines of these lengths; autocorrelations have length zero.
+
+    With `autos` those of the antennas of these baselines are kept, too.
+    """
     positions = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     pairs = zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True)
     lengths = np.array([np.linalg.norm(positions[b] - positions[a]) for a, b in pairs])
-    return _within(lengths, ends, "lengths", "baselines (m)")
+    chosen = _within(lengths, ends, "lengths", "baselines (m)")
+    if autos:
+        left = np.union1d(data.ant_1_array[chosen], data.ant_2_array[chosen])
+        chosen |= (data.ant_1_array == data.ant_2_array) & np.isin(data.ant_1_array, left)
+    return chosen
 
 
 def _antenna(data: UVData, name: str) -> int:
@@ -159,6 +169,9 @@ def _polarization(data: UVData, name: str) -> int:
         numbers[polnum2str(int(number)).lower()] = int(number)
     for shown, number in zip(data.get_pols(), list(data.polarization_array), strict=True):
         numbers[shown.lower()] = int(number)
+    if data.telescope.feed_array is None:
+        # Old files do not tell the orientation of their feeds; x is taken to be east, as when they are calibrated.
+        numbers |= {east: numbers[x] for east, x in (("ee", "xx"), ("nn", "yy")) if x in numbers}
     if name.lower() not in numbers:
         raise InputError(
             f"--select polarizations: {name!r} is not in the data, which have {', '.join(data.get_pols())}"

@@ -7,23 +7,32 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, SerializeAsAny, model_validator
 
 from calstudy.base.plugins import Plugin, Registry
-from calstudy.base.schema import Section
+from calstudy.base.schema import Section, fault
 from calstudy.base.units import Delay, Length, Wavenumber
 
 ESTIMATORS: Registry[Any] = Registry("estimator", "calstudy.power.estimators", "calstudy.power.interface:Estimator")
+
+MOST_BINS = 10_000
 
 
 class KBins(Section):
     """Equal spherical bins in |k|."""
 
     min: Wavenumber = Field(0.0, ge=0)
-    max: Wavenumber = Field(3.4, gt=0)
-    width: Wavenumber = Field(0.04, gt=0)
+    max: Wavenumber = Field(3.4, gt=0, le=1000)
+    width: Wavenumber = Field(0.04, gt=0, description="At most 10000 bins may result.")
 
     @model_validator(mode="after")
     def _ascend(self) -> Self:
         if self.max <= self.min:
-            raise ValueError(f"max ({self.max} h/Mpc) must be larger than min ({self.min} h/Mpc)")
+            raise fault("max", f"{self.max:g} h/Mpc must be larger than min, {self.min:g} h/Mpc")
+        span = self.max - self.min
+        if span / self.width > MOST_BINS:
+            raise fault(
+                "width",
+                f"{self.width:g} h/Mpc makes {span / self.width:.3g} bins, and at most {MOST_BINS} are allowed; use "
+                f"{span / MOST_BINS:.2g} h/Mpc or more",
+            )
         return self
 
 
@@ -44,7 +53,7 @@ class PowerSettings(Section):
         1.0, gt=0, description="Baselines whose vectors differ by less than this are in one group."
     )
     wedge_buffer: Delay = Field(100e-9, ge=0, description="Modes with |delay| <= |b|/c + buffer are in the wedge.")
-    length_bin: Length = Field(4.0, gt=0, description="Width of the cylindrical (wedge) bins in baseline length.")
+    length_bin: Length = Field(4.0, ge=0.01, description="Width of the cylindrical (wedge) bins in baseline length.")
     bins: KBins = KBins()
     cosmology: Literal["Planck15", "Planck18", "WMAP9"] = Field(
         "Planck15",

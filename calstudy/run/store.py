@@ -54,6 +54,23 @@ def _inside(name: str) -> bool:
     return not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
 
+def require_writable(folder: Path, field: str) -> None:
+    """Raise InputError if a folder cannot be written, or made, as far as can be seen without trying.
+
+    Parameters
+    ----------
+    folder
+        Need not exist.
+    field
+        Of the experiment file, for the message.
+    """
+    found = next(path for path in (folder, *folder.parents) if path.exists())
+    if not found.is_dir():
+        raise InputError(f"{field} = {str(folder)!r}: cannot be written ({found} is a file; a folder is needed)")
+    if not os.access(found, os.W_OK | os.X_OK):
+        raise InputError(f"{field} = {str(folder)!r}: cannot be written ({found} is read-only, or another user's)")
+
+
 class Store:
     """A folder of products that several runs, on several machines, may use at once.
 

@@ -11,6 +11,8 @@ from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
 
 VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
+BRIGHTEST_SOURCE = 197.0
+"""Jy at 200 MHz, rounded down: of the G4Jy components. A higher limit keeps nothing."""
 
 
 class CatalogueErrors(Section):
@@ -37,7 +39,7 @@ class CatalogueErrors(Section):
 class PointSources(Section):
     """Fields that all catalogues of point sources have."""
 
-    flux_limit: FluxDensity = Field(0.05, ge=0, description="Keep sources brighter than this.")
+    flux_limit: FluxDensity = Field(0.05, ge=0, le=1e5, description="Keep sources brighter than this.")
     spectrum: Literal["flat", "catalogue"] = Field(
         "flat", description="The same flux in all channels, as in the paper, or the spectral indices of the catalogue."
     )
@@ -59,7 +61,10 @@ class SyntheticSources(PointSources):
 
     kind: Literal["g4jy-and-counts"] = "g4jy-and-counts"
     flux_limit: FluxDensity = Field(
-        0.05, ge=0.001, description="Keep sources brighter than this; the counts are measured down to 1 mJy."
+        0.05,
+        ge=0.001,
+        le=BRIGHTEST_SOURCE,
+        description="Keep sources brighter than this; the counts are measured down to 1 mJy.",
     )
     seed: int = Field(1, ge=0, description="Seed of the positions and fluxes of the synthetic sources.")
     index_scatter: float = Field(
@@ -131,7 +136,7 @@ class CodeSources(Section):
 
     kind: Literal["code"]
     path: Path = Field(strict=False, description="Python file; a relative path starts at the experiment file.")
-    function: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="Name of the function in it.")
+    function: str = Field(description="Name of the function in it.")
     options: dict[str, Any] = Field(default_factory=dict, description="Given to the function as keyword arguments.")
 
 
@@ -198,6 +203,12 @@ class Eor(Section):
     pivot_k: float = Field(0.1, gt=0, description="Pivot of the power law, in 1/Mpc (no h).")
     nside: Literal[16, 32, 64, 128, 256] = Field(256, description="HEALPix resolution.")
     seed: int = Field(2, ge=0)
+
+    @model_validator(mode="after")
+    def _index_is_used(self) -> Eor:
+        if self.index and self.spectrum == "flat":
+            raise fault("index", f"{self.index:g} has no effect with spectrum: flat; use spectrum: power-law")
+        return self
 
 
 class SkySettings(Section):

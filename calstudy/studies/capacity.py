@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from calstudy.base import ranks
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
-from calstudy.base.resources import LIBRARIES_MEMORY, cores, free_memory, parse_memory
+from calstudy.base.resources import LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
 from calstudy.experiment.model import Experiment
 from calstudy.products.calibration import CALIBRATE_CHUNK
 from calstudy.products.simulation import SIMULATE_CHUNK
@@ -15,6 +15,8 @@ from calstudy.run.store import Store
 from calstudy.run.task import Stage, Task
 from calstudy.studies.study import Budget
 
+WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
+"""More workers than cores wait for each other; more than this is a slip."""
 Targets = Callable[[Experiment], Sequence[Task]]
 """Which products of an experiment are wanted."""
 
@@ -48,6 +50,12 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
         cannot help; before anything has started.
     """
     workers, scheduler = budget.workers, budget.scheduler
+    most = max(LEAST_LIMIT, WORKERS_PER_CORE * cores())
+    if scheduler is None and workers is not None and workers > most:
+        raise InputError(
+            f"--workers {workers}: at most {most} are allowed on this machine, which has {cores()} processor core(s); "
+            "leave it out for one per core"
+        )
     if ranks.count() > 1:
         _require_sharing(experiment, workers, scheduler)
     if scheduler is not None:
@@ -72,10 +80,10 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
 
 def _require_room(largest: Task, need: float, budget: float, source: str) -> None:
     if need > budget:
+        more = "give it more with --max-memory, or " if need < total_memory() else ""
         raise InputError(
             f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
-            f"needs about {need / 1e9:.1f} GB; give it more with --max-memory, or use fewer antennas, channels, "
-            "integrations or sources"
+            f"needs about {need / 1e9:.1f} GB; {more}use fewer antennas, channels, integrations or sources"
         )
 
 

@@ -18,7 +18,7 @@ from calstudy.claims.paper import distinct_papers, unique_notes
 from calstudy.claims.product import combined_claims
 from calstudy.experiment.files import apply_scale, override, parse_override, read_mapping, validate
 from calstudy.experiment.messages import sentences
-from calstudy.experiment.model import FIGURES, Experiment, Outputs
+from calstudy.experiment.model import FIGURES, Experiment, Outputs, StudyName
 from calstudy.experiment.realizations import expand_realizations
 from calstudy.figures import ComparisonFigure, comparison_task
 from calstudy.run.task import Task
@@ -29,21 +29,20 @@ from calstudy.studies.study import Budget, Made, Study, fitted_parts
 
 KEY = "experiments"
 """The key that makes a file a collection."""
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 
 
 class Member(Section):
     """One experiment of the collection; its file name alone stands for it."""
 
     file: Path = Field(strict=False, description="The experiment file; a relative path starts at the collection file.")
-    name: str | None = Field(None, pattern=NAME, description="Replaces the experiment's own name.")
+    name: StudyName | None = Field(None, description="Replaces the experiment's own name.")
     overrides: dict[str, Any] = Field(default_factory=dict, description="Fields to change (dotted path: value).")
 
 
 class CollectionFile(Section):
     """Several experiments that are run together, share products, and are compared."""
 
-    name: str = Field(pattern=NAME, description="Names the folder of the combined figures and claims.")
+    name: StudyName = Field(description="Names the folder of the combined figures and claims.")
     description: str = ""
     experiments: Annotated[tuple[Annotated[Member, choice("file")], ...], Field(strict=False, min_length=1)] = Field(
         description="Experiment files, each with its own run folder."

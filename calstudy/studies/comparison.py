@@ -19,7 +19,7 @@ from calstudy.base.schema import Section, choice, fault
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import apply_scale, dump, override, parse_override, read_mapping, validate
 from calstudy.experiment.messages import sentences
-from calstudy.experiment.model import FIGURES, Experiment, Outputs
+from calstudy.experiment.model import FIGURES, Experiment, Outputs, StudyName
 from calstudy.figures import CasesFigure, cases_task
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required
@@ -27,12 +27,11 @@ from calstudy.products.score import score
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import CASES, EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
-from calstudy.studies.preflight import refusal_of_calibrator, require_calibration
+from calstudy.studies.preflight import refusal_of_calibrator, require_possible
 from calstudy.studies.study import Budget, Made, Study
 
 KEY = "calibrators"
 """The key that makes a file a comparison."""
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 LONGEST_LABEL = 40
 VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
@@ -44,7 +43,7 @@ Block = Annotated[dict[str, Any], choice("calibrator")]
 class ComparisonFile(Section):
     """Calibrators times worlds, made from one experiment."""
 
-    name: str = Field(pattern=NAME, description="Names the run folder.")
+    name: StudyName
     description: str = ""
     experiment: Annotated[Path, Field(strict=False)] | dict[str, Any] = Field(
         description="The experiment that all cases start from: a file, whose relative path starts at this one, or the "
@@ -142,7 +141,7 @@ class Comparison(Study):
                 fitted.append(case)
                 continue
             try:
-                require_calibration(case.experiment)
+                require_possible(case.experiment)
                 experiment, count = fit(case.experiment, budget, _targets_of)
             except InputError as error:
                 raise InputError(f"{case.calibrator} in {case.world}: {error}") from None

@@ -23,7 +23,7 @@ from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
-from calstudy.studies.preflight import require_calibration
+from calstudy.studies.preflight import notes_of, require_possible
 from calstudy.studies.study import Budget, Made, Study
 
 SKY_MODEL_TABLE = "sky-model.csv"
@@ -58,9 +58,14 @@ class ExperimentStudy(Study):
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the study with simulations and solves cut to the memory, and the number of workers."""
-        require_calibration(self.experiment)
+        require_possible(self.experiment)
         experiment, count = fit(self.experiment, budget, targets_of)
         return type(self)(experiment, self._folder), count
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What a plan says of settings that are allowed, and hardly meant."""
+        return notes_of(self.experiment)
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Checks that need the antennas' positions, made before anything heavy starts."""
+"""Checks that need more than the settings: positions of antennas, beam files; made before anything heavy starts."""
 
 from __future__ import annotations
 
@@ -6,17 +6,60 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
+from calstudy.base.plugins import guarded
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
+from calstudy.instrument.distinct_beams import nominal_beams
+from calstudy.instrument.interface import model_of
 from calstudy.instrument.layouts import Layout, make_array, make_layout
 from calstudy.instrument.settings import InstrumentSettings
+from calstudy.sky.counts import expected_sources
+from calstudy.sky.settings import Foregrounds, SyntheticSources
+
+
+def require_possible(experiment: Experiment) -> None:
+    """Raise InputError if a beam cannot be made, or the calibrator refuses antennas, baselines and channels."""
+    require_beams(experiment.instrument)
+    require_calibration(experiment)
+
+
+def require_beams(instrument: InstrumentSettings) -> None:
+    """Raise InputError if a beam of an instrument cannot be made for its channels."""
+    for beam in nominal_beams(instrument):
+        with guarded(beam):
+            model_of(beam).require_usable(instrument.channels)
+
+
+def notes_of(experiment: Experiment) -> tuple[str, ...]:
+    """Return sentences on settings that are allowed, and hardly meant."""
+    assumed = assumed_changes(experiment.calibration.assumed)
+    limit = "sky.foregrounds.flux_limit"
+    if limit not in assumed:
+        return ()
+    kept = [_catalogue_depth(sky.foregrounds) for sky in (experiment.sky, assumed_world(experiment).sky)]
+    if None in kept or kept[0] != kept[1]:
+        return ()
+    return (
+        f"{FIELD}.{limit} = {str(assumed[limit])!r}: the same {kept[0]} brightest sources are kept as with the true "
+        "limit, for sky.foregrounds.count is reached before either; the sky model misses none of them",
+    )
+
+
+def _catalogue_depth(foregrounds: Foregrounds) -> int | None:
+    """Return how many of the brightest sources are kept if their number decides, not the flux limit; else None."""
+    if not isinstance(foregrounds, SyntheticSources) or foregrounds.count is None:
+        return None
+    # Several standard deviations of what is drawn, and of the cosmic scatter of the bright ones.
+    surely = 0.8 * expected_sources(foregrounds.flux_limit) - 100
+    return foregrounds.count if surely > foregrounds.count else None
 
 
 def require_calibration(experiment: Experiment) -> None:
     """Raise InputError if the calibrator refuses the antennas, baselines and channels of an experiment."""
     if any(variant.calibrate for variant in experiment.variants.values()):
         changes, world = assumed_changes(experiment.calibration.assumed), assumed_world(experiment)
+        require_beams(world.instrument)
         has_sky_model = SKY_MODEL in changes or world.sky.has_foregrounds
         require_calibratable(experiment.calibration, frame_of(experiment.instrument), has_sky_model)
         places = [(instrument.layout, instrument.site) for instrument in (experiment.instrument, world.instrument)]

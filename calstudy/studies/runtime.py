@@ -21,7 +21,7 @@ from calstudy.claims.paper import distinct_papers
 from calstudy.claims.product import run_time_claims
 from calstudy.experiment.files import apply_scale, override, parse_override
 from calstudy.experiment.messages import sentences
-from calstudy.experiment.model import FIGURES, PAPERS
+from calstudy.experiment.model import FIGURES, PAPERS, StudyName
 from calstudy.figures import DRAW
 from calstudy.instrument.settings import Channels, LinearLayout, RectangularLayout
 from calstudy.products.run_times import COUNT_STEPS, SUMMARIZE, TIME_STEPS, TimedArray
@@ -134,7 +134,7 @@ class RuntimeOutputs(Section):
 class RuntimeFile(Section):
     """Steps of the paper's solver, of our Adamax and of the default solver, timed side by side on this machine."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", description="Names the run folder.")
+    name: StudyName
     description: str = ""
     runtime: RuntimeSettings
     outputs: RuntimeOutputs = RuntimeOutputs()

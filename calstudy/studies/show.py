@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from calstudy.base.resources import LIBRARIES_MEMORY, free_memory
+from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory, total_memory
 from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
 from calstudy.run.execution import largest_disk, schedule
 from calstudy.run.progress import duration
-from calstudy.run.store import Store
+from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.folder import MANIFEST
 from calstudy.studies.study import Budget, Run, Study
@@ -31,8 +32,8 @@ def _gigabytes(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e7 else f"{count / 1e6:.1f} MB"
 
 
-def show_plan(study: Study, budget: Budget, console: Console) -> None:
-    """Print the stages of a study, what is in the store, and what the rest will take.
+def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
+    """Return what a run would make and take, as plain JSON types; seconds on one core, and bytes.
 
     Parameters
     ----------
@@ -40,42 +41,79 @@ def show_plan(study: Study, budget: Budget, console: Console) -> None:
         What is planned.
     budget
         Workers and memory.
-    console
-        Where it is written.
 
     Raises
     ------
     InputError
-        If the study does not fit.
+        If the study does not fit, or store or run folders cannot be written.
     """
     study, workers = study.fitted(budget)
     store = Store(study.outputs.store)
     plan = schedule(study.targets, store)
+    if plan.todo:
+        require_writable(store.root, "outputs.store")
+    require_writable(study.folder.parent, "outputs.runs")
     todo = {task.key for task in plan.todo}
-    table = Table(title=f"{study.name}: plan for {workers} worker(s)", title_justify="left")
+    stages = []
+    for stage, tasks in _by_stage(study.tasks).items():
+        costs = [task.cost for task in tasks if task.key in todo]
+        stages.append(
+            {
+                "stage": stage,
+                "products": len(tasks),
+                "to_make": len(costs),
+                "seconds": sum(cost.seconds for cost in costs),
+                "memory_each": max((cost.memory for cost in costs), default=0.0),
+                "disk": sum(cost.disk for cost in costs),
+            }
+        )
+    largest = max((task.cost.memory for task in plan.todo), default=0.0)
+    notes = list(study.notes)
+    if budget.max_memory is not None and parse_memory(budget.max_memory) > total_memory():
+        notes.insert(0, f"--max-memory {budget.max_memory} is more than this machine has")
+    return {
+        "name": study.name,
+        "workers": workers,
+        "stages": stages,
+        "seconds": sum(task.cost.seconds for task in plan.todo),
+        "memory": LIBRARIES_MEMORY + workers * largest if plan.todo else 0.0,
+        "memory_free": float(free_memory()),
+        "disk_while_running": largest_disk(study.targets, plan.todo),
+        "disk_kept": sum(task.cost.disk for task in plan.todo if not task.temporary),
+        "damaged": [f"{task.stage.name} ({task.label})" for task in plan.damaged],
+        "stand_ins": list(study.stand_ins),
+        "notes": notes,
+        "sites": sites(study.tasks),
+        "store": str(store.root),
+        "run_folders": [str(folder) for folder in study.folders],
+    }
+
+
+def show_plan(plan: Mapping[str, Any], console: Console) -> None:
+    """Print a plan, from `describe_plan`."""
+    table = Table(title=f"{plan['name']}: plan for {plan['workers']} worker(s)", title_justify="left")
     table.add_column("stage")
     for heading in ("products", "to make", "cpu time", "memory each", "disk"):
         table.add_column(heading, justify="right")
-    for stage, tasks in _by_stage(study.tasks).items():
-        costs = [task.cost for task in tasks if task.key in todo]
+    for row in plan["stages"]:
+        made = row["to_make"] > 0
         table.add_row(
-            stage,
-            str(len(tasks)),
-            str(len(costs)),
-            duration(sum(cost.seconds for cost in costs)) if costs else "-",
-            _gigabytes(max(cost.memory for cost in costs)) if costs else "-",
-            _gigabytes(sum(cost.disk for cost in costs)) if costs else "-",
+            row["stage"],
+            str(row["products"]),
+            str(row["to_make"]),
+            duration(row["seconds"]) if made else "-",
+            _gigabytes(row["memory_each"]) if made else "-",
+            _gigabytes(row["disk"]) if made else "-",
         )
     console.print(table)
-    for task in plan.damaged:
-        console.print(f"damaged, will be made again: {task.stage.name} ({task.label})", markup=False)
-    _total(plan.todo, largest_disk(study.targets, plan.todo), workers, console)
-    for note in study.stand_ins:
-        console.print(f"stand-in: {note}", markup=False)
-    for place in sites(study.tasks):
-        console.print(f"site: {place}", markup=False)
-    console.print(f"store: {store.root}", markup=False, soft_wrap=True)
-    for folder in study.folders:
+    for product in plan["damaged"]:
+        console.print(f"damaged, will be made again: {product}", markup=False)
+    _show_total(plan, console)
+    for heading, lines in (("stand-in", "stand_ins"), ("note", "notes"), ("site", "sites")):
+        for line in plan[lines]:
+            console.print(f"{heading}: {line}", markup=False)
+    console.print(f"store: {plan['store']}", markup=False, soft_wrap=True)
+    for folder in plan["run_folders"]:
         console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
 
 
@@ -93,17 +131,14 @@ def sites(tasks: Sequence[Task]) -> list[str]:
     )
 
 
-def _total(tasks: Sequence[Task], disk: float, workers: int, console: Console) -> None:
-    if not tasks:
+def _show_total(plan: Mapping[str, Any], console: Console) -> None:
+    if not any(row["to_make"] for row in plan["stages"]):
         console.print("everything is in the store: a run only writes its folder")
         return
-    costs = [task.cost for task in tasks]
-    kept = sum(cost.disk for cost, task in zip(costs, tasks, strict=True) if not task.temporary)
-    memory = LIBRARIES_MEMORY + workers * max(cost.memory for cost in costs)
     console.print(
-        f"in all: about {duration(sum(cost.seconds for cost in costs) / workers)}, "
-        f"up to {_gigabytes(memory)} of memory ({_gigabytes(free_memory())} free), "
-        f"{_gigabytes(disk)} of disk while running, {_gigabytes(kept)} kept"
+        f"in all: about {duration(plan['seconds'] / plan['workers'])}, "
+        f"up to {_gigabytes(plan['memory'])} of memory ({_gigabytes(plan['memory_free'])} free), "
+        f"{_gigabytes(plan['disk_while_running'])} of disk while running, {_gigabytes(plan['disk_kept'])} kept"
     )
 
 

@@ -151,6 +151,11 @@ class Study(ABC):
     def fill(self, made: Made) -> None:
         """Put what was asked for into the run folder: figures, tables, claims, manifest, the file itself."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a plan says of settings that are allowed, and hardly meant; of the study and of its parts, once each."""
+        return tuple(dict.fromkeys(note for part in self.parts.values() for note in part.notes))
+
     @cached_property
     def tasks(self) -> list[Task]:
         """All tasks, once each, every one after what it needs."""

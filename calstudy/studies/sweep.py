@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from calstudy.studies.study import Budget, Made, Study, fitted_parts
 SWEPT = ("instrument", "sky", "simulation", "corruption", "calibration", "power", "variants")
 """Sections whose fields can be varied."""
 LONGEST_LABEL = 72
+MOST_POINTS = 250
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,12 @@ def expand(experiment: Experiment) -> Sweep:
     if not experiment.sweep:
         raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")
     faults = _faults_of_fields(experiment.sweep)
+    count = sum(math.prod(len(values) for values in block.values()) for block in experiment.sweep)
+    if count > MOST_POINTS:
+        faults.append(
+            f"sweep: has {count} points, all combinations of the values, and at most {MOST_POINTS} are allowed; give "
+            "fewer values, or a list of blocks that vary one field each"
+        )
     if not experiment.measures_signal_loss:
         faults.append(
             f"sweep: compares the signal loss of its points, which needs the variants {', '.join(SIGNAL_LOSS_VARIANTS)}"

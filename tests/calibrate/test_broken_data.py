@@ -89,6 +89,56 @@ FILES: dict[str, Callable[[Path], object]] = {
 """Damage to the file; pyuvdata refuses it in words of its own, which are passed on."""
 
 
+def with_one(name: str, index: int, value: object) -> Callable[[Path], None]:
+    def change(values: np.ndarray) -> np.ndarray:
+        values = np.array(values, float)
+        values[index] = values[1] if value == "second" else value
+        return values
+
+    return with_values(name, change)
+
+
+IMPLAUSIBLE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "frequencies negative": (with_values("Header/freq_array", lambda values: -values), "frequencies of -"),
+    "frequencies in MHz": (with_values("Header/freq_array", lambda values: values / 1e6), "they look like MHz"),
+    "frequencies in GHz": (with_values("Header/freq_array", lambda values: values / 1e9), "and 1e+12 Hz are allowed"),
+    "frequencies far too high": (with_values("Header/freq_array", lambda values: values * 1e9), "are allowed"),
+    "one frequency nan": (with_one("Header/freq_array", 3, np.nan), "1 of 64 frequencies are not finite"),
+    "one frequency infinite": (with_one("Header/freq_array", 3, np.inf), "1 of 64 frequencies are not finite"),
+    "one frequency twice": (with_one("Header/freq_array", 3, "second"), "MHz occurs 2 times; once is allowed"),
+    "one frequency zero": (with_one("Header/freq_array", 0, 0.0), "frequencies of 0 to"),
+    "channel widths zero": (with_values("Header/channel_width", lambda values: values * 0), "widths of 0 to 0"),
+    "channel widths nan": (
+        with_values("Header/channel_width", lambda values: values * np.nan),
+        "channel widths of nan",
+    ),
+    "one time nan": (with_one("Header/time_array", 2, np.nan), "cannot be read as visibilities"),
+    "durations zero": (
+        with_values("Header/integration_time", lambda values: values * 0),
+        "integration times of 0 to 0",
+    ),
+    "durations negative": (with_values("Header/integration_time", lambda values: -values), "times of -"),
+    "durations nan": (
+        with_values("Header/integration_time", lambda values: values * np.nan),
+        "integration times of nan",
+    ),
+}
+"""Numbers that pyuvdata reads, and no telescope writes; what the refusal says."""
+
+
+@pytest.mark.parametrize("name", IMPLAUSIBLE)
+@pytest.mark.filterwarnings("ignore")
+def test_implausible_numbers_are_refused_with_the_value_and_what_is_allowed(name, good, tmp_path, capsys):
+    path = tmp_path / "data.uvh5"
+    path.write_bytes(good.read_bytes())
+    change, told = IMPLAUSIBLE[name]
+    change(path)
+    status, message = run_command(capsys, "calibrate", path, *OPTIONS, "--dry-run", "--output", tmp_path / "out")
+    assert status == REFUSED, message
+    assert "data.uvh5" in complaint(message)
+    assert told in complaint(message)
+
+
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.filterwarnings("ignore")
 def test_a_damaged_file_is_named(name, good, tmp_path, capsys):

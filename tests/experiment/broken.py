@@ -11,10 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import yaml
+from pyuvdata import ShortDipoleBeam, UVBeam
 from tiny import tiny
 
-from calstudy.experiment.files import validate
+from calstudy.experiment.files import override, validate
 
 SEED = 20220422
 
@@ -161,6 +164,110 @@ def bad_layouts(folder: Path) -> Iterator[Broken]:
         yield Broken(f"layout: {name}", yaml.safe_dump(data, sort_keys=False).encode(), (path.name, "longest baseline"))
 
 
+IMPLAUSIBLE: list[tuple[str, Any, str]] = [
+    ("instrument.channels.width", "80 mHz", "at least 100 Hz"),
+    ("instrument.channels.width", "80 GHz", "at most 10 MHz"),
+    ("instrument.channels.first", "170", "has no unit"),
+    ("instrument.channels.first", "170 Hz", "at least 10 MHz"),
+    ("instrument.channels.first", "167 kHz", "at least 10 MHz"),
+    ("instrument.channels.first", "-170 MHz", "at least 10 MHz"),
+    ("instrument.channels.first", "170 GHz", "21 cm line"),
+    ("instrument.channels.count", 10**8, "at most 65536"),
+    ("instrument.channels.count", 1, "at least 8"),
+    ("instrument.times.integration", "5 d", "at most 3600 s"),
+    ("instrument.times.integration", "2 fs", "at least 1 ms"),
+    ("instrument.times.integration", "-2 s", "at least 1 ms"),
+    ("instrument.times.count", 10**9, "at most 100000"),
+    ("instrument.times", {"integration": "1 h", "count": 56}, "56 integrations of 3600 s are 56 h; a day"),
+    ("instrument.times.start_lst", "25 h", "less than 24"),
+    ("instrument.layout.side", 10**5, "at most 26"),
+    ("instrument.layout.spacing", "1 nm", "at least 10 mm"),
+    ("instrument.layout", {"kind": "linear", "count": 10**6}, "at most 2000"),
+    ("instrument.layout", {"kind": "rectangular", "count": 10**6}, "at most 2000"),
+    ("instrument.layout", {"kind": "rectangular", "max_baseline": "5 m"}, "must exceed the length of a row"),
+    ("instrument.layout", {"kind": "hera-19", "count": 30}, "instrument.layout.count: 30 is more than the 19"),
+    ("instrument.layout", {"kind": "golomb", "count": 100}, "at most 12"),
+    ("instrument.location", "mars", "'mars' is not a choice"),
+    ("instrument.location", {"latitude": "-91 deg", "longitude": "0 deg"}, "at least -90 deg"),
+    ("instrument.beam", {"kind": "hera", "model": "nic-cst"}, "is not within the beam file's 100 to 145 MHz"),
+    ("instrument.beam", {"kind": "airy", "diameter": "0 m"}, "diameter"),
+    ("instrument.polarizations", ["xx", "xx"], "names a polarization twice"),
+    ("instrument.polarizations", ["zz"], "not a choice (allowed: xx, yy)"),
+    ("instrument.polarizations", "xx", "must be a list"),
+    ("sky.eor.index", -2, "-2 has no effect with spectrum: flat"),
+    ("sky.eor.nside", "64", "is a text; write it without quotes"),
+    ("sky.eor.nside", 100, "allowed: 16, 32, 64, 128, 256"),
+    ("sky.foregrounds.flux_limit", "1e9 Jy", "at most 197 Jy"),
+    ("sky.foregrounds.flux_limit", "200 Jy", "at most 197 Jy"),
+    ("sky.foregrounds.flux_limit", "1 uJy", "at least 0.001 Jy"),
+    ("sky.foregrounds.index_scatter", 0.2, "has no effect with spectrum: flat"),
+    ("power.bins.width", "1e-9 h/Mpc", "8e+08 bins, and at most 10000"),
+    ("power.bins", {"min": "2 h/Mpc", "max": "1 h/Mpc"}, "must be larger than min"),
+    ("power.bins.max", "1e9 h/Mpc", "at most 1000"),
+    ("power.length_bin", "1 nm", "at least 10 mm"),
+    ("calibration.integrations_per_solve", 1000, "use at most 2"),
+    ("calibration.basis.buffer", "1 s", "calibration.basis"),
+    ("outputs.store", "/etc/passwd", "is a file; a folder is needed"),
+    ("outputs.runs", "/etc/passwd", "is a file; a folder is needed"),
+    ("outputs.convergence.steps", ["a"], "must be a whole number"),
+    ("scales", {"small": {"instrument.banana": 3}}, "scales.small: instrument.banana: unknown key"),
+    ("scales", {"small": {"instrument.times.count": -3}}, "scales.small: instrument.times.count = -3"),
+    ("scales", {"small": {"name.x": 3}}, "scales.small: "),
+    ("scales", {"small": 3}, "scales.small = 3"),
+    ("sweep", {"sky.eor.seed": list(range(300)), "corruption.noise.factor": list(range(1, 301))}, "90000 points"),
+    ("sweep", {"sky.eor.seed": [1, 1]}, "names the value 1 twice"),
+    ("realizations", {"draw": ["eor"], "count": 10**6}, "at most 1000"),
+    ("realizations", {"draw": [], "count": 3}, "names nothing"),
+    ("name", "my run", "'my run' cannot name a folder"),
+    ("name", "x" * 65, "at most 64"),
+]
+"""A field, a value that no one means, and what the refusal says."""
+
+
+def implausible(folder: Path) -> Iterator[Broken]:
+    """Yield experiments with one value that is of the right kind, and cannot be meant."""
+    for number, (path, value, told) in enumerate(IMPLAUSIBLE):
+        text = yaml.safe_dump(override(tiny(folder), path, value), sort_keys=False).encode()
+        yield Broken(f"{number}: {path} = {str(value)[:40]}", text, (told,))
+
+
+def bad_beams(folder: Path) -> Iterator[Broken]:
+    """Yield experiments whose beam file cannot serve; the files are made here."""
+    for name, (kind, told) in write_beams(folder).items():
+        data = override(tiny(folder), "instrument.beam", {"kind": kind, "path": str(folder / name)})
+        yield Broken(f"beam: {name}", yaml.safe_dump(data, sort_keys=False).encode(), (told,))
+
+
+def write_beams(folder: Path) -> dict[str, tuple[str, str]]:
+    """Write beam files; return for each the kind of beam that it is given for, and what the refusal says."""
+    (folder / "text.beamfits").write_text("not a beam\n" * 100)
+    (folder / "text.h5").write_text("not a beam\n" * 100)
+    (folder / "empty.beamfits").touch()
+    with h5py.File(folder / "other.h5", "w") as file:
+        file["x"] = 3.0
+    table = make_beam()
+    table.select(freq_chans=[0], inplace=False).write_beamfits(folder / "one_frequency.beamfits", clobber=True)
+    table.select(freq_chans=[0, 1, 2], inplace=False).write_beamfits(folder / "short.beamfits", clobber=True)
+    stokes = table.efield_to_pstokes(inplace=False)
+    stokes.write_beamfits(folder / "stokes.beamfits", clobber=True)
+    return {
+        "text.beamfits": ("beamfits", "text.beamfits cannot be read as beamfits"),
+        "empty.beamfits": ("beamfits", "empty.beamfits cannot be read as beamfits"),
+        "one_frequency.beamfits": ("beamfits", "is not within the beam file's 160 to 160 MHz"),
+        "short.beamfits": ("beamfits", "is not within the beam file's 160 to 180 MHz"),
+        "stokes.beamfits": ("beamfits", "stokes.beamfits cannot be read as beamfits"),
+        "text.h5": ("mwa-embedded-element", "text.h5 cannot be read as an MWA beam file"),
+        "other.h5": ("mwa-embedded-element", "names no frequencies"),
+    }
+
+
+def make_beam() -> UVBeam:
+    """Return a beam of short dipoles, tabulated every 10 MHz from 160 to 190 MHz."""
+    dipole = ShortDipoleBeam(feed_array=["x", "y"])
+    axes = {"axis1_array": np.radians(np.arange(0, 360, 10)), "axis2_array": np.radians(np.arange(0, 91, 10))}
+    return dipole.to_uvbeam(freq_array=np.arange(160e6, 191e6, 10e6), beam_type="efield", **axes)
+
+
 TEXTS = {
     "empty": b"",
     "comment": b"# nothing\n",
@@ -197,6 +304,10 @@ TEXTS = {
     "bad float tag": b"name: !!float x\n",
     "sexagesimal": b"name: x\ninstrument: {times: {start_lst: 1:30:00}}\n",
     "octal": b"name: 0777\n",
+    "octal count": b"name: x\nsky: {eor: {seed: 010}}\n",
+    "negative octal": b"name: x\nsky: {eor: {seed: -017}}\n",
+    "sexagesimal seed": b"name: x\nsky: {eor: {seed: 6:24}}\n",
+    "sexagesimal fraction": b"name: x\nsky: {eor: {index: 1:30.5}}\n",
     "huge integer": b"name: x\nsky: {eor: {seed: " + b"9" * 5000 + b"}}\n",
     "collection of nothing": b"name: x\nexperiments: []\n",
     "collection without name": b"experiments: [x.yaml]\n",
@@ -239,5 +350,5 @@ def bad_texts(folder: Path) -> Iterator[Broken]:
 
 def all_broken(folder: Path) -> list[Broken]:
     """Return all of them."""
-    makers = (wrong_values, unknown_keys, missing_files, bad_layouts, bad_texts)
+    makers = (wrong_values, unknown_keys, missing_files, bad_layouts, bad_texts, implausible, bad_beams)
     return [item for make in makers for item in make(folder)]

@@ -90,7 +90,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ("{name: a, instrument: {channels: {first: 167}}}", "instrument.channels.first: 167 has no unit"),
         (
             "{name: a, instrument: {channels: {width: -80 kHz}}}",
-            "instrument.channels.width = '-80 kHz': must be greater than 0 Hz",
+            "instrument.channels.width = '-80 kHz': must be at least 100 Hz",
         ),
         ("{name: a, instrument: {layout: hexa}}", "instrument.layout: 'hexa' is not a choice, did you mean 'hex'?"),
         (
@@ -136,7 +136,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
             "outputs.figures: asks for 'gains', which needs variants.residual to have foregrounds, effects: true and",
         ),
         ("{}", "name: missing, and it has no default"),
-        ("{name: a b}", "name = 'a b': must match"),
+        ("{name: a b}", "name: 'a b' cannot name a folder"),
         (
             "{name: a, calibration: {solver: {max_steps: 0}, basis: {bufer: 3}}}",
             "calibration.solver.max_steps = 0: must be at least 1",

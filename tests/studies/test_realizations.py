@@ -27,7 +27,7 @@ from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.realizations import Realizations
-from calstudy.studies.show import show_plan, show_run
+from calstudy.studies.show import describe_plan, show_plan, show_run
 from calstudy.studies.study import Budget, Run, run_study
 
 EVERYTHING = {"draw": ["eor", "gains", "noise"], "count": 3}
@@ -230,7 +230,7 @@ def test_the_plan_counts_the_disk_that_is_held_at_one_time(folder, tmp_path):
     kept = sum(task.cost.disk for task in Realizations(many).tasks if not task.temporary)
     assert disks[0] < disks[1] < kept + visibilities / 4
     console = Console(record=True, width=200, file=io.StringIO())
-    show_plan(Realizations(few), Budget(workers=1), console)
+    show_plan(describe_plan(Realizations(few), Budget(workers=1)), console)
     assert "of disk while running" in console.export_text()
 
 

@@ -18,7 +18,7 @@ from calstudy.claims.folders import evaluate_folder
 from calstudy.studies import runtime
 from calstudy.studies.load import load_study
 from calstudy.studies.runtime import RuntimeStudy
-from calstudy.studies.show import show_plan
+from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Budget, run_study
 
 FILE = Path(__file__).parents[2] / "experiments" / "runtime.yaml"
@@ -130,7 +130,7 @@ def test_what_would_spoil_the_times_is_refused(study):
 
 def test_a_plan_names_what_will_be_timed(study):
     console = Console(file=io.StringIO(), width=100)
-    show_plan(study, Budget(), console)
+    show_plan(describe_plan(study, Budget()), console)
     told = console.file.getvalue()
     assert "step-times" in told
     assert "plan for 1 worker" in told

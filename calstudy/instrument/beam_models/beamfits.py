@@ -25,6 +25,13 @@ class FileBeam(BeamModel):
         """Whether it is interpolated by a smooth fit."""
         return self.interpolation == "chebyshev"
 
+    def require_usable(self, channels: Channels) -> None:
+        """Read the file, and look whether its frequencies enclose the channels."""
+        from calstudy.instrument.beam_frequencies import choose_frequencies
+        from calstudy.instrument.beam_grid import read_beamfits
+
+        choose_frequencies(read_beamfits(self.path).freq_array, channels.band, self.interpolation)
+
     def make(self, channels: Channels) -> Beam:
         """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beam_grid import read_beamfits

@@ -33,13 +33,23 @@ class HeraBeam(BeamModel):
         """Whether it is interpolated by a smooth fit."""
         return self.interpolation == "chebyshev"
 
+    @property
+    def _file(self) -> Path:
+        distribution_name, path = FILES[self.model]
+        return Path(str(distribution(distribution_name).locate_file(path)))
+
+    def require_usable(self, channels: Channels) -> None:
+        """Read the file, and look whether its frequencies enclose the channels."""
+        from calstudy.instrument.beam_frequencies import choose_frequencies
+        from calstudy.instrument.beam_grid import read_beamfits
+
+        choose_frequencies(read_beamfits(self._file).freq_array, channels.band, self.interpolation)
+
     def make(self, channels: Channels) -> Beam:
         """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beam_grid import read_beamfits
         from calstudy.instrument.beams import GriddedBeam
         from calstudy.instrument.tabulated import TabulatedBeam
 
-        distribution_name, path = FILES[self.model]
-        file = Path(str(distribution(distribution_name).locate_file(path)))
-        table = TabulatedBeam(read_beamfits(file), channels.band, self.interpolation)
+        table = TabulatedBeam(read_beamfits(self._file), channels.band, self.interpolation)
         return GriddedBeam(table, self.kind, STAND_IN.format(what=f"HERA's ({self.model})"))

@@ -1,0 +1,118 @@
+"""``calstudy runs`` and ``store``: what lies in the folders of runs and products; nothing is deleted unasked."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from calstudy.base.errors import InputError
+
+if TYPE_CHECKING:
+    from calstudy.run.store import Product
+
+RunsFolder = Annotated[Path, typer.Argument(help="Folder of run folders.")]
+StoreFolder = Annotated[Path, typer.Argument(help="Folder of products.")]
+OlderThan = Annotated[str | None, typer.Option(metavar="AGE", help="Only products made longer ago: 30d or 12h.")]
+LargerThan = Annotated[str | None, typer.Option(metavar="SIZE", help="Only products of this size or more: '100 MB'.")]
+Unreferenced = Annotated[
+    bool, typer.Option("--unreferenced", help="Only products that no run in the folder --runs refers to.")
+]
+Runs = Annotated[Path, typer.Option(help="Folder of runs, for --unreferenced.")]
+Delete = Annotated[bool, typer.Option("--delete", help="List the products that are chosen, and delete them.")]
+SECONDS = {"h": 3600.0, "d": 86_400.0}
+
+
+def runs(folder: RunsFolder = Path("runs")) -> None:
+    """List finished runs: when, how large, of how many products."""
+    from calstudy.run.inventory import list_runs
+    from calstudy.verdicts.tables import Table
+
+    rows = [
+        (
+            entry.folder.relative_to(folder).as_posix(),
+            entry.finished.strftime("%Y-%m-%d %H:%M"),
+            _size(entry.size),
+            f"{len(entry.keys)}",
+        )
+        for entry in list_runs(folder)
+    ]
+    Table(("folder", "finished (UTC)", "size", "products"), rows, f"runs in {folder}").show(Console(highlight=False))
+
+
+def store(
+    folder: StoreFolder = Path("store"),
+    older_than: OlderThan = None,
+    larger_than: LargerThan = None,
+    unreferenced: Unreferenced = False,
+    runs: Runs = Path("runs"),
+    delete: Delete = False,
+) -> None:
+    """Show what is in a store by stage, or delete chosen products.
+
+    A deleted product is made again by the next run that needs it. Without --delete nothing is changed; with it, at
+    least one of --older-than, --larger-than and --unreferenced must say which products are meant. Do not delete
+    during a run.
+    """
+    from calstudy.run.inventory import age_of, list_runs, products
+    from calstudy.run.inventory import unreferenced as without_run
+    from calstudy.run.store import Store
+
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such store")
+    oldest, smallest = _age(older_than), _bytes(larger_than)
+    if delete and older_than is None and larger_than is None and not unreferenced:
+        raise InputError("--delete: say which products by --older-than, --larger-than or --unreferenced")
+    where, chosen = Store(folder), list(products(Store(folder)))
+    if unreferenced:
+        chosen = without_run(chosen, list_runs(runs))
+    chosen = [product for product in chosen if age_of(product) >= oldest and product.size >= smallest]
+    console = Console(highlight=False)
+    _show(chosen, folder, console)
+    if not delete:
+        return
+    for product in chosen:
+        stage, key = str(product.record["stage"]), str(product.record["key"])
+        with where.lock(stage, key):
+            where.discard(stage, key)
+        console.print(f"deleted: {stage} ({product.record['label']}), {_size(product.size)}, {key}", markup=False)
+
+
+def _show(chosen: list[Product], folder: Path, console: Console) -> None:
+    from calstudy.run.inventory import age_of
+    from calstudy.verdicts.tables import Table
+
+    rows = []
+    for stage in sorted({str(product.record["stage"]) for product in chosen}):
+        found = [product for product in chosen if product.record["stage"] == stage]
+        ages = [age_of(product) / SECONDS["d"] for product in found]
+        size = _size(sum(product.size for product in found))
+        rows.append((stage, f"{len(found)}", size, f"{min(ages):.1f} d", f"{max(ages):.1f} d"))
+    total = _size(sum(product.size for product in chosen))
+    title = f"{len(chosen)} products in {folder}, {total}"
+    Table(("stage", "products", "size", "youngest", "oldest"), rows, title).show(console)
+
+
+def _size(count: float) -> str:
+    return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.2f} MB"
+
+
+def _age(text: str | None) -> float:
+    if text is None:
+        return 0.0
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([hd])", text)
+    if found is None:
+        raise InputError(f"--older-than {text}: write a number of hours or days, such as 12h or 30d")
+    return float(found[1]) * SECONDS[found[2]]
+
+
+def _bytes(text: str | None) -> float:
+    from calstudy.base.resources import parse_memory
+
+    try:
+        return 0.0 if text is None else parse_memory(text)
+    except InputError:
+        raise InputError(f"--larger-than {text}: write a positive number and a unit (MB, GB or TB)") from None

@@ -1,0 +1,92 @@
+"""The file with which a user begins: a small experiment, with comments on what can be changed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from calstudy.base.errors import InputError
+from calstudy.base.package_files import find_experiment
+from calstudy.experiment.files import read_mapping
+from calstudy.experiment.model import STUDY_NAME
+
+MODELINE = "# yaml-language-server: $schema="
+"""Start of the line from which editors know the schema of a file."""
+TEXT = """\
+# A small experiment: about a minute. Every field that is left out has the value of Ewall-Wice et al. (2022).
+# `calstudy plan {name}.yaml` checks it and says what a run takes; `calstudy run {name}.yaml` runs it.
+# All fields: docs/experiments.md, or `calstudy fields`.
+name: {name}
+description: A small array with cable reflections in the gains, calibrated with CALAMITY.
+
+instrument:
+  layout: {{kind: mwa-compact-minredundant, count: 16}}   # or hex, hera-19, hera-37, ..., csv with a path
+  # location: hera                                        # mwa, hera, paper, ovro-lwa, or latitude and longitude
+  beam: mwa-embedded-element                              # airy, gaussian, hera, or beamfits with a path
+  channels: {{first: 167.075 MHz, width: 240 kHz, count: 128}}
+  times: {{start_lst: 1.8 h, integration: 8 s, count: 8}}
+  polarizations: [xx]                                     # [xx], [yy] or [xx, yy]
+
+sky:
+  foregrounds: {{kind: g4jy-and-counts, count: 4000}}     # the 4000 brightest; or flux_limit: 50 mJy for all above
+  # diffuse: haslam                                       # Galactic emission besides the sources
+  eor: {{nside: 32, seed: 2}}                             # 256 at full scale
+
+corruption:
+  eor_level: -40 dB                                       # rms of the EoR over that of the foregrounds
+  effects: [{{kind: reflection-gains}}]                   # what happens to the data, in this order
+  noise: {{factor: 4}}                                    # times the rms of the EoR
+
+calibration:
+  calibrator: calamity                                    # calamity-redundant, sky-based, ..., or a file.py
+  # assumed: {{sky.foregrounds.flux_limit: 1 Jy}}         # what the calibrator takes for true
+  chunks: 1
+
+simulation:
+  chunks: 2
+  nodes: {{tolerance: 1e-7}}
+
+# sweep: {{corruption.noise.factor: [1, 4, 16]}}          # vary fields: a run for every combination
+# realizations: {{draw: [gains, noise], count: 5}}        # or draw EoR, gains or noise again
+
+outputs:
+  figures: [layout, gains, wedge, spherical, signal-loss]
+  store: store                                            # products, shared by all experiments
+  runs: runs                                              # a folder for each run
+"""
+
+
+def starter_text(name: str, schema: Path) -> str:
+    """Return the text of an experiment file.
+
+    Parameters
+    ----------
+    name
+        Of the experiment.
+    schema
+        File of the JSON schema, for editors.
+
+    Raises
+    ------
+    InputError
+        If the name cannot be one.
+    """
+    _require_name(name)
+    return f"{MODELINE}{schema}\n{TEXT.format(name=name)}"
+
+
+def copy_text(example: str, name: str, schema: Path) -> str:
+    """Return the text of a published experiment under another name; parameters and errors as `starter_text`."""
+    _require_name(name)
+    path = find_experiment(Path(example))
+    if {"experiments", "calibrators"} & set(read_mapping(path)):
+        raise InputError(f"--example {example}: is made of other files; copy one of those")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if not line.startswith(MODELINE)]
+    text = re.sub(r"^name: .*$", f"name: {name}", "\n".join(kept), count=1, flags=re.MULTILINE)
+    return f"{MODELINE}{schema}\n{text}\n"
+
+
+def _require_name(name: str) -> None:
+    if not STUDY_NAME.fullmatch(name):
+        raise InputError(f"{name!r} cannot name an experiment: use at most 64 letters, digits, '_', '.', '-'")

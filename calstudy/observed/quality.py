@@ -1,0 +1,200 @@
+"""What stands out in a finished calibration: gains, and chi^2 of antennas, channels and integrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pyuvdata import UVData
+
+from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+from calstudy.calibrate.records import CalibrationResult
+
+# Bandpasses and the antennas of an array differ by less than this; interference exceeds it by orders of magnitude.
+GAIN_FACTOR = 5.0
+# Of means over many samples: what is noise alone scatters by a few per cent.
+CHI2_FACTOR = 3.0
+NAMED = 6
+"""So many channels or antennas are named in a warning; solution.json has all of them."""
+# Median over mean of the square of a complex normal variable.
+MEDIAN_OVER_MEAN = np.log(2)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Gains and chi^2 of one polarization. NaN where everything is flagged.
+
+    Attributes
+    ----------
+    polarization
+        Its name.
+    antennas
+        Names of the antennas with solutions, (Nants,).
+    frequency
+        Hz, (Nfreqs,).
+    gain_by_channel
+        |g| over the antenna's median, median over integrations, (Nants, Nfreqs).
+    gain_by_antenna
+        Median |g| of each antenna over the median of all antennas, (Nants,).
+    chi2_by_antenna, chi2_by_channel, chi2_by_integration
+        Mean of |V - g g* F|^2 / sigma^2 over unflagged samples, (Nants,), (Nfreqs,), (Ntimes,). Parameters of the fit
+        are not counted, so that it is a bit below one for noise.
+    noise
+        Where sigma is from, in words.
+    """
+
+    polarization: str
+    antennas: np.ndarray
+    frequency: np.ndarray
+    gain_by_channel: np.ndarray
+    gain_by_antenna: np.ndarray
+    chi2_by_antenna: np.ndarray
+    chi2_by_channel: np.ndarray
+    chi2_by_integration: np.ndarray
+    noise: str
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences that name channels, antennas and integrations which stand out."""
+        highest = np.fmax.reduce(self.gain_by_channel, axis=0)
+        channels = [f"{frequency / 1e6:.3f} MHz" for frequency in self.frequency]
+        integrations = [f"integration {index}" for index in range(self.chi2_by_integration.size)]
+        antennas = [f"antenna {name}" for name in self.antennas]
+        inverse = 1 / np.where(self.gain_by_antenna > 0, self.gain_by_antenna, np.nan)
+        found = [
+            _told("|g| is far above the antenna's median", "x", channels, highest, GAIN_FACTOR, "interference?"),
+            _told("|g| is far above that of the other antennas", "x", antennas, self.gain_by_antenna, GAIN_FACTOR),
+            _told("|g| is far below that of the other antennas", "1/", antennas, inverse, GAIN_FACTOR, "a dead one?"),
+        ]
+        for names, values in (
+            (channels, self.chi2_by_channel),
+            (antennas, self.chi2_by_antenna),
+            (integrations, self.chi2_by_integration),
+        ):
+            found.append(_told("chi^2 is far above the median", "x", names, values / _median(values), CHI2_FACTOR))
+        return [f"{self.polarization}: {sentence}" for sentence in found if sentence]
+
+    def described(self) -> dict[str, Any]:
+        """Return all numbers as plain JSON types, null for NaN."""
+        return {
+            "polarization": self.polarization,
+            "noise": self.noise,
+            "antennas": [str(name) for name in self.antennas],
+            "gain_by_antenna": _plain(self.gain_by_antenna),
+            "gain_by_channel": _plain(np.fmax.reduce(self.gain_by_channel, axis=0)),
+            "chi2_by_antenna": _plain(self.chi2_by_antenna),
+            "chi2_by_channel": _plain(self.chi2_by_channel),
+            "chi2_by_integration": _plain(self.chi2_by_integration),
+            "warnings": self.warnings,
+        }
+
+
+def _plain(values: np.ndarray) -> list[float | None]:
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]
+
+
+def _median(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size and np.median(finite) > 0 else np.nan
+
+
+def _told(
+    what: str, sign: str, names: Sequence[str], ratios: np.ndarray, factor: float, question: str = ""
+) -> str | None:
+    """Return a sentence that names what has a ratio above a factor, the largest first; None if nothing has."""
+    order = [int(index) for index in np.argsort(-np.nan_to_num(ratios)) if ratios[index] > factor]
+    if not order:
+        return None
+    shown = ", ".join(f"{names[index]} ({_ratio(sign, ratios[index])})" for index in order[:NAMED])
+    more = f" and {len(order) - NAMED} more" if len(order) > NAMED else ""
+    return f"{what}: {shown}{more}{f'; {question}' if question else ''}"
+
+
+def _ratio(sign: str, value: float) -> str:
+    return f"1/{value:.0f}" if sign == "1/" else f"{value:.0f} x" if value >= 10 else f"{value:.1f} x"
+
+
+def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Quality:
+    """Measure what stands out in a calibration.
+
+    The noise is that of the radiometer equation, sigma^2 = V_aa V_bb / (channel width x integration time x nsamples),
+    if the data have the autocorrelations of all calibrated antennas. Otherwise it is the median of |V - g g* F|, the
+    same for all samples, and chi^2 tells only which parts are worse than others.
+
+    Parameters
+    ----------
+    data
+        What was calibrated, as given to `calstudy.calibrate.execution.run_calibrator`.
+    result
+        What came out.
+    polarization
+        Index of the polarization.
+    """
+    gains, pairs = result.gains, antenna_pairs(result.model)
+    numbers = np.unique(pairs)
+    order = np.argsort(gains.ant_array)
+    rows = order[np.searchsorted(gains.ant_array, numbers, sorter=order)]
+    flags = gains.flag_array[rows, :, :, polarization]
+    values = np.where(flags, np.nan, gains.gain_array[rows, :, :, polarization])
+    by_channel, by_antenna = _gain_ratios(np.abs(values))
+    first, second = np.searchsorted(numbers, pairs).T
+    products = np.moveaxis(values[first] * values[second].conj(), 2, 0)
+    unused = flag_cube(result.residual)[..., polarization]
+    power = np.abs(np.where(unused, np.nan, to_cube(result.residual)[..., polarization] * products)) ** 2
+    variance, noise = _variance(data, pairs, polarization)
+    if variance is None:
+        scale = _median(power) / MEDIAN_OVER_MEAN
+        chi2 = power / (scale if scale > 0 else np.nan)
+    else:
+        chi2 = power / variance
+    names = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.antenna_names, strict=True))
+    touching = [(first == row) | (second == row) for row in range(numbers.size)]
+    return Quality(
+        polarization=result.model.get_pols()[polarization],
+        antennas=np.array([str(names[int(number)]) for number in numbers]),
+        frequency=np.asarray(result.model.freq_array, float),
+        gain_by_channel=by_channel,
+        gain_by_antenna=by_antenna,
+        chi2_by_antenna=np.array([_mean(chi2[:, chosen], ()) for chosen in touching]).ravel(),
+        chi2_by_channel=_mean(chi2, (2,)),
+        chi2_by_integration=_mean(chi2, (0,)),
+        noise=noise,
+    )
+
+
+def _mean(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
+    """Return the mean of finite values over all axes but those kept, NaN where there is none."""
+    axes = tuple(axis for axis in range(values.ndim) if axis not in kept)
+    finite = np.isfinite(values)
+    count = finite.sum(axis=axes)
+    return np.where(count > 0, np.where(finite, values, 0).sum(axis=axes) / np.maximum(count, 1), np.nan)
+
+
+def _gain_ratios(amplitudes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return |g| over each antenna's median, (Nants, Nfreqs), and that median over the array's, (Nants,)."""
+    masked = np.ma.masked_invalid(amplitudes)
+    own = np.ma.median(masked, axis=(1, 2)).filled(np.nan)
+    by_channel = np.ma.median(masked, axis=2).filled(np.nan) / np.where(own > 0, own, np.nan)[:, None]
+    return by_channel, own / _median(own)
+
+
+def _variance(data: UVData, pairs: np.ndarray, polarization: int) -> tuple[np.ndarray | None, str]:
+    """Return sigma^2 of the samples of some baselines (NaN where unknown; None without autocorrelations), origin."""
+    all_pairs = antenna_pairs(data)
+    autos = {int(a): row for row, (a, b) in enumerate(all_pairs) if a == b}
+    if not set(np.unique(pairs).tolist()) <= set(autos):
+        return None, "the median of the residuals, for the data have no autocorrelations"
+    flags, cube = flag_cube(data)[..., polarization], to_cube(data)[..., polarization]
+    power = np.where(flags, np.nan, cube.real)
+    places = {tuple(pair): row for row, pair in enumerate(all_pairs.tolist())}
+    rows = [places[tuple(pair)] for pair in pairs.tolist()]
+    first, second = ([autos[int(number)] for number in column] for column in pairs.T)
+    counts = data.nsample_array[..., polarization].reshape(cube.shape)[:, rows]
+    samples = np.abs(np.mean(data.channel_width)) * np.mean(data.integration_time) * counts
+    product = power[:, first] * power[:, second]
+    valid = (product > 0) & (samples > 0)
+    return np.where(
+        valid, product / np.where(valid, samples, 1), np.nan
+    ), "autocorrelations, by the radiometer equation"

@@ -1,0 +1,93 @@
+"""What lies in a store and in a folder of runs, and which products no run refers to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from calstudy.base.errors import InputError
+from calstudy.run.store import RECORD, Product, Store
+
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class RunEntry:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder
+        Its folder.
+    name
+        Of the study.
+    finished
+        When.
+    size
+        Bytes of all files in the folder.
+    keys
+        Of the products that its manifest names.
+    """
+
+    folder: Path
+    name: str
+    finished: datetime
+    size: int
+    keys: frozenset[str]
+
+
+def list_runs(folder: Path) -> list[RunEntry]:
+    """Return the finished runs in a folder and its folders, the latest first.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of runs")
+    found = []
+    for path in sorted(folder.rglob(MANIFEST)):
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            finished = datetime.fromisoformat(content["finished"])
+            keys = frozenset(entry["key"] for entry in content.get("products", []))
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        size = sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+        found.append(RunEntry(path.parent, str(content.get("name", "")), finished, size, keys))
+    return sorted(found, key=lambda entry: entry.finished, reverse=True)
+
+
+def products(store: Store) -> Iterator[Product]:
+    """Yield all complete products of a store."""
+    for record in sorted(store.root.glob(f"*/*/{RECORD}")):
+        product = store.find(record.parent.parent.name, record.parent.name)
+        if product is not None:
+            yield product
+
+
+def age_of(product: Product) -> float:
+    """Return the seconds since a product was made."""
+    made = datetime.fromisoformat(str(product.record["started"]))
+    return (datetime.now(UTC) - made).total_seconds()
+
+
+def unreferenced(found: Iterable[Product], runs: Iterable[RunEntry]) -> list[Product]:
+    """Return the products that no run names, nor any product that a run names was made from."""
+    known = {product.record["key"]: product for product in found}
+    waiting, used = [key for run in runs for key in run.keys], set()
+    while waiting:
+        key = waiting.pop()
+        if key not in used:
+            used.add(key)
+            waiting += _inputs(known[key].record) if key in known else []
+    return [product for key, product in known.items() if key not in used]
+
+
+def _inputs(record: Any) -> list[str]:
+    return [str(key) for _, key in record.get("inputs", {}).values()]

@@ -1,0 +1,256 @@
+"""What stands out in measured data is named; an interrupted calibration is resumed; sky models may lack baselines."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from command_line import run_command
+from pyuvdata import UVCal, UVData
+from test_calamity import make_uvdata
+from toy import make_toy, scattered
+
+from calstudy.base.errors import InputError
+from calstudy.calibrate import execution
+from calstudy.calibrate.records import CalibrationResult
+from calstudy.calibrate.sky_model import common_baselines
+from calstudy.calibrate.standard_formats import make_gains, make_visibilities
+from calstudy.observed.quality import assess
+from calstudy.observed.reading import prepare
+from calstudy.observed.selection import Selection, select
+
+OPTIONS = ["--gains-only"]
+N_TIMES, CHANNEL, NOISE = 4, 20, 0.01
+ANTENNA = 3
+"""Place among the eight antennas."""
+
+
+@pytest.fixture(scope="module")
+def clean() -> UVData:
+    """Data without autocorrelations, with complex noise."""
+    uvd = make_uvdata(make_toy(scattered(8)), N_TIMES)
+    rng = np.random.default_rng(5)
+    draws = rng.normal(size=(2, *uvd.data_array.shape))
+    uvd.data_array += NOISE * (draws[0] + 1j * draws[1]) / np.sqrt(2)
+    return uvd
+
+
+def result_of(data: UVData, noise: np.ndarray, gains: np.ndarray | None = None) -> CalibrationResult:
+    """Return a calibration whose residual, in the unit of the data, is `noise`, (Ntimes, Nbls, Nfreqs, Npols)."""
+    numbers = data.telescope.antenna_numbers
+    shape = (len(numbers), data.Nfreqs, data.Ntimes, data.Npols)
+    gains = np.ones(shape, complex) if gains is None else gains
+    first, second = (np.searchsorted(numbers, column[: data.Nbls]) for column in (data.ant_1_array, data.ant_2_array))
+    products = np.moveaxis(gains[first] * gains[second].conj(), 2, 0)
+    flags = np.zeros(noise.shape, bool)
+    return CalibrationResult(
+        make_gains(data, numbers, gains, np.zeros(shape, bool)),
+        make_visibilities(data, np.zeros_like(noise), flags),
+        make_visibilities(data, noise / products, flags),
+        (),
+    )
+
+
+def normal(data: UVData, seed: int = 3) -> np.ndarray:
+    draws = np.random.default_rng(seed).normal(size=(2, data.Ntimes, data.Nbls, data.Nfreqs, data.Npols))
+    return (draws[0] + 1j * draws[1]) / np.sqrt(2)
+
+
+def test_noise_alone_has_a_chi2_of_one_and_no_warnings(clean):
+    found = assess(clean, result_of(clean, normal(clean)))
+    samples = N_TIMES * clean.Nbls * clean.Nfreqs
+    for values in (found.chi2_by_antenna, found.chi2_by_channel, found.chi2_by_integration):
+        # The scatter of a mean of n squares of complex normal variables is 1/sqrt(n).
+        assert np.abs(values - 1).max() < 6 / np.sqrt(samples / values.size)
+    assert found.warnings == []
+
+
+def test_chi2_does_not_depend_on_the_gains(clean):
+    rng = np.random.default_rng(8)
+    gains = rng.uniform(0.5, 2, (8, clean.Nfreqs, N_TIMES, 1)) * np.exp(1j * rng.uniform(0, 6, (8, clean.Nfreqs, 1, 1)))
+    with_gains, without = (assess(clean, result_of(clean, normal(clean), used)) for used in (gains, None))
+    assert np.allclose(with_gains.chi2_by_channel, without.chi2_by_channel, rtol=1e-10)
+    assert np.allclose(with_gains.chi2_by_antenna, without.chi2_by_antenna, rtol=1e-10)
+
+
+def test_what_is_noisy_is_named_and_nothing_else(clean):
+    noise = normal(clean)
+    noise[:, :, CHANNEL] *= 4
+    (warning,) = assess(clean, result_of(clean, noise)).warnings
+    assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (1" in warning
+    assert warning.count("MHz") == 1
+    noise = normal(clean)
+    noise[2] *= 3
+    (warning,) = assess(clean, result_of(clean, noise)).warnings
+    assert "integration 2 (" in warning
+    noise = normal(clean)
+    number = clean.telescope.antenna_numbers[ANTENNA]
+    touching = (clean.ant_1_array[: clean.Nbls] == number) | (clean.ant_2_array[: clean.Nbls] == number)
+    noise[:, touching] *= 5
+    (warning,) = assess(clean, result_of(clean, noise)).warnings
+    assert f"antenna ant{number} (" in warning
+    assert warning.count("ant") == 2
+
+
+def test_gains_that_stand_out_are_named(clean):
+    gains = np.ones((8, clean.Nfreqs, N_TIMES, 1), complex)
+    gains[:, CHANNEL] = 80j
+    gains[ANTENNA] *= 0.1
+    told = assess(clean, result_of(clean, normal(clean), gains)).warnings
+    assert len(told) == 2
+    assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (80 x); interference?" in told[0]
+    assert f"antenna ant{clean.telescope.antenna_numbers[ANTENNA]} (1/10); a dead one?" in told[1]
+
+
+def with_autos(data: UVData, power: float) -> UVData:
+    """Return data with autocorrelations of a constant power, and the durations and widths of a radiometer."""
+    times = np.unique(data.time_array)
+    autos = UVData.new(
+        freq_array=data.freq_array,
+        polarization_array=data.polarization_array,
+        times=times,
+        antpairs=[(number, number) for number in data.telescope.antenna_numbers],
+        telescope=data.telescope,
+        integration_time=float(data.integration_time[0]),
+        channel_width=np.asarray(data.channel_width),
+        do_blt_outer=True,
+        empty=True,
+        vis_units=data.vis_units,
+    )
+    autos.data_array[:] = power
+    autos.nsample_array[:] = 1
+    both = data.copy()
+    both.nsample_array[:] = 1
+    both = both.__add__(autos, run_check=False)
+    both.reorder_blts(order="time", minor_order="baseline", run_check=False)
+    return both
+
+
+def test_with_autocorrelations_chi2_is_in_units_of_the_radiometer_equation(clean):
+    data = with_autos(clean, 7.0)
+    sigma = 7.0 / np.sqrt(float(np.mean(clean.channel_width)) * float(clean.integration_time[0]))
+    found = assess(data, result_of(clean, 2 * sigma * normal(clean)))
+    assert "radiometer" in found.noise
+    assert np.nanmean(found.chi2_by_channel) == pytest.approx(4, rel=6 / np.sqrt(clean.data_array.size))
+
+
+def test_a_selection_of_lengths_keeps_the_autocorrelations_that_weights_need(clean):
+    data = with_autos(clean, 7.0)
+    lengths = np.linalg.norm(data.uvw_array, axis=1)
+    selection = {"lengths": (1.0, float(np.median(lengths[lengths > 0])))}
+    without = select(data, Selection(**selection))
+    assert (without.ant_1_array != without.ant_2_array).all()
+    kept = select(data, Selection(**selection, autos=True))
+    are_autos = kept.ant_1_array == kept.ant_2_array
+    assert set(kept.ant_1_array[are_autos]) == set(without.ant_1_array) | set(without.ant_2_array)
+    assert (~are_autos).sum() == without.Nblts
+
+
+@pytest.mark.parametrize("fit_autos", [False, True])
+def test_baselines_that_the_sky_model_lacks_are_left_out_and_autocorrelations_stay_if_they_are_not_fitted(
+    clean, fit_autos
+):
+    data, _ = prepare(with_autos(clean, 7.0))
+    pairs = clean.get_antpairs()[:3]
+    sky, _ = prepare(clean.select(bls=pairs, inplace=False))
+    sky.data_array *= 3
+    model, kept, notes = common_baselines(sky, data, fit_autos)
+    numbers = clean.telescope.antenna_numbers.tolist()
+    expected = set(pairs) | (set() if fit_autos else {(number, number) for number in numbers})
+    assert set(kept.get_antpairs()) == expected
+    assert set(model.get_antpairs()) == expected
+    assert np.array_equal(model.get_data(*pairs[2]), 3 * data.get_data(*pairs[2]))
+    assert fit_autos or not model.get_data(numbers[4], numbers[4]).any()
+    assert len(notes) == 1
+    assert notes[0].startswith(f"{data.Nbls - len(expected)} baselines that the sky model lacks")
+
+
+def test_a_sky_model_of_other_antennas_is_refused(clean):
+    data, _ = prepare(clean.select(bls=clean.get_antpairs()[:1], inplace=False))
+    sky, _ = prepare(clean.select(bls=clean.get_antpairs()[-1:], inplace=False))
+    with pytest.raises(InputError, match="none of the cross-correlations"):
+        common_baselines(sky, data, False)
+
+
+@pytest.fixture
+def files(clean, tmp_path, monkeypatch):
+    """Data and a sky model in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    clean.write_uvh5("data.uvh5")
+    model = clean.copy()
+    model.data_array *= 0.25
+    model.write_uvh5("sky.uvh5")
+    return tmp_path
+
+
+CALIBRATE = ["calibrate", "data.uvh5", "--sky-model", "sky.uvh5", *OPTIONS]
+
+
+def test_a_dry_run_says_what_would_be_done_and_writes_nothing(files, capsys):
+    status, told = run_command(capsys, *CALIBRATE, "--output", "out", "--dry-run")
+    assert status == 0
+    assert f"{N_TIMES} solves" in told
+    assert not (files / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_killed_calibration_is_resumed_and_gives_what_an_undisturbed_one_gives(files, capsys, monkeypatch):
+    assert run_command(capsys, *CALIBRATE, "--output", "whole")[0] == 0
+    solves = []
+    true = execution.run_calibrator
+
+    def killed(calibrator, data, *others):
+        if len(solves) == 2:
+            raise KeyboardInterrupt
+        solves.append(data.time_array[0])
+        return true(calibrator, data, *others)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("calstudy.observed.pieces.run_calibrator", killed)
+        assert run_command(capsys, *CALIBRATE, "--output", "cut")[0] == 130
+    assert not (files / "cut" / "gains.calh5").exists()
+    solves.clear()
+
+    def counted(calibrator, data, *others):
+        solves.append(data.time_array[0])
+        return true(calibrator, data, *others)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("calstudy.observed.pieces.run_calibrator", counted)
+        assert run_command(capsys, *CALIBRATE, "--output", "cut")[0] == 0
+    assert len(solves) == 2
+    whole, cut = (UVCal.from_file(files / name / "gains.calh5") for name in ("whole", "cut"))
+    assert np.array_equal(whole.gain_array, cut.gain_array)
+    assert whole.Ntimes == N_TIMES
+    # The sky model is a quarter of the data.
+    assert np.abs(whole.gain_array) == pytest.approx(2, rel=1e-6)
+    records = [json.loads((files / name / "solution.json").read_text())["records"] for name in ("whole", "cut")]
+    assert [record["integration"] for record in records[1]] == list(range(N_TIMES))
+    assert [record["last_loss"] for record in records[0]] == [record["last_loss"] for record in records[1]]
+    assert not list((files / "cut").glob(".unfinished*"))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_interference_is_warned_of_and_written(files, clean, capsys):
+    spoiled = clean.copy()
+    spoiled.data_array[:, CHANNEL] *= 1e4
+    spoiled.write_uvh5("data.uvh5", clobber=True)
+    status, told = run_command(capsys, *CALIBRATE, "--output", "out")
+    assert status == 0
+    named = f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (100 x); interference?"
+    assert named in told
+    (quality,) = json.loads((files / "out" / "solution.json").read_text())["quality"]
+    assert any(named in warning for warning in quality["warnings"])
+    assert quality["gain_by_channel"][CHANNEL] == pytest.approx(100, rel=1e-3)
+    assert len(quality["chi2_by_antenna"]) == len(quality["antennas"]) == 8
+    with np.load(files / "out" / "diagnostics.npz") as arrays:
+        assert arrays["chi2_by_channel"].shape == (clean.Nfreqs,)
+        assert str(arrays["antennas"][0]).startswith("ant")
+
+
+def test_a_field_may_be_given_as_in_an_experiment_file(files, capsys):
+    options = ["--set", "calibration.integrations_per_solve=2", "--output", "out", "--dry-run"]
+    status, told = run_command(capsys, *CALIBRATE, *options)
+    assert status == 0
+    assert f"{N_TIMES // 2} solves" in told

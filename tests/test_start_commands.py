@@ -1,0 +1,215 @@
+"""Commands to begin with, and those that look after folders: init, examples, schema, runs, store; output as JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import run_command
+from jsonschema import Draft202012Validator
+from tiny import tiny
+
+from calstudy.base.package_files import experiment_names, published
+from calstudy.cli import main as cli
+from calstudy.experiment.files import dump, override, parse_yaml, validate
+from calstudy.run.store import Store
+from calstudy.studies.json_schema import SCHEMA_FILE, experiment_schema
+
+REFUSED = 2
+
+
+def output_of(capsys, *arguments: object) -> str:
+    """Run a command that must not fail, and return what it prints."""
+    cli.app([str(argument) for argument in arguments], standalone_mode=False)
+    return capsys.readouterr().out
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def schema() -> Draft202012Validator:
+    content = json.loads(experiment_schema())
+    Draft202012Validator.check_schema(content)
+    return Draft202012Validator(content)
+
+
+def test_a_new_experiment_is_valid_with_and_without_its_commented_fields(here, capsys, schema):
+    output_of(capsys, "init", "mine")
+    text = Path("mine.yaml").read_text()
+    # A plan checks it completely.
+    assert json.loads(output_of(capsys, "plan", "mine.yaml", "--json"))["name"] == "mine"
+    commented = [line for line in text.splitlines() if re.match(r" *# [a-z_]+: ", line)]
+    assert len(commented) >= 4
+    for line in commented:
+        content = parse_yaml(text.replace(line, line.replace("# ", "", 1)), "mine.yaml")
+        assert content != parse_yaml(text, "mine.yaml"), line
+        validate(content, here)
+        assert schema.is_valid(content), line
+    assert Path(text.splitlines()[0].partition("$schema=")[2]).is_file()
+
+
+def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
+    output_of(capsys, "init", "mine", "--example", "lowsnr")
+    copied, original = (
+        yaml.safe_load(path.read_text()) for path in (here / "mine.yaml", published("experiments") / "lowsnr.yaml")
+    )
+    assert copied == {**original, "name": "mine"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["init", "taken"], "exists already, and is not overwritten"),
+        (["init", "my study"], "'my study' cannot name an experiment"),
+        (["init", "../mine"], "cannot name an experiment"),
+        (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
+        (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
+        (["schema", "--output", "nowhere/schema.json"], "--output nowhere/schema.json: cannot be written"),
+        (["runs", "nowhere"], "nowhere: no such folder of runs"),
+        (["store", "nowhere"], "nowhere: no such store"),
+        (["store", "store", "--delete"], "--delete: say which products"),
+        (["store", "store", "--older-than", "long"], "--older-than long: write a number of hours or days"),
+        (["store", "store", "--larger-than", "big"], "--larger-than big: write a positive number"),
+        (["store", "store", "--unreferenced", "--runs", "nowhere"], "nowhere: no such folder of runs"),
+    ],
+)
+def test_mistakes_are_one_sentence_and_change_nothing(arguments, told, here, capsys):
+    Path("taken.yaml").write_text("name: taken\n")
+    Path("store").mkdir()
+    status, message = run_command(capsys, *arguments)
+    assert status == REFUSED
+    assert told in message
+    assert message.count("\n") == 1
+    assert sorted(path.name for path in here.iterdir()) == ["store", "taken.yaml"]
+    assert Path("taken.yaml").read_text() == "name: taken\n"
+
+
+def test_all_published_experiments_are_listed(here, capsys):
+    listed = output_of(capsys, "examples")
+    assert all(name in listed for name in experiment_names())
+
+
+def test_the_published_schema_is_current_and_every_experiment_names_it():
+    folder = published("experiments")
+    assert (folder / SCHEMA_FILE).read_text() == experiment_schema(), "run: python -m calstudy schema"
+    for name in experiment_names():
+        first = (folder / f"{name}.yaml").read_text().splitlines()[0]
+        assert first == f"# yaml-language-server: $schema={SCHEMA_FILE}"
+
+
+@pytest.mark.parametrize("name", experiment_names())
+def test_published_experiments_follow_the_schema(name, schema):
+    content = parse_yaml((published("experiments") / f"{name}.yaml").read_text(), name)
+    assert [error.message for error in schema.iter_errors(content)] == []
+
+
+def test_an_experiment_with_every_field_follows_the_schema(schema, tmp_path):
+    content = yaml.safe_load(dump(validate(tiny(tmp_path), tmp_path)))
+    assert [error.message for error in schema.iter_errors(content)] == []
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("banana", 1),
+        ("instrument.layout", "hexx"),
+        ("instrument.layout.side", "four"),
+        ("instrument.channels.width", 80),
+        ("instrument.chanels", {}),
+        ("instrument.beam", {"kind": "airy", "radius": "3 m"}),
+        ("sky.eor.nside", 65),
+        ("corruption.effects", [{"kind": "reflection-gain"}]),
+        ("calibration", {"calibrator": "sky-based", "basis": {}}),
+        ("calibration.solver", {"name": "adam", "max_step": 3}),
+        ("outputs.figures", ["wegde"]),
+        ("sweep", {"sky.eor.seed": 3}),
+        ("realizations", {"draw": ["foregrounds"]}),
+    ],
+)
+def test_an_editor_finds_what_a_plan_finds(path, value, schema, tmp_path):
+    good = tiny(tmp_path)
+    assert schema.is_valid(good)
+    assert not schema.is_valid(override(good, path, value))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("calibration.calibrator", "mine.py:Mine"),
+        ("calibration", {"calibrator": "mine.py", "anything": 3}),
+        ("instrument.beam", "mine.py"),
+        ("instrument.location", "hera"),
+        ("instrument.location", {"latitude": "-30 deg", "longitude": "21 deg"}),
+        ("corruption.effects", ["crosstalk", {"kind": "mine.py"}]),
+        ("instrument.as_built.dipoles.dead_fraction", "15 %"),
+        ("realizations", [{"draw": ["noise"]}, {"draw": ["eor"], "count": 3}]),
+    ],
+)
+def test_an_editor_accepts_short_forms_and_files_of_ones_own(path, value, schema, tmp_path):
+    assert schema.is_valid(override(tiny(tmp_path), path, value))
+
+
+def test_a_plan_as_json_has_the_numbers_of_the_table(here, capsys):
+    Path("tiny.yaml").write_text(yaml.safe_dump(tiny(here)))
+    plan = json.loads(output_of(capsys, "plan", "tiny.yaml", "--json"))
+    table = output_of(capsys, "plan", "tiny.yaml")
+    assert {row["stage"] for row in plan["stages"]} >= {"simulate", "calibrate", "transfer"}
+    assert all(row["stage"] in table for row in plan["stages"])
+    assert plan["seconds"] == pytest.approx(sum(row["seconds"] for row in plan["stages"]))
+    assert plan["store"] == str(here / "store")
+
+
+def make_product(store: Store, stage: str, key: str, made_from: str | None = None, days: float = 0.0) -> None:
+    """Put a product into a store that was made some days ago."""
+    with store.lock(stage, key), store.building(stage, key) as folder:
+        (folder / "data.bin").write_bytes(b"x" * 1000)
+        started = (datetime.now(UTC) - timedelta(days=days)).isoformat()
+        inputs = {} if made_from is None else {"data": [stage, made_from]}
+        store.seal(folder, {"stage": stage, "key": key, "label": key, "started": started, "inputs": inputs})
+
+
+@pytest.fixture
+def used_store(here) -> Store:
+    """A store in which `b`, made from `a`, belongs to a run, and `c` and the old `d` to none."""
+    store = Store(here / "store")
+    store.prepare()
+    for key, made_from, days in (("a", None, 50), ("b", "a", 1), ("c", "a", 1), ("d", None, 50)):
+        make_product(store, "average", key, made_from, days)
+    run = here / "runs" / "mine-1234"
+    run.mkdir(parents=True)
+    manifest = {"name": "mine", "finished": datetime.now(UTC).isoformat(), "products": [{"key": "b"}]}
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    return store
+
+
+def keys(store: Store) -> set[str]:
+    return {path.name for path in (store.root / "average").iterdir() if not path.name.startswith(".")}
+
+
+def test_nothing_is_deleted_unasked_and_what_runs_were_made_from_is_kept(used_store, capsys):
+    assert "4 products" in output_of(capsys, "store")
+    assert "2 products" in output_of(capsys, "store", "--unreferenced")
+    assert "2 products" in output_of(capsys, "store", "--older-than", "30d")
+    assert "0 products" in output_of(capsys, "store", "--larger-than", "1 MB")
+    assert keys(used_store) == {"a", "b", "c", "d"}
+    told = output_of(capsys, "store", "--unreferenced", "--older-than", "30d", "--delete")
+    assert re.findall(r"deleted: average \((\w)\)", told) == ["d"]
+    assert keys(used_store) == {"a", "b", "c"}
+    told = output_of(capsys, "store", "--unreferenced", "--delete")
+    assert re.findall(r"deleted: average \((\w)\)", told) == ["c"]
+    assert keys(used_store) == {"a", "b"}
+
+
+def test_runs_are_listed(used_store, capsys):
+    listed = output_of(capsys, "runs")
+    assert "mine-1234" in listed
+    assert str(datetime.now(UTC).year) in listed
