@@ -15,7 +15,8 @@ from tiny import tiny
 
 from calstudy.base.package_files import experiment_names, published
 from calstudy.cli import main as cli
-from calstudy.experiment.files import dump, override, parse_yaml, validate
+from calstudy.experiment.files import dump, override, validate
+from calstudy.experiment.yaml_files import parse_yaml
 from calstudy.run.store import Store
 from calstudy.studies.json_schema import SCHEMA_FILE, experiment_schema
 

@@ -21,9 +21,10 @@ from calstudy.claims.evaluation import (
 from calstudy.claims.paper import Paper
 from calstudy.claims.results import RunResults
 from calstudy.claims.run_times import RunTimes
-from calstudy.experiment.files import read_mapping, validate
+from calstudy.experiment.files import validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import PAPERS
+from calstudy.experiment.yaml_files import read_mapping
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import write_claims, write_claims_by_solver
 

@@ -21,7 +21,7 @@ KINDS = {"experiments": "collection", "runtime": "run times", "calibrators": "co
 def examples() -> None:
     """List the published experiments, which `run`, `plan` and `init --example` take by name."""
     from calstudy.base.package_files import experiment_names, published
-    from calstudy.experiment.files import read_mapping
+    from calstudy.experiment.yaml_files import read_mapping
     from calstudy.verdicts.tables import Table
 
     rows = []

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import find_experiment
-from calstudy.experiment.files import read_mapping
 from calstudy.experiment.model import STUDY_NAME
+from calstudy.experiment.yaml_files import read_mapping
 
 MODELINE = "# yaml-language-server: $schema="
 """Start of the line from which editors know the schema of a file."""

@@ -10,8 +10,9 @@ from pydantic import ValidationError
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
-from calstudy.experiment.files import input_files, override, parse_override, read_mapping
+from calstudy.experiment.files import input_files, override, parse_override
 from calstudy.experiment.messages import sentences
+from calstudy.experiment.yaml_files import read_mapping
 
 DEFAULT = "calamity"
 

@@ -31,6 +31,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.power.spectra import outside_wedge
+
 if TYPE_CHECKING:
     from calstudy.power.spectra import DelaySpectra
 
@@ -224,3 +226,23 @@ def _combinations(group: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.
 def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
     used = number >= 0
     return np.bincount(number[used], np.reshape(values, number.shape)[used], size)
+
+
+def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
+    """Return how modes fall into bins of |k|, outside or inside the wedge, each unit being a sample.
+
+    Parameters
+    ----------
+    spectra
+        Whose modes.
+    edges
+        Of the bins, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
+    buffer
+        Modes with |tau| <= |b|/c + buffer (s) are inside the wedge.
+    inside
+        Which modes are meant; the others are left out.
+    """
+    bins = np.searchsorted(edges, np.hypot(spectra.k_perp[:, None], spectra.k_parallel), side="left") - 1
+    bins[(bins >= edges.size - 1) | (outside_wedge(spectra, buffer) == inside)] = -1
+    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
+    return Clusters.of(spectra, bins, samples, edges.size - 1)

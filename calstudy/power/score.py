@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calstudy.power.clusters import clusters_in_k
 from calstudy.power.spectra import DelaySpectra
-from calstudy.power.transfer import clusters_in_k
 
 BANDS = (0.1, 0.2, 0.5, 1.0)
 """Edges in h/Mpc of the bands in which calibrations are compared."""

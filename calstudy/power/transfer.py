@@ -55,9 +55,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calstudy.power.clusters import Clusters, linear_error
+from calstudy.power.clusters import Clusters, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -236,22 +235,6 @@ def flux_scale(even: np.ndarray, odd: np.ndarray, weights: np.ndarray) -> float:
     total = np.sum(np.broadcast_to(weights, power.shape), where=known)
     mean = np.sum(power * weights, where=known) / total if total > 0 else np.nan
     return float(mean**-0.5) if mean > 0 else np.nan
-
-
-def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
-    """Return how modes fall into bins of |k|, outside or inside the wedge, each unit being a sample.
-
-    Parameters
-    ----------
-    spectra
-        Whose modes.
-    edges, buffer, inside
-        As for `spherical_transfer`.
-    """
-    bins = np.searchsorted(edges, np.hypot(spectra.k_perp[:, None], spectra.k_parallel), side="left") - 1
-    bins[(bins >= edges.size - 1) | (outside_wedge(spectra, buffer) == inside)] = -1
-    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
-    return Clusters.of(spectra, bins, samples, edges.size - 1)
 
 
 def spherical_transfer(

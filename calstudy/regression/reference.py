@@ -15,8 +15,8 @@ import yaml
 from pydantic import ValidationError
 
 from calstudy.base.errors import InputError
-from calstudy.experiment.files import read_mapping
 from calstudy.experiment.model import FIGURES
+from calstudy.experiment.yaml_files import read_mapping
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import CLAIMS_FILES, CLAIMS_JSON, from_json
 from calstudy.verdicts.tolerances import Rules

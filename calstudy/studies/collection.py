@@ -16,10 +16,11 @@ from calstudy.base.schema import Section, choice, fault
 from calstudy.claims.evaluation import members_by_role, refusal_of_role
 from calstudy.claims.paper import distinct_papers, unique_notes
 from calstudy.claims.product import combined_claims
-from calstudy.experiment.files import apply_scale, override, parse_override, read_mapping, validate
+from calstudy.experiment.files import apply_scale, override, parse_override, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import FIGURES, Experiment, Outputs, StudyName
 from calstudy.experiment.realizations import expand_realizations
+from calstudy.experiment.yaml_files import read_mapping
 from calstudy.figures import ComparisonFigure, comparison_task
 from calstudy.run.task import Task
 from calstudy.studies.experiment import ExperimentStudy

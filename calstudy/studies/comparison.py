@@ -17,9 +17,10 @@ from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, choice, fault
 from calstudy.claims.paper import stand_ins
-from calstudy.experiment.files import apply_scale, dump, override, parse_override, read_mapping, validate
+from calstudy.experiment.files import apply_scale, dump, override, parse_override, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import FIGURES, Experiment, Outputs, StudyName
+from calstudy.experiment.yaml_files import read_mapping
 from calstudy.figures import CasesFigure, cases_task
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required

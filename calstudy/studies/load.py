@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calstudy.base.package_files import find_experiment
-from calstudy.experiment.files import load, read_mapping
+from calstudy.experiment.files import load
+from calstudy.experiment.yaml_files import read_mapping
 from calstudy.studies import collection, comparison, runtime
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.realizations import Realizations

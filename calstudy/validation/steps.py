@@ -12,9 +12,10 @@ from pydantic import Field, ValidationError, model_validator
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.package_files import published
 from calstudy.base.schema import Section, fault
-from calstudy.experiment.files import override, parse_override, read_mapping, validate
+from calstudy.experiment.files import override, parse_override, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
+from calstudy.experiment.yaml_files import read_mapping
 from calstudy.validation.measurement import MEASUREMENTS, Measurement
 from calstudy.verdicts.criterion import AtLeast, AtMost, Criterion, Equal, Threshold, Within
 

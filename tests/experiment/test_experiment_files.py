@@ -6,17 +6,9 @@ import pytest
 import yaml
 
 from calstudy.base.errors import InputError
-from calstudy.experiment.files import (
-    apply_scale,
-    dump,
-    load,
-    override,
-    parse_override,
-    parse_yaml,
-    read_mapping,
-    validate,
-)
+from calstudy.experiment.files import apply_scale, dump, load, override, parse_override, validate
 from calstudy.experiment.model import Experiment
+from calstudy.experiment.yaml_files import parse_yaml, read_mapping
 from calstudy.studies.collection import Collection
 from calstudy.studies.comparison import Comparison
 from calstudy.studies.experiment import ExperimentStudy
