@@ -76,7 +76,7 @@ def _die_while_building(root: Path) -> None:
 
 
 def test_a_killed_run_leaves_no_product_and_no_lock(store):
-    process = multiprocessing.get_context("fork").Process(target=_die_while_building, args=(store.root,))
+    process = multiprocessing.get_context("spawn").Process(target=_die_while_building, args=(store.root,))
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
@@ -98,7 +98,7 @@ def _make_slowly(root: Path, log: Path) -> None:
 
 
 def test_of_several_runs_one_makes_the_product_and_the_others_wait_for_it(store, tmp_path):
-    context, log = multiprocessing.get_context("fork"), tmp_path / "log"
+    context, log = multiprocessing.get_context("spawn"), tmp_path / "log"
     processes = [context.Process(target=_make_slowly, args=(store.root, log)) for _ in range(3)]
     for process in processes:
         process.start()
