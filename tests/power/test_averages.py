@@ -153,7 +153,7 @@ def test_bins_reach_the_maximum():
     edges = make_bin_edges(KBins())
     assert edges.size == 86
     assert edges[-1] == pytest.approx(3.4)
-    with pytest.raises(ValueError, match="0.5 h/Mpc must be larger than min, 1 h/Mpc"):
+    with pytest.raises(ValueError, match=r"0\.5 h/Mpc must be larger than min, 1 h/Mpc"):
         KBins(min="1.0 h/Mpc", max="0.5 h/Mpc")
     assert make_bin_edges(KBins(max="1.0 h/Mpc", width="0.3 h/Mpc"))[-1] == pytest.approx(1.2)
 
