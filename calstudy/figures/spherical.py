@@ -208,10 +208,10 @@ def _full_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
 
 
 def _zoom_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
-    """Return limits from below the noise to above the EoR and the bulk of the residuals."""
+    """Return limits from below the noise to above the EoR and the residuals."""
     low = min(np.median(_magnitudes([spectrum])) for spectrum in _present(columns, ("eor", *ZOOMED)))
     bands = [column.eor.power.real + SIGMAS_95 * column.eor.error for column in columns]
-    residuals = [np.quantile(_magnitudes([item]), 0.98) for item in _present(columns, ("residual",))]
+    residuals = [_magnitudes([item]).max() for item in _present(columns, ("residual",))]
     return 0.1 * float(low), 2 * float(max(*(np.nanmax(band) for band in bands), *residuals, low))
 
 
