@@ -82,13 +82,15 @@ def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
     InputError
         If they hold delays, or have no antennas, no feed, or not the same channels in common.
     """
-    for cal in (first, second):
+    for name, cal in (("first", first), ("second", second)):
         if cal.cal_type != "gain":
-            raise InputError(f"a file holds {cal.cal_type} solutions; gains by channel are needed")
+            raise InputError(f"the {name} file holds solutions of type {cal.cal_type!r}; gains by channel are needed")
     numbers = np.intersect1d(first.ant_array, second.ant_array)
     feeds = [int(feed) for feed in first.jones_array if feed in second.jones_array]
-    if not numbers.size or polarization >= len(feeds):
-        raise InputError("the two files have no antenna in common" if not numbers.size else "have no feed in common")
+    if not numbers.size:
+        raise InputError("the two files have no antenna in common")
+    if polarization >= len(feeds):
+        raise InputError(f"the two files have {len(feeds)} feed(s) in common; there is no number {polarization}")
     frequencies = [np.sort(np.ravel(cal.freq_array)) for cal in (first, second)]
     width = float(np.min(first.channel_width))
     if len(frequencies[0]) != len(frequencies[1]) or np.abs(np.subtract(*frequencies)).max() > SAME_CHANNEL * width:

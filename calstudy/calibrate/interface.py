@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.schema import Section, choice
+from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Frequency, Time
 from calstudy.instrument.size import Size
 
@@ -169,7 +169,7 @@ class DpssSmoothing(Smoothing):
     @model_validator(mode="after")
     def _smooths(self) -> Self:
         if self.frequency_scale is None and self.time_scale is None:
-            raise ValueError("needs a frequency_scale, a time_scale, or both")
+            raise fault("", "needs a frequency_scale, a time_scale, or both")
         return self
 
     @property
@@ -188,7 +188,7 @@ class PolynomialSmoothing(Smoothing):
     @model_validator(mode="after")
     def _smooths(self) -> Self:
         if self.frequency_degree is None and self.time_degree is None:
-            raise ValueError("needs a frequency_degree, a time_degree, or both")
+            raise fault("", "needs a frequency_degree, a time_degree, or both")
         return self
 
     @property

@@ -91,7 +91,7 @@ class TangentSpace:
                 continue
             for index in bucket.members:
                 members = np.flatnonzero(structure.groups == index)
-                responses.append(_respond(problem, members, roots[members], bucket.vectors))
+                responses.append(_response(problem, members, roots[members], bucket.vectors))
         return cls(roots, roots * model, structure.conjugated, tuple(responses), structure.prior != "none")
 
     def without_foregrounds(self, values: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ class TangentSpace:
         return result
 
 
-def _respond(problem: CalibrationProblem, members: np.ndarray, roots: np.ndarray, vectors: np.ndarray) -> Response:
+def _response(problem: CalibrationProblem, members: np.ndarray, roots: np.ndarray, vectors: np.ndarray) -> Response:
     """Return the response of one foreground model, with the sequences (Nfreqs, Nvec), on its baselines.
 
     Parameters

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, guarded
@@ -21,6 +21,7 @@ from calstudy.verdicts.tolerances import Drawn, Rules, spread_of_scale
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from calstudy.products.comparison import Case
     from calstudy.products.graph import Graph
 
 
@@ -145,9 +146,13 @@ class ComparisonFigure(StudyFigure):
 class CasesFigure(StudyFigure):
     """A figure of a comparison: calibrators in worlds.
 
-    Its `draw` reads the scores of all cases with `calstudy.products.comparison.read_cases`.
+    Attributes
+    ----------
+    scores
+        Which scores it shows, and saves as its arrays: those in ``bands`` of k, or in the experiment's ``bins``.
     """
 
+    scores: ClassVar[Literal["bands", "bins"]] = "bands"
     tolerances = ((r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),)
 
     def refusal(self, experiment: Experiment) -> str:
@@ -160,6 +165,28 @@ class CasesFigure(StudyFigure):
         from calstudy.products.score import score
 
         return {"score": required(score(graph))}
+
+    @abstractmethod
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw the figure.
+
+        Parameters
+        ----------
+        cases
+            By the labels of world and calibrator, in the order of the file; without those that a calibrator refuses.
+        job
+            Its `settings` have ``calibrators`` and ``worlds``, their labels, and ``notes``: the stand-ins to print.
+        """
+
+    def draw(self, job: Job) -> Drawing:
+        """Read the scores, and draw them."""
+        from calstudy.products.comparison import read_cases
+
+        cases = read_cases(job)
+        shown = {
+            world: {name: getattr(case, self.scores) for name, case in found.items()} for world, found in cases.items()
+        }
+        return Drawing(self.draw_cases(cases, job), shown)
 
 
 def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:

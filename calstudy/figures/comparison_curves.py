@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from calstudy.figures import CasesFigure, Drawing
+from calstudy.figures import CasesFigure
 from calstudy.figures.comparison_spectra import look
 from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
-from calstudy.products.comparison import Case, read_cases
+from calstudy.products.comparison import Case
 from calstudy.run.task import Job
 
 LINEAR = 0.01
@@ -73,8 +73,6 @@ class ComparisonCurves(CasesFigure):
 
     caption = "Transfer function and bias outside the wedge from one calibrator to the next, with 95 % bars."
 
-    def draw(self, job: Job) -> Drawing:
-        """Draw T above and the bias below."""
-        cases = read_cases(job)
-        shown = {world: {name: case.bands for name, case in found.items()} for world, found in cases.items()}
-        return Drawing(draw_curves(cases, job.settings["calibrators"], job.settings["notes"]), shown)
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw all cases."""
+        return draw_curves(cases, job.settings["calibrators"], job.settings["notes"])

@@ -12,9 +12,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from calstudy.figures import CasesFigure, Drawing
+from calstudy.figures import CasesFigure
 from calstudy.plotting import style
-from calstudy.products.comparison import Case, read_cases
+from calstudy.products.comparison import Case
 from calstudy.run.task import Job
 
 SHADES = LogNorm(1e-2, 1e2)
@@ -104,8 +104,6 @@ class ComparisonMatrix(CasesFigure):
 
     caption = "Bias of every calibrator in every world, in units of the EoR, and the part T of the EoR that is left."
 
-    def draw(self, job: Job) -> Drawing:
-        """Draw the matrices."""
-        cases = read_cases(job)
-        shown = {world: {name: case.bands for name, case in found.items()} for world, found in cases.items()}
-        return Drawing(draw_matrix(cases, job.settings["calibrators"], job.settings["notes"]), shown)
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw all cases."""
+        return draw_matrix(cases, job.settings["calibrators"], job.settings["notes"])

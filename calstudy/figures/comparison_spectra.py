@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from calstudy.figures import CasesFigure, Drawing
+from calstudy.figures import CasesFigure
 from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
-from calstudy.products.comparison import Case, read_cases
+from calstudy.products.comparison import Case
 from calstudy.run.task import Job
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
@@ -85,9 +85,8 @@ class ComparisonSpectra(CasesFigure):
     """P^R / P^S and s^2 P^R0 / P^S of every calibrator against k, a row for each world."""
 
     caption = "Recovered power (left) and bias (right) outside the wedge in units of the EoR, with 95 % bars."
+    scores = "bins"
 
-    def draw(self, job: Job) -> Drawing:
-        """Draw a row for each world."""
-        cases = read_cases(job)
-        shown = {world: {name: case.bins for name, case in found.items()} for world, found in cases.items()}
-        return Drawing(draw_spectra(cases, job.settings["calibrators"], job.settings["notes"]), shown)
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw all cases."""
+        return draw_spectra(cases, job.settings["calibrators"], job.settings["notes"])

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from calstudy.base.errors import InputError
-from calstudy.figures import CasesFigure, Drawing
+from calstudy.figures import CasesFigure
 from calstudy.figures.comparison_spectra import look
 from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
-from calstudy.products.comparison import Case, read_cases
+from calstudy.products.comparison import Case
 from calstudy.products.tolerances import BAND, LIMIT, Fault, faults
 from calstudy.run.task import Job
 
@@ -100,13 +100,11 @@ class ComparisonTolerances(CasesFigure):
 
     caption = "Bias (left) and transfer function (right) against the severity of faults, with 95 % bars."
 
-    def draw(self, job: Job) -> Drawing:
-        """Draw a row for each fault."""
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw a row for each fault; raises InputError if the worlds name none."""
         found = faults(job.settings["worlds"])
         if not found:
             raise InputError(
                 f"figure {self.label!r}: no world has a label with a fault and a number, such as 'positions: 2 cm'"
             )
-        cases = read_cases(job)
-        shown = {world: {name: case.bands for name, case in row.items()} for world, row in cases.items()}
-        return Drawing(draw_tolerances(found, cases, job.settings["calibrators"], job.settings["notes"]), shown)
+        return draw_tolerances(found, cases, job.settings["calibrators"], job.settings["notes"])

@@ -18,8 +18,9 @@ from calstudy.base.identity import digest_json
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator, Progress
 from calstudy.calibrate.records import CalibrationResult, SolveRecord
+from calstudy.products.files import GAINS, MODEL, RESIDUAL
 
-GAINS, MODEL, RESIDUAL, RECORDS = "gains.calh5", "model.uvh5", "residual.uvh5", "records.json"
+RECORDS = "records.json"
 NOT_FINITE = ("newton_decrement", "decrement_rms")
 """Numbers of a record that JSON has as null where they are NaN."""
 

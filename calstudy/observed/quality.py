@@ -64,16 +64,18 @@ class Quality:
         antennas = [f"antenna {name}" for name in self.antennas]
         inverse = 1 / np.where(self.gain_by_antenna > 0, self.gain_by_antenna, np.nan)
         found = [
-            _told("|g| is far above the antenna's median", "x", channels, highest, GAIN_FACTOR, "interference?"),
-            _told("|g| is far above that of the other antennas", "x", antennas, self.gain_by_antenna, GAIN_FACTOR),
-            _told("|g| is far below that of the other antennas", "1/", antennas, inverse, GAIN_FACTOR, "a dead one?"),
+            _sentence("|g| is far above the antenna's median", "x", channels, highest, GAIN_FACTOR, "interference?"),
+            _sentence("|g| is far above that of the other antennas", "x", antennas, self.gain_by_antenna, GAIN_FACTOR),
+            _sentence(
+                "|g| is far below that of the other antennas", "1/", antennas, inverse, GAIN_FACTOR, "a dead one?"
+            ),
         ]
         for names, values in (
             (channels, self.chi2_by_channel),
             (antennas, self.chi2_by_antenna),
             (integrations, self.chi2_by_integration),
         ):
-            found.append(_told("chi^2 is far above the median", "x", names, values / _median(values), CHI2_FACTOR))
+            found.append(_sentence("chi^2 is far above the median", "x", names, values / _median(values), CHI2_FACTOR))
         return [f"{self.polarization}: {sentence}" for sentence in found if sentence]
 
     def described(self) -> dict[str, Any]:
@@ -100,7 +102,7 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(finite)) if finite.size and np.median(finite) > 0 else np.nan
 
 
-def _told(
+def _sentence(
     what: str, sign: str, names: Sequence[str], ratios: np.ndarray, factor: float, question: str = ""
 ) -> str | None:
     """Return a sentence that names what has a ratio above a factor, the largest first; None if nothing has."""

@@ -26,7 +26,7 @@ BANDS = (0.1, 0.2, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class CalibratedSpectra:
     """Delay spectra of the same units and delays.
 
     Attributes
@@ -74,7 +74,7 @@ class Score:
     flux_scale: float = field(metadata={"unit": ""})
 
 
-def score(spectra: Calibrated, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
+def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
     """Return the scores in bins of |k|.
 
     Parameters

@@ -48,13 +48,13 @@ def score(graph: Graph) -> Task | None:
 def make_score(job: Job) -> Mapping[str, Any]:
     """Write the scores in bins and in bands of k, and all numbers to score.json."""
     from calstudy.power.score import BANDS as EDGES
-    from calstudy.power.score import Calibrated
+    from calstudy.power.score import CalibratedSpectra
     from calstudy.power.score import score as measure
     from calstudy.power.spherical import make_bin_edges
     from calstudy.power.tables import save_spectrum
 
     names = ("signal", "response", "residual", "residual_without_eor")
-    measured = Calibrated(**{name: spectra.read_delay_spectra(job.inputs[name]) for name in names})
+    measured = CalibratedSpectra(**{name: spectra.read_delay_spectra(job.inputs[name]) for name in names})
     known = read_json(job.inputs["scale"] / signal_loss.SCALE)["flux_scale"]
     scale, power = math.nan if known is None else known, job.settings["power"]
     save_spectrum(job.output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
@@ -136,8 +136,8 @@ def _held_out_chi_squared(job: Job) -> float | None:
     fitted, _ = _known_gains(job, PARITIES[0])
     even, odd = (read_visibilities(job.inputs[f"data:{parity}"] / DATA) for parity in PARITIES)
     model = read_visibilities(job.inputs[f"calibration:{PARITIES[0]}"] / MODEL)
-    pairs = antenna_pairs(even).tolist()
-    rows = [pairs.index(pair) for pair in antenna_pairs(model).tolist()]
+    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(even).tolist())}
+    rows = [places[tuple(pair)] for pair in antenna_pairs(model).tolist()]
     first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
     misfit = noise = 0.0
     cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]

@@ -34,6 +34,8 @@ from calstudy.studies.study import Budget, Made, Study
 KEY = "calibrators"
 """The key that makes a file a comparison."""
 LONGEST_LABEL = 40
+NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
+"""Keys of the experiment that the cases do not take from it."""
 VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
 )
@@ -266,28 +268,32 @@ def load_comparison(
             built_in = [name for name in FIGURES.built_in() if issubclass(FIGURES.find(name), CasesFigure)]
             hint = f"does not compare calibrators{nearest(figure.label, built_in)} (built in: {', '.join(built_in)})"
             raise ExperimentError([f"figures.{place}: {figure.label!r} {hint}; ask for it in an experiment"])
-    base, origin = _base(file, folder, scale if own is None else None, scale)
+    base, origin = _base(file, folder, scale, optional=own is not None)
     changes = dict(parse_override(text) for text in overrides)
     worlds = {world: {**fields, **changes} for world, fields in file.worlds.items()}
     cases = _make_cases(file.calibrators, worlds, base, origin)
     figures = [figure.model_dump(mode="json") for figure in _shown(file)]
-    said = {"name": file.name, "description": file.description, "experiment": base, "worlds": worlds}
+    said = {"name": file.name, "description": file.description, "experiment": _complete(base, origin), "worlds": worlds}
     return Comparison(file, cases, {**said, "calibrators": dict(file.calibrators), "figures": figures})
 
 
-def _base(
-    file: ComparisonFile, folder: Path, required_scale: str | None, scale: str | None
-) -> tuple[dict[str, Any], Path]:
+def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return an experiment with its defaults and absolute paths, which is the same wherever it is read."""
+    content = validate(base, folder).model_dump(mode="json")
+    return {key: value for key, value in content.items() if key not in NOT_SHARED}
+
+
+def _base(file: ComparisonFile, folder: Path, scale: str | None, optional: bool) -> tuple[dict[str, Any], Path]:
     """Return the content of the experiment that all cases start from, and the folder of its relative paths.
 
     Parameters
     ----------
     file, folder
         The comparison, and where it lies.
-    required_scale
-        The scale that the experiment must have; None if the comparison has it, or none was asked for.
     scale
-        The one that is applied if the experiment has it.
+        Name of a set of changes in the experiment's `scales`; None for none.
+    optional
+        Whether the experiment may lack it, for the comparison has it.
     """
     if isinstance(file.experiment, dict):
         base: dict[str, Any] = file.experiment
@@ -298,8 +304,9 @@ def _base(
     for key in (KEY, "experiments", "runtime"):
         if key in base:
             raise ExperimentError([f"experiment: has the key {key!r}, and is no single experiment"])
-    base = apply_scale(base, scale if scale in (base.get("scales") or {}) else required_scale)
-    base = {key: value for key, value in base.items() if key not in ("calibration", "sweep", "realizations", "scales")}
+    has_it = scale in (base.get("scales") or {})
+    base = apply_scale(base, scale if has_it or not optional else None)
+    base = {key: value for key, value in base.items() if key not in NOT_SHARED}
     for dotted, value in file.overrides.items():
         base = override(base, dotted, value)
     return base, folder

@@ -58,10 +58,9 @@ def _catalogue_depth(foregrounds: Foregrounds) -> int | None:
 def require_calibration(experiment: Experiment) -> None:
     """Raise InputError if the calibrator refuses the antennas, baselines and channels of an experiment."""
     if any(variant.calibrate for variant in experiment.variants.values()):
-        changes, world = assumed_changes(experiment.calibration.assumed), assumed_world(experiment)
+        world = assumed_world(experiment)
         require_beams(world.instrument)
-        has_sky_model = SKY_MODEL in changes or world.sky.has_foregrounds
-        require_calibratable(experiment.calibration, frame_of(experiment.instrument), has_sky_model)
+        require_calibratable(experiment.calibration, frame_of(experiment.instrument), _has_sky_model(experiment))
         places = [(instrument.layout, instrument.site) for instrument in (experiment.instrument, world.instrument)]
         if places[0] != places[1]:
             _require_same_antennas(make_array(experiment.instrument), make_array(world.instrument))
@@ -69,13 +68,16 @@ def require_calibration(experiment: Experiment) -> None:
 
 def refusal_of_calibrator(experiment: Experiment) -> str:
     """Return why the calibrator cannot work on the antennas, baselines and channels of an experiment, or nothing."""
-    has_sky_model = SKY_MODEL in assumed_changes(experiment.calibration.assumed)
-    has_sky_model = has_sky_model or assumed_world(experiment).sky.has_foregrounds
     try:
-        require_calibratable(experiment.calibration, frame_of(experiment.instrument), has_sky_model)
+        require_calibratable(experiment.calibration, frame_of(experiment.instrument), _has_sky_model(experiment))
     except InputError as error:
         return str(error)
     return ""
+
+
+def _has_sky_model(experiment: Experiment) -> bool:
+    given = SKY_MODEL in assumed_changes(experiment.calibration.assumed)
+    return given or assumed_world(experiment).sky.has_foregrounds
 
 
 def _require_same_antennas(true: Layout, assumed: Layout) -> None:

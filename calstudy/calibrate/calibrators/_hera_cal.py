@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -115,7 +115,8 @@ class HeraCal(Calibrator):
                 warnings.simplefilter("ignore")
                 gains[:, :, full], found = self.solve(measured, [groups[number] for number in full])
             for number, outcome in zip(full, found, strict=True):
-                ended[number] = _with_usage(outcome, usage, len(full))
+                seconds = usage.seconds / len(full)
+                ended[number] = replace(outcome, seconds=seconds, peak_memory=usage.peak_memory)
         return gains, ended
 
 
@@ -123,17 +124,6 @@ def _turned(gains: np.ndarray) -> np.ndarray:
     """Return gains, zero where there are none, whose sum over antennas is real and positive in every channel."""
     flat = gains.reshape(len(gains), -1)
     return fix_phase(flat, np.ones_like(flat)).reshape(gains.shape)
-
-
-def _with_usage(outcome: Outcome, usage: Usage, count: int) -> Outcome:
-    return Outcome(
-        status=outcome.status,
-        message=outcome.message,
-        steps=outcome.steps,
-        seconds=usage.seconds / count,
-        peak_memory=usage.peak_memory,
-        diagnostics=outcome.diagnostics,
-    )
 
 
 def patterns(used: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -22,5 +22,8 @@ class NoCalibration(Calibrator):
         shape = observation.visibilities.shape
         n_times, n_polarizations = shape[0], shape[-1]
         gains = np.ones((observation.numbers.size, shape[2], n_times, n_polarizations), complex)
+        count = n_polarizations * len(self.solves(n_times))
+        if progress is not None:
+            progress(count, count)
         outcome = Outcome(status="converged", message="gains of one: nothing is fitted")
-        return Calibration(gains=gains, outcomes=[outcome] * (n_polarizations * len(self.solves(n_times))))
+        return Calibration(gains=gains, outcomes=[outcome] * count)

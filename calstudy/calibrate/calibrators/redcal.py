@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 
 from calstudy.base.observation import Frame
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.schema import fault
 from calstudy.base.units import Length
 from calstudy.calibrate.calibrators._hera_cal import FEED, POL, HeraCal, Measured, patterns
 from calstudy.calibrate.degeneracy import fix_phase
@@ -54,7 +55,7 @@ class Redcal(HeraCal):
     @classmethod
     def _in_order(cls, steps: tuple[Step, ...]) -> tuple[Step, ...]:
         if list(steps) != [step for step in STEPS if step in steps]:
-            raise ValueError(f"must be some of {', '.join(STEPS)}, each once, in this order")
+            raise fault("", f"must be some of {', '.join(STEPS)}, each once, in this order")
         return steps
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
@@ -243,7 +244,7 @@ class _Redundant:
             _, solution = calibrator.logcal(rest, wgts=weights)
         status, steps = np.full(self.solvable.shape, "converged", "U9"), np.zeros(self.solvable.shape, int)
         if "omnical" in self.settings.steps:
-            told, solution = calibrator.omnical(
+            details, solution = calibrator.omnical(
                 rest,
                 solution,
                 wgts=weights,
@@ -252,9 +253,9 @@ class _Redundant:
                 maxiter=self.settings.max_steps,
                 check_every=CHECK_EVERY,
             )
-            steps = told["iter"]
-            perfect = told["chisq"] < PERFECT * sum(weights[key] * np.abs(rest[key]) ** 2 for key in self.data)
-            short = (told["conv_crit"] > self.settings.tolerance) & ~perfect
+            steps = details["iter"]
+            perfect = details["chisq"] < PERFECT * sum(weights[key] * np.abs(rest[key]) ** 2 for key in self.data)
+            short = (details["conv_crit"] > self.settings.tolerance) & ~perfect
             status[short] = np.where(steps[short] >= self.settings.max_steps, "max-steps", "stalled")
         solution.remove_degen(degen_sol=self._unity())
         return {key: gain * first[key] for key, gain in solution.gains.items()}, status, steps

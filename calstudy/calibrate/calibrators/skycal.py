@@ -83,13 +83,13 @@ class Skycal(HeraCal):
             DataContainer({key: row[None] for key, row in zip(keys, values, strict=True)}) for values in (ratio, weight)
         ]
         first = {(antenna, FEED): gain[None] for antenna, gain in enumerate(start)}
-        refined, told = refine_gains(
+        refined, details = refine_gains(
             *containers, first, refine_tol=self.tolerance, refine_maxiter=self.max_steps, max_divergent_chan_frac=1.0
         )
         gains = np.full(start.shape, np.nan, complex)
         for (antenna, _), gain in refined.items():
             gains[antenna] = start[antenna] * gain[0]
-        (steps,) = told["iter"].values()
+        (steps,) = details["iter"].values()
         return gains, steps
 
     def _outcome(self, steps: np.ndarray) -> Outcome:
