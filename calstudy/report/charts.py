@@ -10,18 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from calstudy.plotting import style
-
-# Series in the order of the legend: field, label, colour.
+# Series in the order of the legend: field, label, and colour by its name in page.css.
 SERIES = {
-    "eor": ("EoR, P^S", style.GREY),
-    "uncorrupted": ("perfect gains, P^(S+F+N)", style.BLACK),
-    "uncalibrated": ("uncalibrated, P^V", style.RED),
-    "residual": ("residual, P^R", style.ORANGE),
-    "residual_without_eor": ("residual without EoR", style.CYAN),
-    "noise": ("noise, P^N", style.MAGENTA),
-    "outside": ("outside the wedge", style.ORANGE),
-    "inside": ("inside the wedge", style.CYAN),
+    "eor": ("EoR, P^S", "grey"),
+    "uncorrupted": ("perfect gains, P^(S+F+N)", "black"),
+    "uncalibrated": ("uncalibrated, P^V", "red"),
+    "residual": ("residual, P^R", "orange"),
+    "residual_without_eor": ("residual without EoR", "cyan"),
+    "noise": ("noise, P^N", "magenta"),
+    "outside": ("outside the wedge", "orange"),
+    "inside": ("inside the wedge", "cyan"),
 }
 POWER = "P [mK² h⁻³ Mpc³]"
 
@@ -90,7 +88,7 @@ def _curves(title: str, label: str, logarithmic: bool, found: Mapping[str, tuple
     for name in ordered:
         k, value, error = found[name]
         kept = np.isfinite(value)
-        text, colour = SERIES.get(name, (name.replace("_", " "), style.GREY))
+        text, colour = SERIES.get(name, (name.replace("_", " "), "grey"))
         rounded = {key: _rounded(array[kept]) for key, array in (("x", k), ("y", value), ("error", error))}
         series.append({"label": text, "colour": colour, **rounded})
     data = {"kind": "curves", "x": "k [h/Mpc]", "y": label, "logarithmic": logarithmic, "series": series}

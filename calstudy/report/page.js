@@ -163,7 +163,7 @@ function makeCurves(place, data) {
   const svg = element("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img" });
   const value = document.createElement("div");
   value.className = "value";
-  const colour = (one) => (one.colour === "#000000" ? "var(--ink)" : one.colour);
+  const colour = (one) => `var(--${one.colour})`;
   const point = (x, y) => [LEFT + ranges[0].part(x) * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - ranges[1].part(height(y)) * (HEIGHT - TOP - BOTTOM)];
   const inside = ([x, y]) => x >= LEFT - 1 && x <= WIDTH - RIGHT + 1 && y >= TOP - 1 && y <= HEIGHT - BOTTOM + 1;
   const draw = () => {
