@@ -95,7 +95,7 @@ def test_another_run_is_refused(members, name, role, member, reason):
 
 def test_verdicts_follow_the_numbers():
     assert verdicts("barry2016", incomplete_sky_model=run(50), complete_sky_model=run(0.01)) == ["PASS", "PASS"]
-    assert verdicts("barry2016", incomplete_sky_model=run(0.5), complete_sky_model=run(0.2)) == ["FAIL", "FAIL"]
+    assert verdicts("barry2016", incomplete_sky_model=run(0.5), complete_sky_model=run(2)) == ["FAIL", "FAIL"]
     # Above the EoR, but within the noise.
     assert verdicts("barry2016", incomplete_sky_model=run(1.5, 3), complete_sky_model=run(0.0, 3)) == ["FAIL", "FAIL"]
     assert verdicts("byrne2019", redundant_incomplete=run(20), redundant_complete=run(0.1)) == ["PASS", "PASS"]
