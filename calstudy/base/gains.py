@@ -36,7 +36,7 @@ def read_gains(path: Path, where: str) -> UVCal:
     if path.is_dir() and find_spec("casacore") is None:
         raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
     try:
-        return UVCal.from_file(path)
+        return UVCal.from_file(str(path))
     # The readers raise whatever their libraries do; a file that cannot be read is the user's to mend.
     except (OSError, ValueError, KeyError, IndexError, RuntimeError) as error:
         kind = "CASA table of gains" if path.is_dir() else "CalH5 or calfits file"

@@ -89,6 +89,7 @@ def score(
     and χ² of data that were not fitted.
     """
     from calstudy.base.errors import InputError
+    from calstudy.products.files import quiet_libraries
     from calstudy.studies.scores import measure_scores, tables
     from calstudy.studies.study import Budget
     from calstudy.studies.worlds import load_worlds
@@ -100,9 +101,11 @@ def score(
     blocks = None
     if folder is not None:
         blocks = {name or folder.resolve().name: {"calibrator": "by-file", "folder": str(folder.resolve())}}
-    worlds = load_worlds(file, scale, overrides or (), blocks)
     console = Console(soft_wrap=True, highlight=False)
-    found = measure_scores(worlds, Budget(workers, max_memory), Console(stderr=True, soft_wrap=True, highlight=False))
+    progress = Console(stderr=True, soft_wrap=True, highlight=False)
+    with quiet_libraries():
+        worlds = load_worlds(file, scale, overrides or (), blocks)
+        found = measure_scores(worlds, Budget(workers, max_memory), progress)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8")

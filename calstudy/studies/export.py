@@ -229,10 +229,12 @@ def _write(uvd: UVData, path: Path, single: bool) -> None:
     path.unlink(missing_ok=True)
     if path.suffix == ".uvh5":
         write_visibilities(uvd, path, single)
-    elif path.suffix == ".uvfits":
-        uvd.write_uvfits(path, force_phase=True)
+        return
+    uvd.phase_to_time(uvd.time_array[0])
+    if path.suffix == ".uvfits":
+        uvd.write_uvfits(path)
     else:
-        uvd.write_ms(path, force_phase=True)
+        uvd.write_ms(str(path))
 
 
 def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
