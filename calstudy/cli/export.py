@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -64,6 +64,10 @@ Gains = Annotated[
     ),
 ]
 Name = Annotated[str | None, typer.Option(help="Label of the row; by default the name of the folder.")]
+OfClass = Annotated[
+    str | None,
+    typer.Option("--calibrator", help="In place of a folder, a calibrator: its name, a file.py, or a block in YAML."),
+]
 ScoreFile = Annotated[
     Path | None, typer.Option("--output", metavar="FILE.json", help="Write the scores, for a leaderboard.")
 ]
@@ -74,6 +78,7 @@ OverwriteScores = Annotated[bool, typer.Option("--overwrite", help="Replace an e
 def score(
     file: File,
     folder: Gains = None,
+    calibrator: OfClass = None,
     name: Name = None,
     output: ScoreFile = None,
     as_json: AsJson = False,
@@ -96,16 +101,11 @@ def score(
 
     if output is not None and output.exists() and not overwrite:
         raise InputError(f"--output {output}: is there already; use --overwrite or another name")
-    if folder is not None and not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
-    blocks = None
-    if folder is not None:
-        blocks = {name or folder.resolve().name: {"calibrator": "by-file", "folder": str(folder.resolve())}}
+    blocks = _blocks(folder, calibrator, name)
     console = Console(soft_wrap=True, highlight=False)
-    progress = Console(stderr=True, soft_wrap=True, highlight=False)
     with quiet_libraries():
         worlds = load_worlds(file, scale, overrides or (), blocks)
-        found = measure_scores(worlds, Budget(workers, max_memory), progress)
+        found = measure_scores(worlds, Budget(workers, max_memory), Console(quiet=True) if as_json else console)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8")
@@ -117,6 +117,33 @@ def score(
         console.print(table.markdown(), markup=False)
     for world, calibrator, why in found.refusals:
         console.print(f"{calibrator} cannot work in {world}: {why}", markup=False)
+
+
+def _blocks(folder: Path | None, calibrator: str | None, name: str | None) -> dict[str, Any] | None:
+    """Return the calibrator to be scored by its label, or None for those of the file."""
+    from calstudy.base.errors import InputError
+    from calstudy.experiment.yaml_files import parse_yaml
+
+    if folder is not None and calibrator is not None:
+        raise InputError("--calibrator: cannot be given together with a folder of gains")
+    if folder is not None:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder")
+        return {name or folder.resolve().name: {"calibrator": "by-file", "folder": str(folder.resolve())}}
+    if calibrator is None:
+        if name is not None:
+            raise InputError(
+                "--name: names the row of a folder or of --calibrator; those of the file have their labels"
+            )
+        return None
+    block = parse_yaml(calibrator, "--calibrator")
+    block = {"calibrator": block} if isinstance(block, str) else block
+    if not isinstance(block, dict) or not isinstance(block.get("calibrator"), str):
+        raise InputError(f"--calibrator {calibrator}: must be a name, a file.py, or a block with 'calibrator'")
+    if block["calibrator"].partition(":")[0].endswith(".py"):
+        # Paths of an option start at the working folder, not at the experiment.
+        block = {**block, "calibrator": str(Path(block["calibrator"]).absolute())}
+    return {name or Path(block["calibrator"]).stem: block}
 
 
 def leaderboard(

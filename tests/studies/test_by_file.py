@@ -3,6 +3,9 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,10 +26,13 @@ from calstudy.instrument.telescope import make_template
 from calstudy.products import corruption
 from calstudy.products.graph import Graph
 from calstudy.products.score import score
+from calstudy.studies.export import CARRIER, Contents
 from calstudy.studies.load import load_study
 from calstudy.studies.scores import Row, Scores, leaderboard, read_scores
 from calstudy.studies.study import run_study
+from calstudy.studies.worlds import load_worlds
 
+ROOT = Path(__file__).parents[2]
 CALAMITY = {"calibrator": "calamity", "prior": "sky-model", "chunks": 1}
 ASSUMED = {"sky.foregrounds.errors": {"flux_scatter": 0.01}}
 NAMES = [f"data-{number}" for number in range(1, 5)]
@@ -375,6 +381,54 @@ def test_gains_come_back_as_casa_tables(skycal, exported, tmp_path):
     found, own = (run_calibrator(ByFile(folder=place).for_data(digest), data, sky).gains for place in (folder, skycal))
     assert np.array_equal(found.flag_array, own.flag_array)
     assert np.abs(found.gain_array - own.gain_array).max() < 1e-6 * np.abs(own.gain_array).max()
+
+
+def test_the_program_of_the_challenge_page_finds_the_gains_of_skycal(exported, skycal, tmp_path):
+    """Two programs minimize the same function; the phase of all antennas together is free in every channel."""
+    folder = tmp_path / "copy"
+    shutil.copytree(exported, folder)
+    [code] = re.findall(r"```python\n(# calibrate.py.*?)```", (ROOT / "docs" / "challenge.md").read_text(), re.DOTALL)
+    (tmp_path / "calibrate.py").write_text(code)
+    subprocess.run([sys.executable, tmp_path / "calibrate.py", folder], check=True)
+    for name in NAMES:
+        found, expected = (UVCal.from_file(place / f"{name}.calh5") for place in (folder, skycal))
+        assert np.array_equal(found.flag_array, expected.flag_array)
+        products = [
+            np.where(cal.flag_array, 0, cal.gain_array)[:, None] * np.where(cal.flag_array, 0, cal.gain_array).conj()
+            for cal in (found, expected)
+        ]
+        # Both stop at changes of 1e-8 of the gains; StefCal converges by about a factor of two each step.
+        assert np.allclose(*products, atol=1e-6)
+
+
+def test_a_calibrator_is_scored_by_its_name(home, capsys):
+    path = home / "none.json"
+    change = f"calibration.assumed={json.dumps(ASSUMED)}"
+    command("score", home / "secret.yaml", "--calibrator", "none", "--set", change, "--output", path, "--workers", 1)
+    [found] = read_scores(path).rows
+    assert found.calibrator == "none"
+    # Gains of one, whose true values are off by 10 % in real and imaginary part.
+    assert found.scores["gain_error_as_fitted"] == pytest.approx(0.1 * np.sqrt(2), rel=0.3)
+    for options, sentence in {
+        ("--calibrator", "none", home): "cannot be given together with a folder",
+        ("--calibrator", "[1]"): "must be a name, a file.py, or a block",
+        ("--name", "mine"): "names the row of a folder or of --calibrator",
+        ("--output", path): "is there already; use --overwrite",
+    }.items():
+        status, text = run_command(capsys, "score", home / "secret.yaml", *options)
+        assert status == 2
+        assert sentence in text
+
+
+def test_the_leaderboard_is_up_to_date_and_its_scores_are_of_the_challenge():
+    folder = ROOT / "docs" / "challenge"
+    page = (ROOT / "docs" / "leaderboard.md").read_text()
+    assert page == leaderboard(folder), "run: python -m calstudy leaderboard docs/challenge > docs/leaderboard.md"
+    worlds = load_worlds(ROOT / "experiments" / "challenge.yaml", None, (), CARRIER)
+    digests = {case.world: Contents.of(case.experiment).digest for case in worlds.cases}
+    for path in folder.glob("*.json"):
+        for item in read_scores(path).rows:
+            assert item.digest == digests[item.world], f"{path.name}: {item.world}"
 
 
 def row(world, calibrator, bias, error, transfer, digest="d"):
