@@ -6,12 +6,16 @@ by g_a g_b*.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs
+
+CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
+"""Reads and writes CASA tables and measurement sets."""
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,19 +24,23 @@ if TYPE_CHECKING:
 
 
 def read_gains(path: Path, where: str) -> UVCal:
-    """Read a CalH5 or calfits file.
+    """Read a CalH5 or calfits file, or a CASA table (which is a folder).
 
     Raises
     ------
     InputError
-        If it is neither; `where` says who asked for it.
+        If it is none of them, or a CASA table without the package that reads it; `where` says who asked for it.
     """
     from pyuvdata import UVCal
 
+    if path.is_dir() and find_spec("casacore") is None:
+        raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
     try:
-        return UVCal.from_file(path)
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise InputError(f"{where} = {str(path)!r}: not a readable CalH5 or calfits file ({error})") from None
+        return UVCal.from_file(str(path))
+    # The readers raise whatever their libraries do; a file that cannot be read is the user's to mend.
+    except (OSError, ValueError, KeyError, IndexError, RuntimeError) as error:
+        kind = "CASA table of gains" if path.is_dir() else "CalH5 or calfits file"
+        raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({error})") from None
 
 
 def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = None) -> UVCal:
@@ -95,27 +103,77 @@ def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
     InputError
         If `cal` holds delays, or lacks an antenna, a channel or a polarization of the template.
     """
-    if cal.cal_type != "gain":
-        raise InputError(f"gains: holds {cal.cal_type} solutions; gains by channel are needed")
-    used = np.unique(antenna_pairs(template))
-    missing = np.setdiff1d(used, cal.ant_array)
+    known = template.telescope.antenna_numbers
+    require_solutions(cal, np.unique(antenna_pairs(template)), template.freq_array, np.min(template.channel_width))
+    present = np.isin(known, cal.ant_array)
+    found, flags = solutions(cal, known[present], template.freq_array, template.polarization_array)
+    gains = np.full((len(known), *found.shape[1:]), np.nan, dtype=complex)
+    gains[present] = np.where(flags, np.nan, found)
+    return gains
+
+
+def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, width: float) -> None:
+    """Raise InputError if gains are delays, or lack antennas or channels.
+
+    Parameters
+    ----------
+    cal
+        The gains.
+    numbers
+        Of antennas that must have some.
+    frequencies
+        Of channels that must have some, Hz; theirs may differ by a tenth of a channel.
+    width
+        Of the channels, Hz.
+    """
+    if cal.cal_type != "gain" or cal.wide_band:
+        kind = f"{cal.cal_type} solutions" if cal.cal_type != "gain" else "gains of whole bands"
+        raise InputError(f"gains: holds {kind}; gains by channel are needed")
+    missing = np.setdiff1d(numbers, cal.ant_array)
     if missing.size:
         raise InputError(f"gains: no solution for antenna(s) {', '.join(map(str, missing))} of the data")
-    tolerance = 0.1 * np.min(template.channel_width)
-    channels = np.abs(cal.freq_array[None] - template.freq_array[:, None]).argmin(axis=1)
-    offset = np.abs(cal.freq_array[channels] - template.freq_array)
-    if offset.max() > tolerance:
-        worst = template.freq_array[offset.argmax()]
+    offset = np.abs(cal.freq_array[None] - frequencies[:, None]).min(axis=1)
+    if offset.max() > 0.1 * width:
+        worst = frequencies[offset.argmax()]
         raise InputError(f"gains: no channel at {worst / 1e6:.4f} MHz, where the data have one")
-    feeds = []
-    for pol in template.polarization_array:
+
+
+def solutions(
+    cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, polarizations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gains of antennas that are in `cal`, at the channels closest to some frequencies.
+
+    Parameters
+    ----------
+    cal
+        The gains, see `require_solutions`.
+    numbers
+        Of antennas.
+    frequencies
+        Of channels, Hz.
+    polarizations
+        AIPS numbers.
+
+    Returns
+    -------
+    gains
+        Complex, (len(numbers), len(frequencies), Ntimes of `cal`, len(polarizations)), of the convention "divide".
+    flags
+        Of the same shape.
+
+    Raises
+    ------
+    InputError
+        If `cal` lacks a polarization.
+    """
+    for pol in polarizations:
         if pol not in cal.jones_array:
             raise InputError(f"gains: no solution for polarization {int(pol)} (AIPS number) of the data")
-        feeds.append(int(np.flatnonzero(cal.jones_array == pol)[0]))
-    gains = np.full((template.Nants_telescope, template.Nfreqs, cal.Ntimes, template.Npols), np.nan, dtype=complex)
-    for row, number in enumerate(template.telescope.antenna_numbers):
-        if number in cal.ant_array:
-            antenna = int(np.flatnonzero(cal.ant_array == number)[0])
-            flagged = cal.flag_array[antenna][channels][:, :, feeds]
-            gains[row] = np.where(flagged, np.nan, cal.gain_array[antenna][channels][:, :, feeds])
-    return 1 / gains if cal.gain_convention == "multiply" else gains
+    rows = [int(np.flatnonzero(cal.ant_array == number)[0]) for number in numbers]
+    channels = np.abs(cal.freq_array[None] - frequencies[:, None]).argmin(axis=1)
+    feeds = [int(np.flatnonzero(cal.jones_array == pol)[0]) for pol in polarizations]
+    gains, flags = (array[rows][:, channels][..., feeds] for array in (cal.gain_array, cal.flag_array))
+    if cal.gain_convention == "multiply":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gains = 1 / gains
+    return gains.astype(complex), flags

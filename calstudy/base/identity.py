@@ -25,7 +25,8 @@ def identity(value: Any) -> Any:
     Fields of sections are left out where they have their default, so that a field that comes later leaves the keys of
     earlier products alone; a default that changes must raise the version of the stages that read it. The tag of a
     choice between blocks is always there unless it is the default choice. The path of an input file counts by the
-    file's content, and a plug-in by the content of its file or the version of its package.
+    file's content, that of a folder by the names and contents of its files, and a plug-in by the content of its file or
+    the version of its package.
 
     Parameters
     ----------
@@ -39,8 +40,13 @@ def identity(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [identity(item) for item in value]
     if isinstance(value, Path):
-        return f"sha256:{digest_file(value)}"
+        return _identity_of_folder(value) if value.is_dir() else f"sha256:{digest_file(value)}"
     return value
+
+
+def _identity_of_folder(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): f"sha256:{digest_file(path)}" for path in files}
 
 
 def _identity_of_section(section: BaseModel) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 UNKEYED: JsonDict = {"keyed": False}
 """`json_schema_extra` of a field that changes how results are made, and not what they are (but for rounding)."""
+FOLDER: JsonDict = {"folder": True}
+"""`json_schema_extra` of a path that is a folder of input files."""
 
 
 class Section(BaseModel):

@@ -24,9 +24,11 @@ from calstudy.instrument.size import Size
 if TYPE_CHECKING:
     from pyuvdata import UVCal
 
-Status = Literal["converged", "max-steps", "stalled", "failed", "skipped"]
-USABLE: tuple[Status, ...] = ("converged", "max-steps", "stalled")
+Status = Literal["converged", "max-steps", "stalled", "failed", "skipped", "by-file"]
+USABLE: tuple[Status, ...] = ("converged", "max-steps", "stalled", "by-file")
 """Statuses of solves that gave gains; what others cover is flagged."""
+SETTLED: tuple[Status, ...] = ("converged", "by-file")
+"""Statuses that nobody needs to be warned of."""
 Progress = Callable[[int, int], None]
 """Called after each solve with the number done and the total."""
 
@@ -60,7 +62,8 @@ class Outcome:
     ----------
     status
         ``converged``; ``max-steps`` or ``stalled`` for gains that are usable but not those that were sought;
-        ``failed`` for none; ``skipped`` if there were no data to fit.
+        ``failed`` for none; ``skipped`` if there were no data to fit; ``by-file`` for gains of another program, of
+        which nothing else is known.
     message
         One sentence on why it stopped.
     steps
@@ -288,6 +291,19 @@ class Calibrator(Plugin):
         progress
             To be called after each solve with the number done and the total; None for no progress reports.
         """
+
+    def for_data(self, digest: str) -> Self:
+        """Return the calibrator of one data set of a run; the same for all, unless files say what to do with each.
+
+        Asked by plans. May raise InputError.
+
+        Parameters
+        ----------
+        digest
+            Of all that the data set is made from.
+        """
+        del digest
+        return self
 
     def solves(self, n_times: int) -> list[slice]:
         """Return the groups of integrations that are solved together."""

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.calibrate.interface import SETTLED
+
 if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
 
@@ -103,7 +105,7 @@ class CalibrationResult:
     @property
     def unconverged(self) -> tuple[SolveRecord, ...]:
         """The solves that did not reach the minimum."""
-        return tuple(record for record in self.solutions if record.status != "converged")
+        return tuple(record for record in self.solutions if record.status not in SETTLED)
 
     def summary(self) -> dict[str, Any]:
         """Return the number of solves by status, total seconds, and every record, as plain JSON types."""

@@ -21,6 +21,7 @@ from calstudy.cli.bench import bench_app
 from calstudy.cli.calibrate import calibrate
 from calstudy.cli.check import check_app
 from calstudy.cli.compare_gains import compare_gains
+from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.regress import regress
 from calstudy.cli.start import examples, init, schema
 from calstudy.cli.storage import runs, store
@@ -37,6 +38,9 @@ app.add_typer(data_app, name="data")
 app.command()(calibrate)
 app.command()(regress)
 app.command()(compare_gains)
+app.command()(export)
+app.command()(score)
+app.command()(leaderboard)
 # Step -1 is an argument, not an option.
 app.command(context_settings={"ignore_unknown_options": True})(validate)
 app.command()(examples)

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.plugins import load_function
+from calstudy.base.schema import FOLDER
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, AssumedWorld, assumed_changes, assumed_world, value_at
 from calstudy.experiment.messages import sentences
@@ -226,7 +227,10 @@ def _absolute(
         target = getattr(block, field)
         file = base / expand_user(target, f"{prefix}{path}")
         resolved = override(resolved, path, str(file.resolve()))
-        if not file.is_file():
+        extra = type(block).model_fields[field].json_schema_extra
+        if extra == FOLDER and not file.is_dir():
+            faults.append(f"{prefix}{path} = {str(target)!r}: no such folder (looked for {file})")
+        elif extra != FOLDER and not file.is_file():
             faults.append(_no_file(f"{prefix}{path}", target, file))
     if faults:
         raise ExperimentError(faults)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of
+from calstudy.calibrate.interface import SETTLED
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import LEVELS
@@ -45,7 +46,7 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     """
     data = corruption.data(graph, variant, parity)
     # What is assumed decides the sky model, which is an input, and nothing else.
-    settings = graph.experiment.calibration.reset("assumed")
+    settings = graph.experiment.calibration.for_data(data.key).reset("assumed")
     solves = -(-graph.experiment.instrument.times.count // settings.integrations_per_solve)
     # Gains that are smoothed in time are those of all integrations.
     together = settings.smooth_gains is not None and settings.smooth_gains.over_time
@@ -132,12 +133,12 @@ def assemble(job: Job) -> Mapping[str, Any]:
 
 
 def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) -> list[str]:
-    unconverged = len(records) - by_status.get("converged", 0)
+    unconverged = [record for record in records if record["status"] not in SETTLED]
     if not unconverged:
         return []
-    example = next(record for record in records if record["status"] != "converged")
+    example = unconverged[0]
     return [
-        f"{unconverged} of {len(records)} solves did not converge "
+        f"{len(unconverged)} of {len(records)} solves did not converge "
         f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
         f"{example['integration']}: {example['message']}"
     ]

@@ -144,7 +144,8 @@ def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, An
     for world, found in cases.items():
         lines += [f"## {world}", ""]
         if found:
-            lines += [_sky_models(found), "", _table(found).markdown()]
+            summaries = {name: case.summary for name, case in found.items()}
+            lines += [_sky_models(found), "", score_table(summaries).markdown()]
         refused = [(name, why) for place, name, why in settings["refusals"] if place == world]
         lines += [f"- {name} cannot work here: {why}" for name, why in refused] + ([""] if refused else [])
     return "\n".join(lines).rstrip() + "\n"
@@ -186,13 +187,19 @@ def _sky_models(found: Mapping[str, Case]) -> str:
     return f"Error of the sky model, rms over that of the foregrounds: {', '.join(known) or 'not known'}."
 
 
-def _table(found: Mapping[str, Case]) -> Table:
-    bands = [band["k"] for band in next(iter(found.values())).summary["bands"]]
+def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return the scores of one world as a table, a row for each calibrator.
+
+    Parameters
+    ----------
+    found
+        Contents of score.json by calibrator.
+    """
+    bands = [band["k"] for band in next(iter(found.values()))["bands"]]
     measured = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
     headings = ("calibrator", *measured, "s", "gain error", "as fitted", "χ²", "solves", "s per integration", "memory")
     rows = []
-    for name, case in found.items():
-        summary = case.summary
+    for name, summary in found.items():
         values = [_cell(band[key], band[f"{key}_error"]) for key in ("transfer", "bias") for band in summary["bands"]]
         rows.append(
             (
@@ -203,11 +210,17 @@ def _table(found: Mapping[str, Case]) -> Table:
                 _percent(summary["gain_error_as_fitted"]),
                 _cell(summary["held_out_chi_squared"], decimals=3),
                 _statuses(summary),
-                f"{summary['seconds_per_integration']:.2g}",
-                f"{summary['peak_memory'] / 1e9:.1f} GB",
+                *_cost_cells(summary),
             )
         )
     return Table(headings, rows)
+
+
+def _cost_cells(summary: Mapping[str, Any]) -> tuple[str, str]:
+    """Return seconds and memory; of gains from files nobody knows what they took."""
+    if summary["seconds_per_integration"] is None:
+        return "-", "-"
+    return f"{summary['seconds_per_integration']:.2g}", f"{summary['peak_memory'] / 1e9:.1f} GB"
 
 
 def _cell(value: float | None, error: float | None = None, decimals: int | None = None) -> str:

@@ -153,14 +153,17 @@ def _held_out_chi_squared(job: Job) -> float | None:
 
 
 def _solves(job: Job) -> dict[str, Any]:
-    """Return how the solves of the data with the EoR ended, and what one integration took."""
+    """Return how the solves of the data with the EoR ended, and what one integration took, None if nobody knows."""
     records = [
         record for parity in PARITIES for record in read_json(job.inputs[f"calibration:{parity}"] / SOLUTION)["records"]
     ]
     statuses = [record["status"] for record in records]
     integrations = sum(record["n_integrations"] for record in records)
+    by_status = {status: statuses.count(status) for status in sorted(set(statuses))}
+    if set(statuses) == {"by-file"}:
+        return {"by_status": by_status, "seconds_per_integration": None, "peak_memory": None}
     return {
-        "by_status": {status: statuses.count(status) for status in sorted(set(statuses))},
+        "by_status": by_status,
         "seconds_per_integration": sum(record["seconds"] for record in records) / integrations,
         "peak_memory": max(record["peak_memory"] for record in records),
     }

@@ -138,6 +138,8 @@ class Comparison(Study):
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the comparison with every case fitted, and the smallest number of workers of all."""
+        if all(case.refusal for case in self.cases):
+            raise InputError(f"calibrators: all refuse; {self.cases[0].calibrator}: {self.cases[0].refusal}")
         fitted, counts = [], []
         for case in self.cases:
             if case.refusal:
@@ -236,7 +238,11 @@ def _shown(file: ComparisonFile) -> list[CasesFigure]:
 
 
 def load_comparison(
-    path: Path, data: Mapping[str, Any], scale: str | None = None, overrides: Sequence[str] = ()
+    path: Path,
+    data: Mapping[str, Any],
+    scale: str | None = None,
+    overrides: Sequence[str] = (),
+    calibrators: Mapping[str, Any] | None = None,
 ) -> Comparison:
     """Validate the content of a comparison file.
 
@@ -248,6 +254,8 @@ def load_comparison(
         Name of a set of changes in the `scales` of the file, of the experiment, or of both.
     overrides
         ``path=value`` texts, applied to the experiment of every case.
+    calibrators
+        In place of those of the file.
 
     Raises
     ------
@@ -258,6 +266,8 @@ def load_comparison(
     """
     own = scale if scale in (data.get("scales") or {}) else None
     data = apply_scale(data, own)
+    if calibrators is not None:
+        data[KEY] = dict(calibrators)
     folder = path.resolve().parent
     try:
         file = ComparisonFile.model_validate(data, context={"folder": folder})
@@ -315,7 +325,7 @@ def _base(file: ComparisonFile, folder: Path, scale: str | None, optional: bool)
 def _make_cases(
     calibrators: Mapping[str, Block], worlds: Mapping[str, Mapping[str, Any]], base: Mapping[str, Any], folder: Path
 ) -> list[Case]:
-    """Return all cases; raises ExperimentError with every fault once, and InputError if all calibrators refuse."""
+    """Return all cases; raises ExperimentError with every fault once."""
     cases: list[Case] = []
     faults: dict[str, list[str]] = {}
     for world, changes in worlds.items():
@@ -334,8 +344,6 @@ def _make_cases(
             cases.append(Case(calibrator, world, experiment, refusal_of_calibrator(experiment)))
     if faults:
         raise ExperimentError([f"{sentence} (in {_listed(found)})" for sentence, found in faults.items()])
-    if all(case.refusal for case in cases):
-        raise InputError(f"calibrators: all refuse; {cases[0].calibrator}: {cases[0].refusal}")
     return cases
 
 

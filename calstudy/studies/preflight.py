@@ -8,12 +8,15 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.base.plugins import guarded
 from calstudy.calibrate.execution import require_calibratable
+from calstudy.calibrate.interface import Calibrator
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.distinct_beams import nominal_beams
 from calstudy.instrument.interface import model_of
 from calstudy.instrument.layouts import Layout, make_array, make_layout
 from calstudy.instrument.settings import InstrumentSettings
+from calstudy.products.corruption import PARITIES, data
+from calstudy.products.graph import Graph
 from calstudy.sky.counts import expected_sources
 from calstudy.sky.settings import Foregrounds, SyntheticSources
 
@@ -60,7 +63,7 @@ def require_calibration(experiment: Experiment) -> None:
     if any(variant.calibrate for variant in experiment.variants.values()):
         world = assumed_world(experiment)
         require_beams(world.instrument)
-        require_calibratable(experiment.calibration, frame_of(experiment.instrument), _has_sky_model(experiment))
+        _require_calibrators(experiment)
         places = [(instrument.layout, instrument.site) for instrument in (experiment.instrument, world.instrument)]
         if places[0] != places[1]:
             _require_same_antennas(make_array(experiment.instrument), make_array(world.instrument))
@@ -69,10 +72,23 @@ def require_calibration(experiment: Experiment) -> None:
 def refusal_of_calibrator(experiment: Experiment) -> str:
     """Return why the calibrator cannot work on the antennas, baselines and channels of an experiment, or nothing."""
     try:
-        require_calibratable(experiment.calibration, frame_of(experiment.instrument), _has_sky_model(experiment))
+        _require_calibrators(experiment)
     except InputError as error:
         return str(error)
     return ""
+
+
+def _require_calibrators(experiment: Experiment) -> None:
+    """Raise InputError if the calibrator of a data set refuses it; as a rule all data sets have the same."""
+    graph = Graph(experiment)
+    asked: list[Calibrator] = []
+    for variant in experiment.variants.values():
+        for parity in PARITIES if variant.calibrate else ():
+            calibrator = experiment.calibration.for_data(data(graph, variant, parity).key)
+            if not any(calibrator is other for other in asked):
+                asked.append(calibrator)
+                frame = frame_of(experiment.instrument)
+                require_calibratable(calibrator, frame, _has_sky_model(experiment))
 
 
 def _has_sky_model(experiment: Experiment) -> bool:

@@ -276,7 +276,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(observed, tmp_path, fault, t
         (
             KNOWN_GAINS,
             "calamty",
-            "'calamty' is not a calibrator, did you mean 'calamity'? (there are: calamity, calamity-redundant,",
+            "'calamty' is not a calibrator, did you mean 'calamity'? (there are: by-file, calamity,",
         ),
     ],
 )

@@ -1,0 +1,118 @@
+"""Folders in which data go to a calibration by another program, and its gains come back: what is in them.
+
+A folder of one experiment has `MANIFEST`, data sets ``data-1``, ``data-2``, ... and, once they are calibrated, a file
+of gains for each, and perhaps a model. Data sets are told by the digest that the manifest has of each: their names and
+order say nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import Field, ValidationError
+
+from calstudy.base.errors import InputError
+from calstudy.base.schema import Section
+
+MANIFEST = "manifest.json"
+GAINS_SUFFIXES = (".calh5", ".calfits", ".cal")
+"""CalH5, calfits, and a CASA table."""
+MODEL_SUFFIXES = (".model.uvh5", ".model.uvfits", ".model.ms")
+
+
+class DataSet(Section):
+    """One set of data, and by what it is told."""
+
+    name: str
+    file: str
+    digest: str = Field(description="Of all that the data were made from.")
+
+
+class Manifest(Section):
+    """What a folder of exported data says of itself: nothing of the experiment.
+
+    Attributes
+    ----------
+    calstudy
+        Version that wrote it.
+    digest
+        Of all data sets and the sky model: ties the folder to the experiment.
+    data
+        The data sets.
+    sky_model
+        File of the assumed visibilities of the foregrounds; None if nothing is assumed.
+    noise
+        Standard deviation of the complex noise of a sample, Jy; None if the data have none.
+    """
+
+    calstudy: str
+    digest: str
+    data: tuple[DataSet, ...]
+    sky_model: str | None = None
+    noise: float | None = None
+
+
+@dataclass(frozen=True)
+class Returned:
+    """What came back for one data set: the file of its gains, and that of a model, or None."""
+
+    gains: Path
+    model: Path | None
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read a manifest; raises InputError if it is not one."""
+    try:
+        return Manifest.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "its content"
+        raise InputError(
+            f"{path}: is not a manifest of 'calstudy export' ({where}: {first['msg']}); copy it from the export"
+        ) from None
+
+
+def find_returned(folder: Path, digest: str) -> Returned:
+    """Return what came back for the data set with a digest.
+
+    Parameters
+    ----------
+    folder
+        Of one experiment; or of several such folders, one for each world of a comparison.
+    digest
+        As in the manifest.
+
+    Raises
+    ------
+    InputError
+        If there is no manifest, none that has these data, no gains for them, or more than one file of them.
+    """
+    manifests = [folder / MANIFEST] if (folder / MANIFEST).exists() else sorted(folder.glob(f"*/{MANIFEST}"))
+    if not manifests:
+        raise InputError(f"{folder}: has no {MANIFEST}, nor has a folder in it; copy it from the export")
+    for path in manifests:
+        for data in read_manifest(path).data:
+            if data.digest == digest:
+                return _returned_for(path.parent, data.name)
+    raise InputError(
+        f"{folder}: its gains are not of these data ({MANIFEST} has other digests); they must be of data that "
+        "'calstudy export' wrote for the same experiment, with the same scale and --set, and the same version"
+    )
+
+
+def _returned_for(folder: Path, name: str) -> Returned:
+    gains = _only([folder / f"{name}{suffix}" for suffix in GAINS_SUFFIXES])
+    if gains is None:
+        allowed = ", ".join(f"{name}{suffix}" for suffix in GAINS_SUFFIXES)
+        raise InputError(f"{folder}: there are no gains for {name} (allowed: {allowed})")
+    return Returned(gains, _only([folder / f"{name}{suffix}" for suffix in MODEL_SUFFIXES]))
+
+
+def _only(paths: list[Path]) -> Path | None:
+    found = [path for path in paths if path.exists()]
+    if len(found) > 1:
+        raise InputError(f"{found[0].parent}: has {' and '.join(path.name for path in found)}; keep one of them")
+    return found[0] if found else None

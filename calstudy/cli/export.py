@@ -1,0 +1,155 @@
+"""``calstudy export``, ``score`` and ``leaderboard``: calibration by other programs, through files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+File = Annotated[
+    Path,
+    typer.Argument(help="An experiment or a comparison (YAML), or the name of a published one.", show_default=False),
+]
+Format = Annotated[str, typer.Option("--format", help="uvh5, uvfits or ms (which takes python-casacore).")]
+Output = Annotated[Path, typer.Option(help="Folder for the data; worlds of a comparison get a folder each in it.")]
+Scale = Annotated[str | None, typer.Option(help="Apply a named set of overrides of the file, such as 'small'.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set instrument.times.count=8."),
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
+MaxMemory = Annotated[
+    str | None,
+    typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier export.")]
+
+
+def export(
+    file: File,
+    output: Output,
+    file_format: Format = "uvh5",
+    scale: Scale = None,
+    overrides: Set = None,
+    workers: Workers = None,
+    max_memory: MaxMemory = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write what a calibrator may know: data, nominal telescope, sky model; nothing of the truth.
+
+    Four data sets, of both realizations of the noise, with the EoR and without, under names that do not tell, and a
+    README that says what to return. `calstudy score` takes the gains back.
+    """
+    from calstudy.products.files import quiet_libraries
+    from calstudy.studies.export import CARRIER
+    from calstudy.studies.export import export as write
+    from calstudy.studies.study import Budget
+    from calstudy.studies.worlds import load_worlds
+
+    console = Console(soft_wrap=True, highlight=False)
+    worlds = load_worlds(file, scale, overrides or (), CARRIER)
+    with quiet_libraries():
+        folders = write(worlds, output, file_format, overwrite, Budget(workers, max_memory), console)
+    for folder in folders:
+        console.print(f"{folder}", markup=False)
+
+
+Gains = Annotated[
+    Path | None,
+    typer.Argument(
+        help="Folder of gains for data of an export; without it, the calibrators of the file are scored.",
+        show_default=False,
+    ),
+]
+Name = Annotated[str | None, typer.Option(help="Label of the row; by default the name of the folder.")]
+OfClass = Annotated[
+    str | None,
+    typer.Option("--calibrator", help="In place of a folder, a calibrator: its name, a file.py, or a block in YAML."),
+]
+ScoreFile = Annotated[
+    Path | None, typer.Option("--output", metavar="FILE.json", help="Write the scores, for a leaderboard.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
+OverwriteScores = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier file of scores.")]
+
+
+def score(
+    file: File,
+    folder: Gains = None,
+    calibrator: OfClass = None,
+    name: Name = None,
+    output: ScoreFile = None,
+    as_json: AsJson = False,
+    scale: Scale = None,
+    overrides: Set = None,
+    workers: Workers = None,
+    max_memory: MaxMemory = None,
+    overwrite: OverwriteScores = False,
+) -> None:
+    """Score gains of another program, found for data of `calstudy export`, as built-in calibrators are scored.
+
+    One row for each world: T and bias free of the flux scale in three bands of k, the flux scale, errors of the gains,
+    and χ² of data that were not fitted.
+    """
+    from calstudy.base.errors import InputError
+    from calstudy.products.files import quiet_libraries
+    from calstudy.studies.scores import measure_scores, tables
+    from calstudy.studies.study import Budget
+    from calstudy.studies.worlds import load_worlds
+
+    if output is not None and output.exists() and not overwrite:
+        raise InputError(f"--output {output}: is there already; use --overwrite or another name")
+    blocks = _blocks(folder, calibrator, name)
+    console = Console(soft_wrap=True, highlight=False)
+    with quiet_libraries():
+        worlds = load_worlds(file, scale, overrides or (), blocks)
+        found = measure_scores(worlds, Budget(workers, max_memory), Console(quiet=True) if as_json else console)
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    if as_json:
+        typer.echo(found.model_dump_json(indent=1))
+        return
+    for world, table in tables(found).items():
+        console.print(f"{world}:", markup=False)
+        console.print(table.markdown(), markup=False)
+    for world, calibrator, why in found.refusals:
+        console.print(f"{calibrator} cannot work in {world}: {why}", markup=False)
+
+
+def _blocks(folder: Path | None, calibrator: str | None, name: str | None) -> dict[str, Any] | None:
+    """Return the calibrator to be scored by its label, or None for those of the file."""
+    from calstudy.base.errors import InputError
+    from calstudy.experiment.yaml_files import parse_yaml
+
+    if folder is not None and calibrator is not None:
+        raise InputError("--calibrator: cannot be given together with a folder of gains")
+    if folder is not None:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder")
+        return {name or folder.resolve().name: {"calibrator": "by-file", "folder": str(folder.resolve())}}
+    if calibrator is None:
+        if name is not None:
+            raise InputError(
+                "--name: names the row of a folder or of --calibrator; those of the file have their labels"
+            )
+        return None
+    block = parse_yaml(calibrator, "--calibrator")
+    block = {"calibrator": block} if isinstance(block, str) else block
+    if not isinstance(block, dict) or not isinstance(block.get("calibrator"), str):
+        raise InputError(f"--calibrator {calibrator}: must be a name, a file.py, or a block with 'calibrator'")
+    if block["calibrator"].partition(":")[0].endswith(".py"):
+        # Paths of an option start at the working folder, not at the experiment.
+        block = {**block, "calibrator": str(Path(block["calibrator"]).absolute())}
+    return {name or Path(block["calibrator"]).stem: block}
+
+
+def leaderboard(
+    folder: Annotated[Path, typer.Argument(help="Folder of files of `calstudy score --output`.", show_default=False)],
+) -> None:
+    """Print a page (Markdown) that ranks all scores of a folder, by world and over all of them."""
+    from calstudy.studies.scores import leaderboard as page
+
+    typer.echo(page(folder), nl=False)

@@ -1,0 +1,267 @@
+"""Export: what a calibrator may know of an experiment, in files for other programs, and nothing of the truth."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from calstudy import __version__
+from calstudy.base.errors import InputError
+from calstudy.base.gains import CASACORE
+from calstudy.base.identity import digest_json
+from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest
+from calstudy.calibrate.standard_formats import PARALLEL_HANDS
+from calstudy.experiment.assumed import assumed_world
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
+from calstudy.products import corruption, sky_model
+from calstudy.products.corruption import LEVELS, PARITIES
+from calstudy.products.files import DATA, VISIBILITIES, read_json, read_visibilities, write_visibilities
+from calstudy.products.graph import Graph
+from calstudy.run.execution import Workers
+from calstudy.run.store import Product, Store
+from calstudy.run.task import Task
+from calstudy.studies.capacity import fit
+from calstudy.studies.comparison import Comparison
+from calstudy.studies.folder import log_to, write
+from calstudy.studies.study import Budget, make
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+FORMATS = ("uvh5", "uvfits", "ms")
+README, LOG = "README.md", "export.log"
+SKY_MODEL = "sky-model"
+CARRIER = {"none": "none"}
+"""The calibrator of worlds that are exported: data and what is assumed do not depend on it."""
+TEXT = """\
+# Data to be calibrated
+
+Written by calstudy {version}. The data are simulated: {antennas} antennas, {channels} channels from {first:.3f} to
+{last:.3f} MHz, {times} integrations of {integration:g} s, polarization{plural} {polarizations}.
+
+| file | content |
+|---|---|
+{rows}
+| `{manifest}` | what ties this folder to its experiment; return it with the gains |
+
+## What to return
+
+For every data file a file of gains, in this folder or in a new one with a copy of `{manifest}`:
+{returned}. Allowed are CalH5 (`.calh5`), calfits (`.calfits`)
+and CASA tables (`.cal`, a folder).
+
+Besides, if you fitted one, a model of the foregrounds for every data file: {models}
+and so on (or `.model.uvfits`, `.model.ms`), visibilities in Jy before any gains, with the samples of the data, none of
+them flagged. Without it, {default}.
+
+Calibrate every data file by itself. The files differ in their noise and in what they contain; to compare them with each
+other is not calibration.
+
+## Conventions
+
+- V_measured = g_a conj(g_b) V_true for the baselines (a, b) of the files; noise is part of V_true. Gains are of the
+  convention "divide" of pyuvdata: data are calibrated by dividing by g_a conj(g_b). Files that say "multiply" are
+  inverted.
+- Gains are complex numbers for every antenna, channel and feed; antennas are told by their numbers. They are for one
+  time, which holds for all, or for every integration (times agree within half an integration).
+- Gains that are not known are flagged; samples with a flagged gain, and data that are flagged, have no part in the
+  result.
+- Feed x is east-west, feed y north-south; V_xx = I / 2 for unpolarized emission of Stokes I.
+- Fluxes are in Jy. {phase}
+- Samples that are not flagged have the same weight; nsamples is one everywhere.
+- {noise}
+- Antenna positions, and the sky model, are what is assumed, and need not be true.
+"""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The tasks of what is exported of one experiment.
+
+    Attributes
+    ----------
+    experiment
+        Validated; it calibrates data with the EoR and without.
+    data
+        The data sets, in the order of their keys, which says nothing of them.
+    sky_model
+        None if nothing is assumed of the sky.
+    levels
+        For the level of the noise; None if there is none.
+    """
+
+    experiment: Experiment
+    data: tuple[Task, ...]
+    sky_model: Task | None
+    levels: Task | None
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Contents:
+        """Return what is exported of an experiment."""
+        graph = Graph(experiment)
+        variants = [experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS[:2]]
+        data = {
+            task.key: task
+            for task in (corruption.data(graph, variant, parity) for variant in variants for parity in PARITIES)
+        }
+        noisy = any("noise" in variant.components for variant in variants)
+        return cls(
+            experiment,
+            tuple(data[key] for key in sorted(data)),
+            sky_model.sky_model(graph),
+            corruption.levels(graph) if noisy else None,
+        )
+
+    @property
+    def digest(self) -> str:
+        """Of all data sets and the sky model."""
+        return digest_json([*(task.key for task in self.data), self.sky_model and self.sky_model.key])
+
+    @property
+    def tasks(self) -> list[Task]:
+        """All of them."""
+        return [*self.data, *(task for task in (self.sky_model, self.levels) if task is not None)]
+
+
+def export(
+    worlds: Comparison, folder: Path, file_format: str, overwrite: bool, budget: Budget, console: Console
+) -> list[Path]:
+    """Write the data of every world, making what is not in the store.
+
+    Parameters
+    ----------
+    worlds
+        From `calstudy.studies.worlds.load_worlds`, with the calibrator `CARRIER`.
+    folder
+        Of the one world there is; several get a folder each in it, ``world-1`` and so on.
+    file_format
+        One of `FORMATS`.
+    overwrite
+        Whether files may be replaced.
+    budget, console
+        As for `calstudy.studies.study.run_study`.
+
+    Returns
+    -------
+    The folders.
+
+    Raises
+    ------
+    InputError
+        If files would be replaced, or the data cannot be made or written.
+    """
+    if file_format not in FORMATS:
+        raise InputError(f"--format {file_format}: not a format of visibilities (allowed: {', '.join(FORMATS)})")
+    if file_format == "ms" and find_spec("casacore") is None:
+        raise InputError(f"--format ms: takes {CASACORE}")
+    several = len(worlds.cases) > 1
+    folders = [folder / f"world-{place + 1}" if several else folder for place in range(len(worlds.cases))]
+    _require_free(folders, overwrite)
+    fits = [fit(case.experiment, budget, lambda wanted: Contents.of(wanted).tasks) for case in worlds.cases]
+    contents = [Contents.of(experiment) for experiment, _ in fits]
+    runs = worlds.outputs.runs.expanduser()
+    runs.mkdir(parents=True, exist_ok=True)
+    with log_to(runs / LOG):
+        workers = Workers(min(count for _, count in fits), runs / LOG, budget.scheduler)
+        targets = [task for content in contents for task in content.tasks]
+        products = make(targets, Store(worlds.outputs.store), workers, console).products
+        for content, place in zip(contents, folders, strict=True):
+            place.mkdir(parents=True, exist_ok=True)
+            _write_world(content, products, place, file_format)
+    return folders
+
+
+def _require_free(folders: Sequence[Path], overwrite: bool) -> None:
+    for folder in folders:
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"--output {folder}: is a file, not a folder")
+        if not overwrite and folder.is_dir() and any(folder.iterdir()):
+            raise InputError(f"--output {folder}: holds files already; use --overwrite or another folder")
+
+
+def _write_world(content: Contents, products: Mapping[str, Product], folder: Path, file_format: str) -> None:
+    from calstudy.instrument.telescope import make_template
+
+    template = make_template(assumed_world(content.experiment).instrument, as_built=True)
+    # A layout may be named after a file.
+    template.telescope.name = template.telescope.instrument = "calstudy"
+    template.history = "calstudy export"
+    sets = []
+    for number, task in enumerate(content.data, start=1):
+        file = f"data-{number}.{file_format}"
+        _write(_at(template, read_visibilities(products[task.key].path / DATA)), folder / file, single=True)
+        sets.append(DataSet(name=f"data-{number}", file=file, digest=task.key))
+    model = content.sky_model
+    if model is not None:
+        sky = read_visibilities(products[model.key].path / VISIBILITIES)
+        _write(_at(template, sky), folder / f"{SKY_MODEL}.{file_format}", single=False)
+    levels = content.levels
+    manifest = Manifest(
+        calstudy=__version__,
+        digest=content.digest,
+        data=tuple(sets),
+        sky_model=None if model is None else f"{SKY_MODEL}.{file_format}",
+        noise=None if levels is None else read_json(products[levels.key].path / LEVELS)["noise_std"],
+    )
+    write(folder / README, _readme(manifest, template, file_format))
+    write(folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+
+
+def _at(template: UVData, uvd: UVData) -> UVData:
+    """Return visibilities and flags with the metadata of the template, and with nothing else."""
+    from calstudy.base.visibilities import flag_cube, from_cube, to_cube
+
+    found = from_cube(template, to_cube(uvd))
+    flag_cube(found)[:] = flag_cube(uvd)
+    return found
+
+
+def _write(uvd: UVData, path: Path, single: bool) -> None:
+    """Write visibilities in the format that the path ends with; `single` stores complex64, as uvfits and ms always."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    if path.suffix == ".uvh5":
+        write_visibilities(uvd, path, single)
+        return
+    uvd.phase_to_time(uvd.time_array[0])
+    if path.suffix == ".uvfits":
+        uvd.write_uvfits(path)
+    else:
+        uvd.write_ms(str(path))
+
+
+def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
+    names = [item.name for item in manifest.data]
+    rows = [f"| `{item.file}` | data to be calibrated, with flags |" for item in manifest.data]
+    phased = f"Data are phased to the zenith of the first integration, as {file_format} wants them."
+    if manifest.sky_model is not None:
+        rows.append(f"| `{manifest.sky_model}` | visibilities of the foregrounds as far as they are known |")
+    return TEXT.format(
+        version=manifest.calstudy,
+        antennas=template.Nants_data,
+        channels=template.Nfreqs,
+        first=template.freq_array.min() / 1e6,
+        last=template.freq_array.max() / 1e6,
+        times=template.Ntimes,
+        integration=template.integration_time[0],
+        plural="s" if template.Npols > 1 else "",
+        polarizations=", ".join(PARALLEL_HANDS[int(number)] for number in template.polarization_array),
+        rows="\n".join(rows),
+        manifest=MANIFEST,
+        returned=", ".join(f"`{name}.calh5`" for name in names),
+        models=f"`{names[0]}.model.uvh5`",
+        default="the gains cannot be scored, for nothing is assumed of the sky"
+        if manifest.sky_model is None
+        else f"`{manifest.sky_model}` is subtracted from the calibrated data",
+        phase="The telescope drifts: data are not phased." if file_format == "uvh5" else phased,
+        noise="The data have no noise."
+        if manifest.noise is None
+        else f"The standard deviation of their complex noise, before any gains, is {manifest.noise:.6g} Jy.",
+    )

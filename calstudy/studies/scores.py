@@ -1,0 +1,229 @@
+"""Scores of calibrators as files, and the page that ranks them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from rich.console import Console
+
+from calstudy import __version__
+from calstudy.base.errors import InputError
+from calstudy.base.schema import Section
+from calstudy.products.comparison import score_table
+from calstudy.products.files import read_json
+from calstudy.products.graph import Graph, required
+from calstudy.products.score import SUMMARY
+from calstudy.products.score import score as score_task
+from calstudy.run.execution import Workers
+from calstudy.run.store import Store
+from calstudy.studies.comparison import Comparison
+from calstudy.studies.export import Contents
+from calstudy.studies.folder import log_to
+from calstudy.studies.study import Budget, make
+from calstudy.verdicts.tables import Table
+
+LOG = "score.log"
+SIGMAS = 2.0
+LIMIT = 1.0
+"""A band of k counts if the bias with so many standard deviations is below this part of the EoR."""
+
+
+class Row(Section):
+    """The scores of one calibrator in one world.
+
+    Attributes
+    ----------
+    world, calibrator
+        Their labels.
+    digest
+        Of the data and the sky model of the world, as in the manifest of an export.
+    scores
+        As in score.json.
+    """
+
+    world: str
+    calibrator: str
+    digest: str
+    scores: dict[str, Any]
+
+
+class Scores(Section):
+    """What a file of scores holds.
+
+    Attributes
+    ----------
+    calstudy
+        Version that measured them.
+    name
+        Of the experiment or comparison.
+    rows
+        World by world.
+    refusals
+        World, calibrator, and why it cannot work there.
+    """
+
+    calstudy: str
+    name: str
+    rows: tuple[Row, ...]
+    refusals: tuple[tuple[str, str, str], ...] = ()
+
+
+def measure_scores(study: Comparison, budget: Budget, console: Console) -> Scores:
+    """Return the scores of all cases of a comparison, making what is not in the store.
+
+    Parameters
+    ----------
+    study
+        From `calstudy.studies.worlds.load_worlds`.
+    budget, console
+        As for `calstudy.studies.study.run_study`.
+    """
+    study, count = study.fitted(budget)
+    runs = study.outputs.runs.expanduser()
+    runs.mkdir(parents=True, exist_ok=True)
+    cases = [case for case in study.cases if not case.refusal]
+    tasks = [required(score_task(Graph(case.experiment, keep_visibilities=False))) for case in cases]
+    with log_to(runs / LOG):
+        workers = Workers(count, runs / LOG, budget.scheduler)
+        made = make(tasks, Store(study.outputs.store), workers, console)
+    rows = [
+        Row(
+            world=case.world,
+            calibrator=case.calibrator,
+            digest=Contents.of(case.experiment).digest,
+            scores=read_json(made.products[task.key].path / SUMMARY),
+        )
+        for case, task in zip(cases, tasks, strict=True)
+    ]
+    refusals = tuple((case.world, case.calibrator, case.refusal) for case in study.cases if case.refusal)
+    return Scores(calstudy=__version__, name=study.name, rows=tuple(rows), refusals=refusals)
+
+
+def tables(scores: Scores) -> dict[str, Table]:
+    """Return a table for each world, as the comparison of calibrators has it."""
+    worlds = dict.fromkeys(row.world for row in scores.rows)
+    return {
+        world: score_table({row.calibrator: row.scores for row in scores.rows if row.world == world})
+        for world in worlds
+    }
+
+
+def read_scores(path: Path) -> Scores:
+    """Read a file of scores; raises InputError if it is none."""
+    try:
+        return Scores.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "its content"
+        raise InputError(f"{path}: is not a file of 'calstudy score --output' ({where}: {first['msg']})") from None
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """How a row is ranked: how many bands count, and the mean T in them; or the bias, if none does."""
+
+    clean: int
+    bands: int
+    transfer: float
+    worst: float
+
+    @classmethod
+    def of(cls, row: Row) -> _Standing:
+        limits, kept = [], []
+        for band in row.scores["bands"]:
+            known = band["bias"] is not None and band["bias_error"] is not None and band["transfer"] is not None
+            limit = abs(band["bias"]) + SIGMAS * band["bias_error"] if known else float("inf")
+            limits.append(limit)
+            if limit < LIMIT:
+                kept.append(band["transfer"])
+        return cls(len(kept), len(limits), sum(kept) / len(kept) if kept else 0.0, min(limits))
+
+    @property
+    def order(self) -> tuple[float, ...]:
+        return -self.clean, -self.transfer, self.worst
+
+    @property
+    def text(self) -> str:
+        return f"{self.clean} of {self.bands}" + (f", T {self.transfer:.2f}" if self.clean else "")
+
+
+def leaderboard(folder: Path) -> str:
+    """Return a page (Markdown) that ranks all scores of a folder.
+
+    Parameters
+    ----------
+    folder
+        Of files from `calstudy score --output`.
+
+    Raises
+    ------
+    InputError
+        If there are none, or they do not belong together: other data under the same name of a world, or a calibrator
+        that occurs twice in a world.
+    """
+    paths = sorted(folder.glob("*.json"))
+    if not paths:
+        raise InputError(f"{folder}: has no files of scores (*.json, from 'calstudy score --output')")
+    found = {path: read_scores(path) for path in paths}
+    worlds: dict[str, dict[str, Row]] = {}
+    for path, scores in found.items():
+        for row in scores.rows:
+            rows = worlds.setdefault(row.world, {})
+            _require_fitting(path, row, rows)
+            rows[row.calibrator] = row
+    names = ", ".join(dict.fromkeys(scores.name for scores in found.values()))
+    lines = [f"# Leaderboard: {names}", "", *_explanation(), "", _overview(worlds).markdown()]
+    for world, rows in worlds.items():
+        ranked = sorted(rows.values(), key=lambda row: _Standing.of(row).order)
+        lines += [f"## {world}", "", score_table({row.calibrator: row.scores for row in ranked}).markdown()]
+        refused = [
+            (calibrator, why)
+            for scores in found.values()
+            for place, calibrator, why in scores.refusals
+            if place == world
+        ]
+        lines += [f"- {calibrator} cannot work here: {why}" for calibrator, why in refused] + ([""] if refused else [])
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _explanation() -> list[str]:
+    return [
+        "Each cell: in how many bands of k the bias is below the EoR with two standard deviations, |bias| + 2σ < 1, "
+        "and the mean of T in these bands. Rows are ordered by these two, added up over worlds. T is the part of the "
+        "EoR's power that is left, the bias the power of the residual without EoR over that of the EoR; both are free "
+        "of the flux scale. All columns of the tables are explained in the [guide](guide.md#comparisons).",
+    ]
+
+
+def _require_fitting(path: Path, row: Row, rows: Mapping[str, Row]) -> None:
+    others = [other for other in rows.values() if other.digest != row.digest]
+    if others:
+        raise InputError(
+            f"{path}: {row.calibrator!r} was scored on other data than {others[0].calibrator!r} in the world "
+            f"{row.world!r} (their digests differ); score it again with the same experiment and version"
+        )
+    if row.calibrator in rows:
+        raise InputError(f"{path}: {row.calibrator!r} has scores in the world {row.world!r} twice; use another --name")
+
+
+def _overview(worlds: Mapping[str, Mapping[str, Row]]) -> Table:
+    standings = {
+        name: {world: _Standing.of(rows[name]) for world, rows in worlds.items() if name in rows}
+        for name in dict.fromkeys(name for rows in worlds.values() for name in rows)
+    }
+
+    def order(name: str) -> tuple[float, ...]:
+        found = standings[name].values()
+        return -sum(item.clean for item in found), -sum(item.clean * item.transfer for item in found)
+
+    rows: Sequence[Sequence[str]] = [
+        (name, *(standings[name][world].text if world in standings[name] else "-" for world in worlds))
+        for name in sorted(standings, key=order)
+    ]
+    return Table(("calibrator", *worlds), rows)
