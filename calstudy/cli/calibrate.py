@@ -318,9 +318,12 @@ def _figure(data: UVData, result: CalibrationResult, notes: list[str]) -> tuple[
 
 def _expected(data: UVData, sky: UVData | None, calibrator: GainFit, result: CalibrationResult) -> dict[str, Any]:
     """Return the expected transfer function of every polarization that has solutions."""
+    from calstudy.base.observation import Observation
+    from calstudy.calibrate.interface import Assumed
     from calstudy.measured.expectation import expect
 
-    found = {pol: expect(data, calibrator, result, sky, index) for index, pol in enumerate(result.model.get_pols())}
+    assumed = Assumed(None if sky is None else Observation(sky))
+    found = {pol: expect(data, calibrator, result, assumed, index) for index, pol in enumerate(result.model.get_pols())}
     return {pol: expected for pol, expected in found.items() if expected is not None}
 
 

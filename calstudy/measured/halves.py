@@ -11,7 +11,7 @@ from calstudy.base.errors import InputError
 from calstudy.calibrate.standard_formats import PARALLEL_HANDS
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
-from calstudy.measured.selection import Selection, select
+from calstudy.measured.selection import Selection, parse_values, select
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -77,7 +77,7 @@ class Facts:
         )
 
 
-def read_facts(paths: tuple[Path, ...], selection: Selection) -> Facts:
+def read_facts(paths: tuple[Path, ...], selection: Selection, positions: Path | None = None) -> Facts:
     """Read the metadata of measured data.
 
     Parameters
@@ -86,6 +86,8 @@ def read_facts(paths: tuple[Path, ...], selection: Selection) -> Facts:
         Of files or folders that belong together.
     selection
         The part that is wanted.
+    positions
+        File of the antennas' positions, in place of those in the data.
 
     Raises
     ------
@@ -93,9 +95,13 @@ def read_facts(paths: tuple[Path, ...], selection: Selection) -> Facts:
         If the files cannot be read, or what is selected has no baselines, or not at least eight channels at equal
         distances.
     """
+    from calstudy.measured.positions import place_antennas
     from calstudy.measured.reading import read_metadata
 
-    data = select(read_metadata(paths), selection)
+    data = read_metadata(paths)
+    if positions is not None:
+        place_antennas(data, positions)
+    data = select(data, selection)
     positions = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)
     crosses = pairs[pairs[:, 0] != pairs[:, 1]]
@@ -166,6 +172,19 @@ def interleaved(data: UVData, parity: str) -> UVData:
     times = np.arange(PARITIES.index(parity), data.Ntimes, 2)
     rows = (times[:, None] * data.Nbls + np.arange(data.Nbls)).ravel()
     return data.select(blt_inds=rows, inplace=False, run_check=False)
+
+
+def flag_channels(data: UVData, text: str) -> None:
+    """Flag the channels in a range of frequencies, such as ``149.7 MHz..150.2 MHz``; raises InputError if none is."""
+    low, high = parse_values({"frequencies": text}, "observed.flag: ").frequencies or (None, None)
+    frequencies = np.ravel(data.freq_array)
+    chosen = (frequencies >= (low or -np.inf)) & (frequencies <= (high or np.inf))
+    if not chosen.any():
+        raise InputError(
+            f"observed.flag: {text!r} has no channel of the data, which have {frequencies.min() / 1e6:.3f} to "
+            f"{frequencies.max() / 1e6:.3f} MHz"
+        )
+    data.flag_array[:, chosen] = True
 
 
 def east_and_north(data: UVData) -> list[str]:

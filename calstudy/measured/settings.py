@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin
@@ -58,6 +58,17 @@ def _as_list(paths: Any) -> Any:
 
 DataFile = Annotated[Path, BeforeValidator(_find), Field(strict=False)]
 DataFiles = Annotated[tuple[DataFile, ...], BeforeValidator(_as_list), Field(strict=False)]
+
+
+def _can_be_a_range(value: str) -> str:
+    try:
+        parse_values({"frequencies": value}, "")
+    except InputError as error:
+        raise fault("", f"{value!r}: {str(error).partition(': ')[2]}") from None
+    return value
+
+
+FrequencyRange = Annotated[str, AfterValidator(_can_be_a_range)]
 
 
 class Select(Section):
@@ -115,6 +126,14 @@ class ObservedSettings(Section):
         "odd. Empty: every second integration of `data`.",
     )
     select: Select = Select()
+    flag: Annotated[tuple[FrequencyRange, ...], Field(strict=False)] = Field(
+        (), description="Channels that are flagged, such as those of known interference: ['149.7 MHz..150.2 MHz']."
+    )
+    positions: DataFile | None = Field(
+        None,
+        description="Antenna positions in place of those in the data: a CSV file with columns number, east_m, north_m "
+        "and up_m.",
+    )
     sky_model: DataFile | None = Field(
         None, description="Visibilities of the sky as far as it is known, in Jy, with the times and channels of `data`."
     )

@@ -114,6 +114,10 @@ def observed(graph: ObservedGraph, parity: str) -> Task:
         "size": {name: getattr(size, name) for name in size.__dataclass_fields__},
         "parity": parity if halves.interleaved else None,
     }
+    if section.flag:
+        settings["flag"] = list(section.flag)
+    if section.positions is not None:
+        settings["positions"] = section.positions
     if section.sky_model is not None:
         autos = isinstance(graph.calibration, GainFit) and graph.calibration.autos
         settings |= {"sky_model": section.sky_model, "autos": autos}
@@ -195,17 +199,22 @@ def noise_power(graph: ObservedGraph, what: str, source: str) -> Task:
 def observe(job: Job) -> Mapping[str, Any]:
     """Write the data of one half to data.uvh5, and the sky model to visibilities.uvh5."""
     from calstudy.calibrate.sky_model import common_baselines
-    from calstudy.measured.halves import east_and_north, interleaved
+    from calstudy.measured.halves import east_and_north, flag_channels, interleaved
+    from calstudy.measured.positions import place_antennas
     from calstudy.measured.reading import prepare, read_visibilities
     from calstudy.measured.selection import Selection
 
-    settings = job.settings
-    selection = settings["select"].selection
+    settings, placed = job.settings, []
+    data = read_visibilities(settings["files"])
+    if "positions" in settings:
+        placed = [place_antennas(data, settings["positions"])]
     try:
-        data, notes = prepare(read_visibilities(settings["files"]), selection)
+        data, notes = prepare(data, settings["select"].selection)
     except InputError as error:
         raise InputError(str(error).replace("--select ", "observed.select.")) from None
-    notes += east_and_north(data)
+    notes = placed + notes + east_and_north(data)
+    for text in settings.get("flag", ()):
+        flag_channels(data, text)
     sky = None
     if "sky_model" in settings:
         sky, sky_notes = prepare(read_visibilities([settings["sky_model"]]), Selection())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from calstudy.calibrate.records import CalibrationResult
 
 QUALITY = "quality.json"
+NUMBERS = ("newton_decrement", "decrement_rms", "first_loss", "last_loss")
+"""Of a record, which JSON has as null where they are not known."""
 
 
 @once
@@ -47,13 +50,21 @@ def quality(graph: ObservedGraph) -> Task:
 
 
 def read_result(folder: Path) -> CalibrationResult:
-    """Read a product of stage `calibrate`, without the records of the solves."""
+    """Read a product of stage `calibrate`; its records have the first and the last loss only."""
+    import numpy as np
     from pyuvdata import UVCal
 
-    from calstudy.calibrate.records import CalibrationResult
+    from calstudy.calibrate.records import CalibrationResult, SolveRecord
 
     model, residual = (read_visibilities(folder / name) for name in (MODEL, RESIDUAL))
-    return CalibrationResult(gains=UVCal.from_file(folder / GAINS), model=model, residual=residual, solutions=())
+    records = []
+    for summary in read_json(folder / SOLUTION)["records"]:
+        known = {name: math.nan if value is None and name in NUMBERS else value for name, value in summary.items()}
+        losses = np.array([known.pop("first_loss"), known.pop("last_loss")], dtype=float)
+        records.append(SolveRecord(**known, loss_history=losses))
+    return CalibrationResult(
+        gains=UVCal.from_file(folder / GAINS), model=model, residual=residual, solutions=tuple(records)
+    )
 
 
 def assess(job: Job) -> Mapping[str, Any]:

@@ -26,6 +26,7 @@ from calstudy.measured.halves import read_facts, require_same_sky
 from calstudy.measured.settings import InjectionSettings, ObservedSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.products.observed import Halves, ObservedGraph
+from calstudy.products.observed_injection import injection_tables
 from calstudy.products.observed_quality import quality
 from calstudy.products.observed_spectra import observed_spectra
 from calstudy.run.task import Task
@@ -135,7 +136,7 @@ class ObservedStudy(Study):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        return [observed_spectra(self.graph), quality(self.graph)]
+        return [observed_spectra(self.graph), quality(self.graph), *injection_tables(self.graph)]
 
     @property
     def targets(self) -> Sequence[Task]:
@@ -188,8 +189,8 @@ def _halves(file: ObservedFile) -> Halves:
     section = file.observed
     selection = section.select.selection
     try:
-        even = read_facts(section.data, selection)
-        odd = read_facts(section.odd, selection) if section.odd else even
+        even = read_facts(section.data, selection, section.positions)
+        odd = read_facts(section.odd, selection, section.positions) if section.odd else even
     except InputError as error:
         raise InputError(str(error).replace("--select ", "observed.select.")) from None
     if section.odd:
@@ -203,6 +204,10 @@ def _halves(file: ObservedFile) -> Halves:
         raise InputError(
             f"observed.flux_scale: the data are in {even.unit!r}, and power spectra need Jy: give {{kind: factor, "
             "unit: 1 Jy}, or system-temperature, or a sky model"
+        )
+    if file.calibration.needs_noise and not (even.autos and odd.autos):
+        raise InputError(
+            "calibration.foreground_prior.noise: must be given, for the data have no autocorrelations that tell it"
         )
     together = file.calibration.integrations_per_solve
     halves = Halves({"even": even, "odd": odd})
