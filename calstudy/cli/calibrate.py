@@ -147,9 +147,9 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
 
     if isinstance(calibrator, GainFit):
         load_tensorflow()
+    from calstudy.measured.selection import parse_selection
     from calstudy.observed.output import EXPECTED, describe, require_free, write_result
     from calstudy.observed.pieces import Given, pieces_folder
-    from calstudy.measured.selection import parse_selection
     from calstudy.products.files import quiet_libraries
 
     selection = parse_selection(request.selections)

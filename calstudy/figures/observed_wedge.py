@@ -28,8 +28,8 @@ class ObservedWedge(ObservedFigure):
     """Cylindrical power spectra of measured data."""
 
     caption = (
-        "Cylindrical power spectra of the measured data: as given, calibrated, the residual, and the power of the noise "
-        "from the difference of the two halves; negative values in blue."
+        "Cylindrical power spectra of the measured data: as given, calibrated, the residual, and the power of their "
+        "noise from the difference of the two halves; negative values in blue."
     )
     tolerances = ((r".*\.power", Drawn(half, "follows from fitted gains; half of it")),)
 
@@ -44,6 +44,5 @@ class ObservedWedge(ObservedFigure):
 
         folder = job.inputs["spectra"]
         found = {name: load_spectrum(folder / spectrum_file(name, "wedge"), CylindricalSpectrum) for name in TITLES}
-        panels = {title: found[name] for name, title in TITLES.items()}
-        figure = draw_panels(panels, job.settings["wedge_buffer"], MAX_DELAY, job.settings["notes"])
+        figure = draw_panels(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY, job.settings["notes"])
         return Drawing(figure, found)

@@ -88,14 +88,19 @@ def draw_wedge(
     ValueError
         If the axes of a spectrum are not increasing or do not match its power, or the delays of two spectra differ.
     """
-    return draw_panels({title: getattr(panels, name) for name, title in TITLES.items()}, buffer, max_delay, stand_ins)
+    spectra = {name: getattr(panels, name) for name in TITLES}
+    return draw_panels(spectra, TITLES, buffer, max_delay, stand_ins)
 
 
 @style.journal_style()
 def draw_panels(
-    spectra: Mapping[str, CylindricalSpectrum], buffer: float, max_delay: float | None, stand_ins: Sequence[str] = ()
+    spectra: Mapping[str, CylindricalSpectrum],
+    titles: Mapping[str, str],
+    buffer: float,
+    max_delay: float | None,
+    stand_ins: Sequence[str] = (),
 ) -> Figure:
-    """Draw the real parts of several cylindrical power spectra, by their titles; for the rest see `draw_wedge`."""
+    """Draw the real parts of several cylindrical power spectra, by their names; for the rest see `draw_wedge`."""
     first = next(iter(spectra.values()))
     for name, spectrum in spectra.items():
         _check(name, spectrum, first.delay)
@@ -104,11 +109,11 @@ def draw_panels(
     figure = style.new_figure(style.TWO_COLUMNS, 3.5)
     figure.set_layout_engine("constrained", wspace=0.02, w_pad=0.02)
     grid = figure.subplots(1, len(spectra), sharey=True)
-    for axes, (title, spectrum) in zip(grid, spectra.items(), strict=True):
+    for axes, (name, spectrum) in zip(grid, spectra.items(), strict=True):
         _draw_power(axes, spectrum, floor, norms)
         draw_horizon(axes, spectrum, buffer)
         label_axes(axes, spectrum, max_delay)
-        axes.set_title(title, pad=4)
+        axes.set_title(titles[name], pad=4)
     grid[0].set_ylabel(style.K_PARALLEL)
     delay_axis(grid[-1], spectrum)
     grid[0].legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)

@@ -1,4 +1,4 @@
-"""How well a calibration fits the noise: chi^2 per degree of freedom, and chi^2 of integrations that were not fitted."""
+"""How well a calibration fits the noise: chi^2 of what was fitted, and of integrations that were not."""
 
 from __future__ import annotations
 
@@ -39,10 +39,8 @@ def count_unknowns(problem: CalibrationProblem, settings: GainFit) -> float | No
         return None
     used = problem.weights > 0
     antennas = np.unique(structure.antennas[used.any(axis=1)]).size
-    if structure.gain_vectors is not None:
-        per_antenna = structure.gain_vectors.shape[1]
-    else:
-        per_antenna = int(used.any(axis=0).sum())
+    vectors = structure.gain_vectors
+    per_antenna = int(used.any(axis=0).sum()) if vectors is None else vectors.shape[1]
     coefficients = 0 if settings.frozen else structure.basis.n_coefficients
     return coefficients + (antennas - 0.5) * per_antenna
 

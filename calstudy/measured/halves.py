@@ -102,23 +102,23 @@ def read_facts(paths: tuple[Path, ...], selection: Selection, positions: Path | 
     if positions is not None:
         place_antennas(data, positions)
     data = select(data, selection)
-    positions = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
+    places = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)
     crosses = pairs[pairs[:, 0] != pairs[:, 1]]
     if not len(crosses):
         raise InputError("observed.data: there are no baselines, only autocorrelations")
     frequencies = np.sort(np.ravel(data.freq_array))
     _require_even(frequencies)
-    times, places = np.unique(data.time_array, return_index=True)
+    times, rows = np.unique(data.time_array, return_index=True)
     return Facts(
         unit=str(data.vis_units),
         antennas=np.unique(crosses).size,
         polarizations=int(np.isin(data.polarization_array, list(PARALLEL_HANDS)).sum()),
         times=times,
-        sidereal_times=np.asarray(data.lst_array)[places],
+        sidereal_times=np.asarray(data.lst_array)[rows],
         integration=float(np.min(data.integration_time)),
         frequencies=frequencies,
-        lengths=np.array([np.linalg.norm(positions[b] - positions[a]) for a, b in crosses.tolist()]),
+        lengths=np.array([np.linalg.norm(places[b] - places[a]) for a, b in crosses.tolist()]),
         autos=set(np.unique(crosses).tolist()) <= set(pairs[pairs[:, 0] == pairs[:, 1], 0].tolist()),
     )
 

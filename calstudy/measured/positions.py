@@ -48,9 +48,7 @@ def place_antennas(data: UVData, path: Path) -> str:
     centre = np.array([axis.to_value(units.m) for axis in telescope.location.geocentric])
     telescope.antenna_positions = utils.ECEF_from_ENU(enu, center_loc=telescope.location) - centre
     data.set_uvws_from_antenna_positions(update_vis=False)
-    distances = [
-        np.linalg.norm(positions[:, None] - positions, axis=-1) for positions in (before, enu[moved])
-    ]
+    distances = [np.linalg.norm(positions[:, None] - positions, axis=-1) for positions in (before, enu[moved])]
     return (
         f"Antenna positions are those of {path.name}; distances between antennas change by up to "
         f"{np.abs(distances[1] - distances[0]).max():.3g} m."

@@ -1,4 +1,4 @@
-"""Measured data: two halves, their calibration and averages, and power spectra of what was measured and what is left."""
+"""Measured data: two halves, their calibration and averages, and delay power spectra."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: Powe
 @once
 def power_of(graph: ObservedGraph, what: str) -> Task:
     """Return the task of the delay power spectra even x odd; `what` is one of `WHAT`."""
-    return crossed(graph, what, *(average(graph, what, parity) for parity in PARITIES))
+    return crossed(graph, what, average(graph, what, "even"), average(graph, what, "odd"))
 
 
 @once

@@ -37,7 +37,7 @@ NUMBERS = ("newton_decrement", "decrement_rms", "first_loss", "last_loss")
 @once
 def quality(graph: ObservedGraph) -> Task:
     """Return the task that measures how well the calibration of both halves fits."""
-    inputs = {}
+    inputs: dict[str, Task] = {}
     for parity in PARITIES:
         inputs |= {f"data:{parity}": observed(graph, parity), f"calibration:{parity}": calibrated(graph, parity)}
     settings = {
@@ -59,7 +59,9 @@ def read_result(folder: Path) -> CalibrationResult:
     model, residual = (read_visibilities(folder / name) for name in (MODEL, RESIDUAL))
     records = []
     for summary in read_json(folder / SOLUTION)["records"]:
-        known = {name: math.nan if value is None and name in NUMBERS else value for name, value in summary.items()}
+        known: dict[str, Any] = {
+            name: math.nan if value is None and name in NUMBERS else value for name, value in summary.items()
+        }
         losses = np.array([known.pop("first_loss"), known.pop("last_loss")], dtype=float)
         records.append(SolveRecord(**known, loss_history=losses))
     return CalibrationResult(

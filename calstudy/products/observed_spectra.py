@@ -119,6 +119,4 @@ def _summary(difference: np.ndarray | None, autos: np.ndarray | None) -> dict[st
     return found
 
 
-OBSERVED_SPECTRA = Stage(
-    name="observed-spectra", version=1, make=average_spectra, cost=lambda task: Cost(10, disk=5e6)
-)
+OBSERVED_SPECTRA = Stage(name="observed-spectra", version=1, make=average_spectra, cost=lambda task: Cost(10, disk=5e6))

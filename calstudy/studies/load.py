@@ -22,8 +22,8 @@ def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = 
     ----------
     path
         The YAML file, or the name of a published one, such as ``quickstart``. One with the key `experiments` is a
-        collection, one with `calibrators` a comparison, one with `runtime` a run-time study, one with `observed` a study of
-        measured data, and an experiment with the key `sweep` is the family of its points, and one with `realizations`
+        collection, one with `calibrators` a comparison, one with `runtime` a run-time study, one with `observed` is
+        about measured data, an experiment with the key `sweep` is the family of its points, and one with `realizations`
         all its realizations.
     scale
         Name of a set of overrides in the file's `scales`.
