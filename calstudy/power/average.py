@@ -41,7 +41,8 @@ def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:
     if averaged.Ntimes > 1:
         with warnings.catch_warnings():
             if centre is not None:
-                warnings.filterwarnings("ignore", message="There is a gap in the times")
+                for message in ("There is a gap in the times", "The time difference between integrations"):
+                    warnings.filterwarnings("ignore", message=message)
             averaged.downsample_in_time(n_times_to_avg=averaged.Ntimes, allow_drift=False)
     # pyuvdata sorts by baseline number; bring back the order of the input.
     averaged.reorder_blts(order=_positions(averaged.baseline_array, uvd.baseline_array[: uvd.Nbls]))

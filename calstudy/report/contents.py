@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import InputError
+from calstudy.report import measured
 from calstudy.run.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
@@ -107,6 +108,8 @@ def read_contents(folder: Path) -> Contents:
         _summary(folder),
         _comparison(folder),
         _realizations(folder),
+        _table(measured.FIT_TITLE, measured.FIT_COLUMNS, measured.fit_rows(folder), measured.FIT_NOTE),
+        _table(measured.NOISE_TITLE, measured.NOISE_COLUMNS, measured.noise_rows(folder), measured.NOISE_NOTE),
         _signal_loss(folder, sky_model),
         _convergence(products, sky_model),
         _simulation(products),
@@ -123,6 +126,10 @@ def read_contents(folder: Path) -> Contents:
         parts=_parts(manifest),
         experiment=text,
     )
+
+
+def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> Table | None:
+    return Table(title, columns, rows, note) if rows else None
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
