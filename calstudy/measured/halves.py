@@ -77,7 +77,9 @@ class Facts:
         )
 
 
-def read_facts(paths: tuple[Path, ...], selection: Selection, positions: Path | None = None) -> Facts:
+def read_facts(
+    paths: tuple[Path, ...], selection: Selection, positions: Path | None = None, even: bool = True
+) -> Facts:
     """Read the metadata of measured data.
 
     Parameters
@@ -88,12 +90,13 @@ def read_facts(paths: tuple[Path, ...], selection: Selection, positions: Path | 
         The part that is wanted.
     positions
         File of the antennas' positions, in place of those in the data.
+    even
+        Whether channels must be at equal distances, and enough of them for power spectra.
 
     Raises
     ------
     InputError
-        If the files cannot be read, or what is selected has no baselines, or not at least eight channels at equal
-        distances.
+        If the files cannot be read, or what is selected has no baselines, or `even` does not hold.
     """
     from calstudy.measured.positions import place_antennas
     from calstudy.measured.reading import read_metadata
@@ -108,7 +111,8 @@ def read_facts(paths: tuple[Path, ...], selection: Selection, positions: Path | 
     if not len(crosses):
         raise InputError("observed.data: there are no baselines, only autocorrelations")
     frequencies = np.sort(np.ravel(data.freq_array))
-    _require_even(frequencies)
+    if even:
+        _require_even(frequencies)
     times, rows = np.unique(data.time_array, return_index=True)
     return Facts(
         unit=str(data.vis_units),

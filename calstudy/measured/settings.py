@@ -31,23 +31,42 @@ IN_PACKAGE = re.compile(r"(?P<package>[A-Za-z_][A-Za-z0-9_.]+):(?P<path>[^/\\].*
 """A file of an installed package: ``hera_qm:data/zen.uvh5``."""
 
 
-def _find(value: Any, info: ValidationInfo) -> Any:
-    """Return the absolute path of a file or folder, which may be given relative to the file or to a package."""
-    if not isinstance(value, str | Path):
-        return value
-    text, folder = str(value), (info.context or {}).get("folder") or Path()
+def find_data(text: str, folder: Path) -> Path:
+    """Return the absolute path of a file or folder, which may be given relative to a folder or to a package.
+
+    Parameters
+    ----------
+    text
+        A path, or ``package:path``.
+    folder
+        Where relative paths start.
+
+    Raises
+    ------
+    InputError
+        If there is no such package, file or folder.
+    """
     if "\0" in text:
-        raise fault("", f"{text!r} cannot be the path of a file")
+        raise InputError(f"{text!r} cannot be the path of a file")
     if (packaged := IN_PACKAGE.fullmatch(text)) is not None:
         path = _folder_of(packaged["package"], text) / packaged["path"]
     else:
         try:
             path = folder / Path(text).expanduser()
         except RuntimeError:
-            raise fault("", f"{text!r}: there is no such home folder") from None
+            raise InputError(f"{text!r}: there is no such home folder") from None
     if not path.exists():
-        raise fault("", f"{text!r}: no such file or folder (looked for {path.resolve()})")
+        raise InputError(f"{text!r}: no such file or folder (looked for {path.resolve()})")
     return path.resolve()
+
+
+def _find(value: Any, info: ValidationInfo) -> Any:
+    if not isinstance(value, str | Path):
+        return value
+    try:
+        return find_data(str(value), (info.context or {}).get("folder") or Path())
+    except InputError as error:
+        raise fault("", str(error)) from None
 
 
 def _folder_of(package: str, text: str) -> Path:
@@ -56,7 +75,7 @@ def _folder_of(package: str, text: str) -> Path:
     except (ImportError, ValueError):
         found = None
     if found is None or not found.submodule_search_locations:
-        raise fault("", f"{text!r}: there is no installed package {package!r}")
+        raise InputError(f"{text!r}: there is no installed package {package!r}")
     return Path(found.submodule_search_locations[0])
 
 
