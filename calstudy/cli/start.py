@@ -83,8 +83,8 @@ def _described(data: str) -> DataSet:
     first, last = math.floor(facts.frequencies[0] / 1e3), math.ceil(facts.frequencies[-1] / 1e3)
     return DataSet(
         path=data,
-        summary=f"{facts.antennas} antennas, {facts.frequencies.size} channels from {facts.frequencies[0] / 1e6:.3f} to "
-        f"{facts.frequencies[-1] / 1e6:.3f} MHz, {facts.times.size} integrations, in {facts.unit!r}.",
+        summary=f"{facts.antennas} antennas, {facts.frequencies.size} channels between {first / 1e3:.3f} and "
+        f"{last / 1e3:.3f} MHz, {facts.times.size} integrations, in {facts.unit!r}.",
         first=f"{first / 1e3:.3f} MHz",
         last=f"{last / 1e3:.3f} MHz",
         in_jansky=facts.unit.lower() == "jy",
