@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.calibrate.standard_formats import PARALLEL_HANDS
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
 from calstudy.measured.selection import Selection, parse_values, select
@@ -98,6 +97,8 @@ def read_facts(
     InputError
         If the files cannot be read, or what is selected has no baselines, or `even` does not hold.
     """
+    # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
+    from calstudy.calibrate.standard_formats import PARALLEL_HANDS
     from calstudy.measured.positions import place_antennas
     from calstudy.measured.reading import read_metadata
 

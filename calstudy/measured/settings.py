@@ -84,7 +84,11 @@ def _as_list(paths: Any) -> Any:
 
 
 DataFile = Annotated[Path, BeforeValidator(_find), Field(strict=False)]
-DataFiles = Annotated[tuple[DataFile, ...], BeforeValidator(_as_list), Field(strict=False)]
+DataFiles = Annotated[
+    tuple[DataFile, ...],
+    BeforeValidator(_as_list, json_schema_input_type=str | tuple[str, ...]),
+    Field(strict=False),
+]
 
 
 def _can_be_a_range(value: str) -> str:
