@@ -52,9 +52,12 @@ class Plugin(Section):
     ----------
     registry
         The kind of thing; set by the base class of each kind.
+    version
+        Of a built-in thing; raised whenever its results change, so that the products that depend on it are made again.
     """
 
     registry: ClassVar[Registry]
+    version: ClassVar[int] = 1
 
     @property
     def reference(self) -> str:
@@ -276,11 +279,14 @@ class Registry(Generic[P]):
         return PluginField(validate, registry=self, default=default)
 
     def identity(self, reference: str) -> str:
-        """Return what identifies the code of a thing: its name, its package's version, or the digest of its file."""
+        """Return what identifies the code of a thing: its name or package with a version, or the digest of its file."""
         file = FILE_REFERENCE.fullmatch(reference)
         if file is not None:
             return f"sha256:{digest_file(Path(file['path']))}:{file['name'] or ''}"
-        point = None if reference in self.built_in() else self.installed().get(reference)
+        if reference in self.built_in():
+            version = self.find(reference).version
+            return reference if version == 1 else f"{reference}@{version}"
+        point = self.installed().get(reference)
         if point is None or point.dist is None:
             return reference
         return f"{point.dist.name}=={point.dist.version}:{reference}"

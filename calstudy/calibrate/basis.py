@@ -12,7 +12,6 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.constants import speed_of_light
-from scipy.signal.windows import dpss
 
 from calstudy.base.errors import InputError
 from calstudy.calibrate.settings import BasisSettings
@@ -95,6 +94,8 @@ def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarra
 def _sequences(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the sequences of `dpss_vectors`, and their concentrations, (Nvec,)."""
     n_asked = min(n_frequencies, int(2 * half_bandwidth) + EXTRA_SEQUENCES)
+    from scipy.signal.windows import dpss
+
     vectors, concentrations = dpss(n_frequencies, half_bandwidth, Kmax=n_asked, return_ratios=True)
     # Concentrations fall monotonically until rounding; what follows the first below the cutoff is noise.
     below = concentrations < eigenvalue_cutoff

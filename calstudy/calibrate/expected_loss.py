@@ -46,7 +46,7 @@ from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import channel_grid
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.solvers.preconditioners import DEGREE_FLOOR, Inverse, channel_inverse
-from calstudy.calibrate.solvers.reduced import LEAST_DAMPING, PRECONDITIONER_DAMPING, NormalEquations, compiled
+from calstudy.calibrate.solvers.reduced import FINITE, FREE, NormalEquations, compiled
 from calstudy.calibrate.tangent_space import TangentSpace
 from calstudy.power.delay import make_taper
 
@@ -181,7 +181,8 @@ def _exact_diagonal(
     left = tangent.without_foregrounds(jacobian)
     again = tangent.without_foregrounds(left) if tangent.finite else None
     # The damped projector is one but for directions of next to no curvature; its square is what the probes measure.
-    inverse = np.linalg.inv(_real_product(jacobian, left) + np.diag(LEAST_DAMPING[tf.float32] * degrees))
+    least = (FINITE if tangent.finite else FREE)[tf.float32].least
+    inverse = np.linalg.inv(_real_product(jacobian, left) + np.diag(least * degrees))
     kernel = inverse @ _real_product(left, left) @ inverse
     found = np.empty((len(left), modes.delay.size))
     for p in range(len(left)):
@@ -243,12 +244,12 @@ class GainResponse:
         reduced = kernels.reduce(problem, gains)
         self._unit = reduced.loss_unit
         projection = kernels.project(reduced.gains, *reduced.data)
-        stronger = kernels.scalar(PRECONDITIONER_DAMPING[kernels.dtype])
+        stronger = kernels.scalar(kernels.dampings.preconditioner)
         if kernels.by_channel:
             inverse: Inverse = channel_inverse(kernels.tensors, projection, stronger)
         else:
             inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
-        damping = kernels.scalar(LEAST_DAMPING[kernels.dtype])
+        damping = kernels.scalar(kernels.dampings.least)
         self._equations = NormalEquations(projection, reduced.gains, damping, inverse)
         self._compiled = tf.function(self._solve)
 

@@ -36,6 +36,9 @@ RIDGE = 1e-12
 # The same for the kernel in float32, whose rounding would swamp the damping where flags leave foregrounds undetermined.
 # One iteration of Tikhonov's regularization keeps what it takes from well determined ones to its square.
 KERNEL_RIDGE = {tf.float32: 1e-3, tf.float64: 1e-9}
+# A finite prior leaves nothing undetermined. Foregrounds that it holds where the data hardly do would converge slowly
+# with more.
+FINITE_KERNEL_RIDGE = {tf.float32: 1e-6, tf.float64: 1e-12}
 # Singular values kept in the common basis of all buckets, relative to the largest: what is left out is an error of the
 # Gauss-Newton matrix.
 SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
@@ -159,7 +162,7 @@ class Projector:
             normal += tf.where(mean > 0, RIDGE * mean, 1.0) * identity
             if not filled.all():
                 normal += tf.linalg.diag((1 - filled) * tf.where(mean > 0, mean, 1.0)[:, 0])
-        ridge = KERNEL_RIDGE[self.dtype] * mean
+        ridge = (FINITE_KERNEL_RIDGE if self._finite else KERNEL_RIDGE)[self.dtype] * mean
         root = tf.linalg.triangular_solve(tf.linalg.cholesky(normal + ridge * identity), identity)
         again = tf.linalg.cholesky(identity + ridge * tf.matmul(root, root, transpose_b=True))
         return tf.linalg.cholesky(normal), tf.matmul(again, root, transpose_a=True)

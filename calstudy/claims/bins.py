@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
+
+if TYPE_CHECKING:
+    from calstudy.claims.results import RunResults
 
 SIGMAS_95 = 1.96
 
@@ -161,3 +165,30 @@ def _last_biased(biased: np.ndarray) -> int | None:
         elif place - (-1 if last is None else last) > 1:
             break
     return last
+
+
+def bias(run: RunResults, k_min: float, k_max: float) -> Finding:
+    """Return s^2 P^R0 / P^S outside the wedge: the residual without EoR over the EoR, free of the flux scale s.
+
+    Bins are weighted with their modes. The uncertainty is that of the thermal noise.
+
+    Parameters
+    ----------
+    run
+        With the variants `eor` and `residual_without_eor`, and a transfer function.
+    k_min, k_max
+        h/Mpc.
+
+    Raises
+    ------
+    Unevaluated
+        If it lacks one of them, or has no modes there.
+    """
+    eor, residual = (run.spherical(variant, "outside-wedge") for variant in ("eor", "residual_without_eor"))
+    scale = run.transfer("outside-wedge").flux_scale
+    used = used_bins(eor, residual, k_min=k_min, k_max=k_max)
+    modes = eor.n_modes[used]
+    signal = float(np.sum(modes * eor.power.real[used]))
+    left = float(np.sum(modes * residual.power.real[used]))
+    noise = float(np.sqrt(np.sum((modes * residual.noise_error[used]) ** 2)))
+    return Finding(scale**2 * left / signal, scale**2 * noise / signal)

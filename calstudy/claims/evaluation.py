@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from calstudy.base.plugins import guarded
 from calstudy.calibrate.settings import GainFit
 from calstudy.claims.paper import Paper
-from calstudy.claims.results import RunResults
 from calstudy.claims.run_times import RUN_TIME, RunTimes
 from calstudy.experiment.model import Experiment
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.statement import Statement
+
+if TYPE_CHECKING:
+    from calstudy.claims.results import RunResults
 
 
 @dataclass(frozen=True)

@@ -161,11 +161,25 @@ def claims(
 @app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="The folder of a finished run.", show_default=False)],
+    other: Annotated[Path | None, typer.Argument(help="A second run, to be shown beside it.")] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Page of two runs; by default FOLDER-and-OTHER.html here.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the page of two runs.")] = False,
 ) -> None:
-    """Write the report of a finished run, one self-contained page, report.html, into its folder."""
-    from calstudy.report.page import write_report
+    """Write the report of a finished run, one self-contained page, report.html, into its folder.
 
-    typer.echo(f"{write_report(folder)}")
+    With two runs, write a page with both side by side: fields that differ, verdicts, figures and tables.
+    """
+    from calstudy.report.page import write_pair, write_report
+
+    if other is None:
+        if output is not None or overwrite:
+            raise InputError("--output, --overwrite: are for the page of two runs")
+        typer.echo(f"{write_report(folder)}")
+        return
+    output = output or Path(f"{folder.resolve().name}-and-{other.resolve().name}.html")
+    typer.echo(f"{write_pair(folder, other, output, overwrite)}")
 
 
 @app.command()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeVar
 
-import astropy.cosmology
 import numpy as np
 from astropy import constants
 from astropy import units as u
@@ -26,6 +25,8 @@ FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 def make_cosmology(name: str) -> FLRW:
     """Return astropy's cosmology of this name ("Planck15", "Planck18" or "WMAP9"); raises ValueError for another."""
+    import astropy.cosmology
+
     if name not in astropy.cosmology.available:
         raise ValueError(f"cosmology {name!r} is unknown, allowed: {', '.join(astropy.cosmology.available)}")
     return getattr(astropy.cosmology, name)

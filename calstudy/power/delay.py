@@ -5,26 +5,27 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
-from scipy.signal import windows
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 TAPERS = {
-    "blackman-harris": windows.blackmanharris,
-    "hann": windows.hann,
-    "tukey": windows.tukey,
-    "none": windows.boxcar,
+    "blackman-harris": "blackmanharris",
+    "hann": "hann",
+    "tukey": "tukey",
+    "none": "boxcar",
 }
-"""The tapers of `calstudy.power.settings.PowerSettings`."""
+"""The tapers of `calstudy.power.settings.PowerSettings`, and what scipy.signal.windows calls them."""
 
 
 def make_taper(name: str, n_channels: int) -> np.ndarray:
     """Return the taper T(nu), shape (n_channels,), peak 1; raises ValueError for an unknown name."""
     if name not in TAPERS:
         raise ValueError(f"taper {name!r} is unknown, allowed: {', '.join(TAPERS)}")
-    return TAPERS[name](n_channels)
+    from scipy.signal import windows
+
+    return getattr(windows, TAPERS[name])(n_channels)
 
 
 def horizon_delay(length: FloatOrArray) -> FloatOrArray:

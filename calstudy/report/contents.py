@@ -11,6 +11,8 @@ from typing import Any
 
 from calstudy.base.errors import InputError
 from calstudy.report import measured
+from calstudy.report.charts import Chart, read_charts
+from calstudy.report.headline import Number, read_headline
 from calstudy.run.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
@@ -35,23 +37,37 @@ class Table:
     note
         A sentence below the heading, may be empty.
     verdicts
-        Index of the column whose texts are PASS or FAIL and are coloured, or None.
+        Indices of the columns whose texts are PASS or FAIL and are coloured.
     """
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
-    verdicts: int | None = None
+    verdicts: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report: its name, what it shows, and the png."""
+    """A figure of the report.
+
+    Attributes
+    ----------
+    name, caption
+        What it is called, and what it shows.
+    path
+        The png.
+    files
+        Its other files, relative to the run folder.
+    charts
+        What can be drawn of its arrays.
+    """
 
     name: str
     caption: str
     path: Path
+    files: Sequence[str] = ()
+    charts: Sequence[Chart] = ()
 
 
 @dataclass(frozen=True)
@@ -68,6 +84,10 @@ class Contents:
         Sentences.
     pictures, tables
         In the order of the page.
+    headline
+        The numbers on top of it.
+    files
+        Tables and records, relative to the run folder.
     parts
         Other run folders that this one consists of: name and relative path of their reports.
     experiment
@@ -81,6 +101,8 @@ class Contents:
     warnings: Sequence[str]
     pictures: Sequence[Picture]
     tables: Sequence[Table]
+    headline: Sequence[Number] = ()
+    files: Sequence[str] = ()
     parts: Sequence[tuple[str, str]] = field(default=())
     experiment: str = ""
 
@@ -108,8 +130,7 @@ def read_contents(folder: Path) -> Contents:
         _summary(folder),
         _comparison(folder),
         _realizations(folder),
-        _table(measured.FIT_TITLE, measured.FIT_COLUMNS, measured.fit_rows(folder), measured.FIT_NOTE),
-        _table(measured.NOISE_TITLE, measured.NOISE_COLUMNS, measured.noise_rows(folder), measured.NOISE_NOTE),
+        *(Table(*found) for found in measured.tables(folder)),
         _signal_loss(folder, sky_model),
         _convergence(products, sky_model),
         _simulation(products),
@@ -123,13 +144,11 @@ def read_contents(folder: Path) -> Contents:
         warnings=[f"{label}: {text}" for label, text in _warnings(products)],
         pictures=_pictures(folder, manifest),
         tables=[table for table in tables if table is not None],
+        headline=read_headline(folder),
+        files=_files(folder),
         parts=_parts(manifest),
         experiment=text,
     )
-
-
-def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> Table | None:
-    return Table(title, columns, rows, note) if rows else None
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
@@ -180,7 +199,19 @@ def _pictures(folder: Path, manifest: Mapping[str, Any]) -> list[Picture]:
     captions = manifest.get("captions", captions)
     order = [name for name in captions if name in found]
     order += [name for name in found if name not in captions]
-    return [Picture(name, captions.get(name, ""), found[name]) for name in order]
+    return [_picture(name, captions.get(name, ""), found[name]) for name in order]
+
+
+def _picture(name: str, caption: str, path: Path) -> Picture:
+    others = [path.with_suffix(suffix) for suffix in (".pdf", ".npz")]
+    files = [f"figures/{other.name}" for other in others if other.is_file()]
+    return Picture(name, caption, path, files, read_charts(others[1]) if others[1].is_file() else ())
+
+
+def _files(folder: Path) -> list[str]:
+    tables = sorted(path for path in (folder / "tables").glob("*") if path.is_file())
+    records = [folder / name for name in ("claims.md", CLAIMS, EXPERIMENT, MANIFEST, "run.log")]
+    return [str(path.relative_to(folder)) for path in (*records, *tables) if path.is_file()]
 
 
 def _parts(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -214,7 +245,7 @@ def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None
     others = len(claims) - len(evaluated)
     note = f"{others} further claims were not evaluated; claims.md says why." if others else ""
     columns = ("section", "the paper says", "measured is", "measured", "holds if", "verdict")
-    return Table(CLAIMS_TITLE, columns, rows, note, verdicts=5)
+    return Table(CLAIMS_TITLE, columns, rows, note, verdicts=(5,))
 
 
 def with_error(value: float | None, error: float | None) -> str:
@@ -312,7 +343,7 @@ def _realizations(folder: Path) -> Table | None:
     ]
     columns = ("wanted", "measured is", "measured", "must be", "verdict")
     note = "All numbers are in realizations.md and realizations.csv."
-    return Table("Realizations", columns, rows, note, verdicts=4)
+    return Table("Realizations", columns, rows, note, verdicts=(4,))
 
 
 def _convergence(products: Sequence[Mapping[str, Any]], sky_model: str) -> Table | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,18 @@ NOISE_NOTE = (
 )
 
 
-def fit_rows(folder: Path) -> list[tuple[str, ...]]:
+def tables(folder: Path) -> Iterator[tuple[str, Sequence[str], Sequence[Sequence[str]], str]]:
+    """Yield title, columns, rows and note of the tables that a run of measured data has; nothing for other runs."""
+    found = (
+        (FIT_TITLE, FIT_COLUMNS, _fits(folder), FIT_NOTE),
+        (NOISE_TITLE, NOISE_COLUMNS, _noise(folder), NOISE_NOTE),
+    )
+    for title, columns, rows, note in found:
+        if rows:
+            yield title, columns, rows, note
+
+
+def _fits(folder: Path) -> list[tuple[str, ...]]:
     """Return chi^2 of both halves of a run's measured data; nothing for other runs, and without autocorrelations."""
     path = folder / "tables" / QUALITY
     if not path.is_file():
@@ -43,7 +54,7 @@ def _fit(parity: str, part: Mapping[str, Any]) -> tuple[str, ...]:
 NOISE_COLUMNS = ("of", "from the difference", "from the autocorrelations", "ratio, mean over baselines")
 
 
-def noise_rows(folder: Path) -> list[tuple[str, ...]]:
+def _noise(folder: Path) -> list[tuple[str, ...]]:
     """Return the noise of a run's measured data; nothing for other runs."""
     path = folder / "tables" / NOISE
     if not path.is_file():

@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import base64
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from calstudy.base.errors import InputError
 from calstudy.report.contents import Contents, read_contents
+from calstudy.report.pair import Pair, read_pair
 
 REPORT = "report.html"
 
 
 def render(contents: Contents) -> str:
-    """Return the page; pictures are part of it."""
+    """Return the page; pictures, style and script are part of it."""
+    return _page("page.html", contents=contents, images=_images(contents))
+
+
+def render_pair(pair: Pair) -> str:
+    """Return the page of two runs side by side."""
+    return _page("pair.html", pair=pair, images=[_images(pair.first), _images(pair.second)])
+
+
+def _page(template: str, **values: Any) -> str:
     environment = Environment(
         loader=PackageLoader("calstudy.report", "."),
         autoescape=True,
@@ -22,10 +34,12 @@ def render(contents: Contents) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    images = {
-        picture.name: base64.b64encode(picture.path.read_bytes()).decode("ascii") for picture in contents.pictures
-    }
-    return environment.get_template("page.html").render(contents=contents, images=images)
+    css, script = ((Path(__file__).parent / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    return environment.get_template(template).render(css=css, script=script, **values)
+
+
+def _images(contents: Contents) -> dict[str, str]:
+    return {picture.name: base64.b64encode(picture.path.read_bytes()).decode("ascii") for picture in contents.pictures}
 
 
 def write_report(folder: Path) -> Path:
@@ -36,9 +50,27 @@ def write_report(folder: Path) -> Path:
     InputError
         If it is not the folder of a finished run.
     """
-    page = render(read_contents(folder))
-    path = folder / REPORT
-    partial = folder / f".{REPORT}-{uuid4().hex}"
-    partial.write_text(page, encoding="utf-8")
+    return _write(render(read_contents(folder)), folder / REPORT)
+
+
+def write_pair(first: Path, second: Path, output: Path, overwrite: bool = False) -> Path:
+    """Write the page of two runs, whole or not at all, and return its path.
+
+    Raises
+    ------
+    InputError
+        If one of the folders is not that of a finished run, or the file is there and not to be overwritten.
+    """
+    if output.exists() and not overwrite:
+        raise InputError(f"{output}: exists; choose another --output, or --overwrite it")
+    return _write(render_pair(read_pair((first, second))), output)
+
+
+def _write(page: str, path: Path) -> Path:
+    partial = path.with_name(f".{path.name}-{uuid4().hex}")
+    try:
+        partial.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
     partial.replace(path)
     return path

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from calstudy.calibrate.calibrators._least_squares import LeastSquares
 from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, GaussNewtonSettings, ScalePrior, Solver
 
@@ -9,6 +11,8 @@ from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, GaussNew
 class DelayWeighted(LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors, of known size, fill the modelled delays of each baseline."""
 
+    # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
+    version: ClassVar[int] = 2
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"

@@ -3,8 +3,8 @@
 Each step solves the damped normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`) by
 preconditioned conjugate gradients, with the damping tied to the loss, so that it vanishes towards the minimum. The
 first two steps use the antenna blocks of each channel as preconditioner, later ones the channel blocks of each antenna,
-which also predict how much the loss can still fall. Where baselines share models, the couplings between antennas remain
-the strong ones, and the antenna blocks of each channel are used throughout.
+which also predict how much the loss can still fall. Where baselines share models without a finite prior, the
+couplings between antennas remain the strong ones, and the antenna blocks of each channel are used throughout.
 
 Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
 that are smaller. They matter where the noise is far below the foregrounds. In double precision, if that is asked for,
@@ -30,8 +30,6 @@ from calstudy.calibrate.projection import Projection
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
 from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, Inverse
 from calstudy.calibrate.solvers.reduced import (
-    LEAST_DAMPING,
-    PRECONDITIONER_DAMPING,
     ROUNDING_LOSS,
     ReducedKernels,
     compiled,
@@ -105,13 +103,13 @@ class GaussNewtonState:
     def damping(self) -> float:
         """Damping of the next step, relative to the diagonal of the Gauss-Newton matrix."""
         tied = self.relief * self.kernels.damping(self.history[-1])
-        return max(tied, LEAST_DAMPING[self.kernels.dtype]) * self.boost
+        return max(tied, self.kernels.dampings.least) * self.boost
 
     @property
     def beyond_single(self) -> bool:
         """Whether products are made in single precision, which does not resolve the damping that is due."""
-        dtype = self.kernels.dtype
-        return dtype == tf.float32 and self.kernels.damping(self.history[-1]) <= LEAST_DAMPING[dtype]
+        kernels = self.kernels
+        return kernels.dtype == tf.float32 and kernels.damping(self.history[-1]) <= kernels.dampings.least
 
     @property
     def curved(self) -> bool:
@@ -298,7 +296,7 @@ class GaussNewton:
         early = state.n_accepted < CHANNEL_STEPS and kernels.space.vectors is None
         if kernels.by_channel or (preconditioner is None and early):
             return state
-        damping = max(state.damping, PRECONDITIONER_DAMPING[kernels.dtype])
+        damping = max(state.damping, kernels.dampings.preconditioner)
         if preconditioner is None or preconditioner.damping != damping:
             blocks = kernels.blocks(state.projection) if preconditioner is None else preconditioner.blocks
             inverse = kernels.inverse(blocks, kernels.scalar(damping), state.gains)

@@ -37,18 +37,36 @@ from calstudy.calibrate.solvers.preconditioners import (
 )
 from calstudy.calibrate.tensors import FitTensors
 
-# Damping, relative to the diagonal, is this times the loss relative to the data, but no more than the bound, and no
-# less than what products in a precision can resolve.
-DAMPING_PER_LOSS = 10.0
 MOST_DAMPING = 1e-2
-LEAST_DAMPING = {tf.float32: 1e-6, tf.float64: 1e-14}
-# Blocks in a precision cannot be inverted with less.
-PRECONDITIONER_DAMPING = {tf.float32: 1e-5, tf.float64: 1e-13}
 CG_TOLERANCE = 1e-3
 CG_CHANNEL_ITERATIONS = 300
 CG_ANTENNA_ITERATIONS = 60
 # Loss relative to the data below which a residual is rounding: 3e-8 of the visibilities, float32's resolution.
 ROUNDING_LOSS = 1e-15
+
+
+class Dampings(NamedTuple):
+    """Dampings relative to the diagonal.
+
+    Attributes
+    ----------
+    per_loss
+        Over the loss relative to the data; `MOST_DAMPING` at most.
+    least
+        What products in a precision can resolve.
+    preconditioner
+        Blocks in a precision cannot be inverted with less.
+    """
+
+    per_loss: float
+    least: float
+    preconditioner: float
+
+
+FREE = {tf.float32: Dampings(10.0, 1e-6, 1e-5), tf.float64: Dampings(10.0, 1e-14, 1e-13)}
+# Smooth gains, which foregrounds can follow, have a curvature from a finite prior alone: the square of the noise over
+# the deviation, far below the damping of a fit that does not determine them at all.
+FINITE = {tf.float32: Dampings(0.1, 1e-7, 1e-6), tf.float64: Dampings(0.1, 1e-14, 1e-13)}
 
 
 class ReducedData(NamedTuple):
@@ -100,14 +118,18 @@ class ReducedKernels:
     ----------
     by_channel
         Whether the antenna blocks of each channel are the preconditioner throughout: couplings between antennas remain
-        the strong ones where baselines share models or coefficients, and are the only ones where the foregrounds are
-        frozen.
+        the strong ones where baselines share models or coefficients without a finite prior, and are the only ones where
+        the foregrounds are frozen.
+    dampings
+        Of the fit in its precision.
     """
 
     def __init__(self, structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32) -> None:
         self.tensors = FitTensors(structure)
         self.structure, self.frozen, self.dtype = structure, frozen, dtype
-        self.by_channel = (self.tensors.coupled or frozen) and structure.gain_vectors is None
+        finite = structure.prior != "none" and not frozen
+        self.by_channel = ((self.tensors.coupled and not finite) or frozen) and structure.gain_vectors is None
+        self.dampings = (FINITE if finite else FREE)[dtype]
         self.projector = FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype)
         self.space = GainSpace(structure.gain_vectors, dtype)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
@@ -129,7 +151,7 @@ class ReducedKernels:
 
     def damping(self, loss: float) -> float:
         """Return the damping, relative to the diagonal, at a loss relative to the weighted square of the data."""
-        return min(max(DAMPING_PER_LOSS * loss, LEAST_DAMPING[self.dtype]), MOST_DAMPING)
+        return min(max(self.dampings.per_loss * loss, self.dampings.least), MOST_DAMPING)
 
     def reduce(self, problem: CalibrationProblem, gains: np.ndarray) -> ReducedData:
         """Return the data of a problem, and gains (Nants, Nfreqs) as close as their space allows, as tensors."""
@@ -268,6 +290,6 @@ def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float
     if kernels.by_channel:
         _, decrease = kernels.channel_step(projection, reduced.gains, kernels.scalar(damping))
         return float(decrease) / loss
-    stronger = kernels.scalar(max(damping, PRECONDITIONER_DAMPING[kernels.dtype]))
+    stronger = kernels.scalar(max(damping, kernels.dampings.preconditioner))
     inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
     return float(kernels.predicted_decrease(projection, reduced.gains, inverse)) / loss

@@ -1,0 +1,74 @@
+"""Byrne et al. 2019: redundant calibration with a sky model that lacks sources.
+
+The statements are in our words, after the paper's abstract.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+from calstudy.claims.bins import bias
+from calstudy.claims.paper import Paper
+from calstudy.claims.roles import first_refusal, not_as_nominal, other_calibrator, other_sky_model
+from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
+from calstudy.verdicts.statement import Source, Statement
+
+if TYPE_CHECKING:
+    from calstudy.claims.results import RunResults
+    from calstudy.experiment.model import Experiment
+
+CRUCIAL = (0.1, 0.2)
+"""h/Mpc, where thermal noise allows a detection first."""
+MISSING = Source("Abstract", ("redundant_incomplete",))
+
+
+@MISSING.states(
+    "with perfect positions and identical beams, redundant calibration still has errors from sources that its sky "
+    "model lacks, which can overwhelm the EoR on crucial modes",
+    "s² P^R0 / P^S outside the wedge, k of 0.1 to 0.2 h/Mpc, redundant calibration with sources missing",
+    AtLeast(1, sigmas=2),
+    "a bias of the size of the EoR itself",
+)
+def absolute_calibration_overwhelms_eor(run: RunResults) -> Finding:
+    return bias(run, *CRUCIAL)
+
+
+@MISSING.states(
+    "the errors come from the sky model",
+    "the same with the complete sky model",
+    AtMost(1, sigmas=2),
+    "less than the EoR itself: with the complete model there are no such errors",
+    roles=("redundant_complete",),
+)
+def complete_model_leaves_crucial_modes(run: RunResults) -> Finding:
+    return bias(run, *CRUCIAL)
+
+
+class Byrne2019(Paper):
+    """Statements on the absolute step of redundant calibration."""
+
+    citation = (
+        "Byrne, R., et al. 2019, Fundamental limitations on the calibration of redundant 21 cm cosmology instruments "
+        "and implications for HERA and the SKA, arXiv:1811.01378"
+    )
+    roles: ClassVar[Mapping[str, str]] = {
+        "redundant_complete": "a run of redundant calibration (redcal) with the true sky as its model",
+        "redundant_incomplete": "a run of redundant calibration (redcal) whose sky model lacks sources",
+    }
+    usual_members: ClassVar[Mapping[str, str]] = {
+        "redundant_complete": "redcal",
+        "redundant_incomplete": "redcal-incomplete",
+    }
+
+    def statements(self) -> Sequence[Statement]:
+        """Return the statements."""
+        return [absolute_calibration_overwhelms_eor, complete_model_leaves_crucial_modes]
+
+    def refusal(self, role: str, experiment: Experiment) -> str | None:
+        """Return what of an experiment is not that of the role, or None."""
+        return first_refusal(
+            other_calibrator(experiment, ("redcal",)),
+            not_as_nominal(experiment),
+            other_sky_model(experiment, incomplete=role == "redundant_incomplete"),
+        )

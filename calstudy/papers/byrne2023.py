@@ -1,0 +1,79 @@
+"""Byrne 2023: delay-weighted calibration with a sky model that lacks sources.
+
+The statements are in our words, after the paper's abstract.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+from calstudy.claims.bins import bias, ratio
+from calstudy.claims.paper import Paper
+from calstudy.claims.roles import first_refusal, not_as_nominal, other_calibrator, other_sky_model
+from calstudy.verdicts.criterion import AtLeast, Finding, Within
+from calstudy.verdicts.statement import Source, Statement, Unevaluated
+
+if TYPE_CHECKING:
+    from calstudy.claims.results import RunResults
+    from calstudy.experiment.model import Experiment
+
+WINDOW = (0.2, 0.5)
+"""h/Mpc."""
+BOTH = Source("Abstract", ("sky_based", "delay_weighted"))
+
+
+@BOTH.states(
+    "delay weighting substantially reduces the error of calibration if the sky model has realistic errors",
+    "error of g_a g_b* V over the data, median of baselines: sky-based over delay-weighted",
+    AtLeast(2),
+    "substantially: by half at least",
+)
+def error_of_calibration_is_reduced(sky_based: RunResults, delay_weighted: RunResults) -> Finding:
+    first, second = (run.measured("product_over_data") for run in (sky_based, delay_weighted))
+    return ratio(Finding(first.value, first.scatter), Finding(second.value, second.scatter))
+
+
+@BOTH.states(
+    "it improves the sensitivity of the power spectrum by about two orders of magnitude",
+    "s² P^R0 / P^S outside the wedge, k of 0.2 to 0.5 h/Mpc: sky-based over delay-weighted, or over the noise of the "
+    "latter if that is larger",
+    Within(10**1.5, 10**2.5),
+    "a hundred, to half an order of magnitude",
+)
+def sensitivity_improves_hundredfold(sky_based: RunResults, delay_weighted: RunResults) -> Finding:
+    first, second = (bias(run, *WINDOW) for run in (sky_based, delay_weighted))
+    if first.value <= 2 * first.uncertainty:
+        raise Unevaluated("the bias of sky-based calibration is not above the noise")
+    least = max(abs(second.value), second.uncertainty)
+    return Finding(first.value / least, first.value * second.uncertainty / least**2)
+
+
+class Byrne2023(Paper):
+    """Statements on delay-weighted calibration."""
+
+    citation = (
+        "Byrne, R. 2023, Delay-weighted calibration: precision calibration for 21 cm cosmology with resilience to sky "
+        "model error, arXiv:2208.04406"
+    )
+    roles: ClassVar[Mapping[str, str]] = {
+        "sky_based": "a run of sky-based calibration whose sky model lacks sources",
+        "delay_weighted": "a run of delay-weighted calibration with the same sky model",
+    }
+    usual_members: ClassVar[Mapping[str, str]] = {
+        "sky_based": "sky-based-incomplete",
+        "delay_weighted": "delay-weighted-incomplete",
+    }
+
+    def statements(self) -> Sequence[Statement]:
+        """Return the statements."""
+        return [error_of_calibration_is_reduced, sensitivity_improves_hundredfold]
+
+    def refusal(self, role: str, experiment: Experiment) -> str | None:
+        """Return what of an experiment is not that of the role, or None."""
+        allowed = ("delay-weighted",) if role == "delay_weighted" else ("sky-based", "skycal")
+        return first_refusal(
+            other_calibrator(experiment, allowed),
+            not_as_nominal(experiment),
+            other_sky_model(experiment, incomplete=True),
+        )

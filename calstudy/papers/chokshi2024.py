@@ -1,0 +1,78 @@
+"""Chokshi et al. 2024: sky-based calibration of MWA tiles whose beams are deformed.
+
+The statements are in our words, after the paper's abstract. The deformation is that of unequal amplitudes of dipoles;
+the paper's are fitted to beams that were measured with satellites.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+from calstudy.claims.bins import bias
+from calstudy.claims.paper import Paper
+from calstudy.claims.roles import first_refusal, other_calibrator, other_sky_model
+from calstudy.experiment.assumed import assumed_changes
+from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
+from calstudy.verdicts.statement import Source, Statement
+
+if TYPE_CHECKING:
+    from calstudy.claims.results import RunResults
+    from calstudy.experiment.model import Experiment
+
+MODES = (0.1, 1.0)
+"""h/Mpc."""
+AMPLITUDES = "instrument.as_built.dipoles"
+DEFORMED = Source("Abstract", ("one_beam",))
+
+
+@DEFORMED.states(
+    "with one beam model for the whole array, foregrounds leak to more than 1000 times the expected signal between k "
+    "of 0.1 and 1 h/Mpc",
+    "s² P^R0 / P^S outside the wedge, k of 0.1 to 1 h/Mpc",
+    AtLeast(1000),
+    "the paper's factor",
+)
+def leakage_exceeds_signal_thousandfold(run: RunResults) -> Finding:
+    return bias(run, *MODES)
+
+
+@DEFORMED.states(
+    "with the beams of all tiles in the calibration, the leakage is less than the signal",
+    "the same with the true beams in the sky model",
+    AtMost(1, sigmas=2),
+    "less than the EoR itself",
+    roles=("all_beams",),
+)
+def known_beams_leave_less_than_signal(run: RunResults) -> Finding:
+    return bias(run, *MODES)
+
+
+class Chokshi2024(Paper):
+    """Statements on deformed beams."""
+
+    citation = (
+        "Chokshi, A., et al. 2024, The necessity of individually validated beam models for an interferometric epoch of "
+        "reionization detection, arXiv:2409.19875"
+    )
+    roles: ClassVar[Mapping[str, str]] = {
+        "one_beam": "a run of sky-based calibration of tiles with unequal dipoles, unknown to its model",
+        "all_beams": "the same with the dipoles in calibration.assumed",
+    }
+    usual_members: ClassVar[Mapping[str, str]] = {"one_beam": "deformed-beams", "all_beams": "deformed-beams-known"}
+
+    def statements(self) -> Sequence[Statement]:
+        """Return the statements."""
+        return [leakage_exceeds_signal_thousandfold, known_beams_leave_less_than_signal]
+
+    def refusal(self, role: str, experiment: Experiment) -> str | None:
+        """Return what of an experiment is not that of the role, or None."""
+        found = experiment.instrument.as_built.dipoles
+        equal = None if found.amplitude_scatter > 0 else f"{AMPLITUDES}.amplitude_scatter is 0"
+        refusal = first_refusal(other_calibrator(experiment, ("sky-based", "skycal")), equal)
+        if refusal is not None or role == "one_beam":
+            return first_refusal(refusal, other_sky_model(experiment, incomplete=False))
+        changes = assumed_changes(experiment.calibration.assumed)
+        if not changes or any(not path.startswith(AMPLITUDES) for path in changes):
+            return f"calibration.assumed does not have {AMPLITUDES} alone"
+        return None

@@ -1,0 +1,88 @@
+"""Joseph et al. 2020: sky-based calibration of MWA tiles of which some have a dead dipole.
+
+The statements are in our words, after the paper's abstract. The paper's 10^3 mK^2 h^-3 Mpc^3 are after subtraction of
+sources, as here, where the residual is that of the sky model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from calstudy.claims.bins import used_bins
+from calstudy.claims.paper import Paper
+from calstudy.claims.roles import first_refusal, other_calibrator, other_sky_model
+from calstudy.verdicts.criterion import AtLeast, Finding, Within
+from calstudy.verdicts.statement import Source, Statement
+
+if TYPE_CHECKING:
+    from calstudy.claims.results import RunResults
+    from calstudy.experiment.model import Experiment
+
+TILES = (0.15, 0.4)
+"""Part of the tiles that have at least one dead dipole."""
+MODES = (0.1, 1.0)
+"""h/Mpc."""
+DEAD = Source("Abstract", ("dead_dipoles",))
+
+
+def residual_power(run: RunResults) -> Finding:
+    """Return P^R0 outside the wedge, mK^2 h^-3 Mpc^3, with the error of the thermal noise; bins weighted with modes."""
+    spectrum = run.spherical("residual_without_eor", "outside-wedge")
+    used = used_bins(spectrum, k_min=MODES[0], k_max=MODES[1])
+    weights = spectrum.n_modes[used] / np.sum(spectrum.n_modes[used])
+    error = np.sqrt(np.sum((weights * spectrum.noise_error[used]) ** 2))
+    return Finding(float(np.sum(weights * spectrum.power.real[used])), float(error))
+
+
+@DEAD.states(
+    "beam models without the dead dipoles bias the power spectrum by about 10^3 mK² h⁻³ Mpc³",
+    "P^R0 outside the wedge, k of 0.1 to 1 h/Mpc, mK² h⁻³ Mpc³",
+    Within(10**2.5, 10**3.5),
+    "to half an order of magnitude",
+)
+def bias_is_a_thousand(run: RunResults) -> Finding:
+    return residual_power(run)
+
+
+@DEAD.states(
+    "this is above the expected signal, by two orders of magnitude",
+    "the same over the 10 mK² h⁻³ Mpc³ that the paper expects",
+    AtLeast(1, sigmas=2),
+    "above it at all, beyond the noise",
+)
+def bias_exceeds_expected_signal(run: RunResults) -> Finding:
+    power = residual_power(run)
+    return Finding(power.value / 10, power.uncertainty / 10)
+
+
+class Joseph2020(Paper):
+    """Statements on dead dipoles."""
+
+    citation = (
+        "Joseph, R. C., et al. 2020, Calibration and 21-cm power spectrum estimation in the presence of antenna beam "
+        "variations, arXiv:1911.13088"
+    )
+    roles: ClassVar[Mapping[str, str]] = {
+        "dead_dipoles": "a run of sky-based calibration with a dead dipole in 15 to 40 % of tiles, unknown to its model"
+    }
+    usual_members: ClassVar[Mapping[str, str]] = {"dead_dipoles": "dead-dipoles"}
+
+    def statements(self) -> Sequence[Statement]:
+        """Return the statements."""
+        return [bias_is_a_thousand, bias_exceeds_expected_signal]
+
+    def refusal(self, role: str, experiment: Experiment) -> str | None:
+        """Return what of an experiment is not that of the role, or None."""
+        del role
+        dead = experiment.instrument.as_built.dipoles.dead_tiles
+        few = (
+            None
+            if TILES[0] <= dead <= TILES[1]
+            else f"instrument.as_built.dipoles.dead_tiles is {dead:g}, not 0.15 to 0.4"
+        )
+        return first_refusal(
+            other_calibrator(experiment, ("sky-based", "skycal")), few, other_sky_model(experiment, incomplete=False)
+        )

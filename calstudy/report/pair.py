@@ -1,0 +1,110 @@
+"""Two runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from calstudy.report.contents import CLAIMS_TITLE, Contents, Picture, Table, read_contents
+
+ALWAYS_DIFFERENT = ("name", "description", "outputs")
+"""Sections of an experiment whose differences say nothing about its results."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two runs, and what is to be seen of both together.
+
+    Attributes
+    ----------
+    first, second
+        The runs.
+    names
+        Of the runs, or of their folders if both runs have one name.
+    differences
+        Fields of the experiments that differ.
+    claims
+        The papers' statements with the verdicts on both; None if neither run has any.
+    pictures
+        Figures of the same name; None where one of the runs has none.
+    tables
+        Title, and the tables of both; None where one of the runs has none.
+    """
+
+    first: Contents
+    second: Contents
+    names: tuple[str, str]
+    differences: Table
+    claims: Table | None
+    pictures: list[tuple[Picture | None, Picture | None]]
+    tables: list[tuple[str, Table | None, Table | None]]
+
+
+def read_pair(folders: tuple[Path, Path]) -> Pair:
+    """Read two run folders.
+
+    Raises
+    ------
+    InputError
+        If one of them is not the folder of a finished run.
+    """
+    first, second = (read_contents(folder) for folder in folders)
+    names = (first.title, second.title)
+    if first.title == second.title:
+        names = (folders[0].resolve().name, folders[1].resolve().name)
+    pictures = _matched({item.name: item for item in first.pictures}, {item.name: item for item in second.pictures})
+    tables = _matched({item.title: item for item in first.tables}, {item.title: item for item in second.tables})
+    claims = tables.pop(CLAIMS_TITLE, None)
+    return Pair(
+        first,
+        second,
+        names,
+        _differences(first.experiment, second.experiment, names),
+        None if claims is None else _claims(*claims, names),
+        list(pictures.values()),
+        [(title, *both) for title, both in tables.items()],
+    )
+
+
+def _matched(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    return {name: (first.get(name), second.get(name)) for name in [*first, *second]}
+
+
+def _differences(first: str, second: str, names: tuple[str, str]) -> Table:
+    fields = [dict(_leaves(yaml.safe_load(text) or {})) if text else {} for text in (first, second)]
+    rows = [
+        (name, *(str(found.get(name, "-")) for found in fields))
+        for name in dict.fromkeys([*fields[0], *fields[1]])
+        if fields[0].get(name) != fields[1].get(name) and name.partition(".")[0] not in ALWAYS_DIFFERENT
+    ]
+    note = "" if rows else "The experiments do not differ."
+    return Table("Fields that differ", ("field", *names), rows, note)
+
+
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted path and the value of every field that is not a block."""
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _leaves(item, f"{path}.{name}" if path else str(name))
+    else:
+        yield path, value
+
+
+def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -> Table | None:
+    """Return one row for each statement, with what was measured in both runs, and both verdicts."""
+    rows: dict[tuple[str, ...], list[tuple[str, str] | None]] = {}
+    for side, table in enumerate((first, second)):
+        for row in table.rows if table is not None else ():
+            section, sentence, quantity, measured, threshold, verdict = row
+            rows.setdefault((section, sentence, quantity, threshold), [None, None])[side] = (measured, verdict)
+    cells = [
+        (*statement, *(text for pair in zip_longest(*(side or ("", "") for side in sides)) for text in pair))
+        for statement, sides in rows.items()
+    ]
+    columns = ("section", "the paper says", "measured is", "holds if", *names, *(f"verdict, {name}" for name in names))
+    return Table(CLAIMS_TITLE, columns, cells, verdicts=(6, 7)) if cells else None

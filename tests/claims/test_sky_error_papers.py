@@ -1,0 +1,111 @@
+"""The papers on wrong sky models and beams: who may play their roles, and numbers on both sides of their thresholds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calstudy.claims.bins import bias
+from calstudy.experiment.model import PAPERS
+from calstudy.power.spectra import SphericalSpectrum
+from calstudy.studies.load import load_study
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+NAMES = ("barry2016", "byrne2019", "byrne2023", "joseph2020", "chokshi2024")
+SIGNAL, SCALE = 200.0, 0.8
+
+
+@pytest.fixture(scope="module")
+def members():
+    return load_study(EXPERIMENTS / "sky-errors.yaml").members
+
+
+def paper(name):
+    return PAPERS.make(name)
+
+
+def spectrum(power, error=0.0):
+    edges = np.linspace(0, 1.2, 31)
+    k = (edges[1:] + edges[:-1]) / 2
+    modes = np.arange(1.0, 31)
+    values = np.broadcast_to(np.asarray(power, float), k.shape) + 0j
+    errors = np.full(k.shape, error)
+    return SphericalSpectrum(k, edges, values, modes, modes, modes, modes, errors, np.zeros(k.shape), True)
+
+
+def run(fraction=0.0, error=0.0, product=1e-3, name="run"):
+    """A run whose residual has a fraction of the EoR's power, with noise that is another fraction."""
+    spectra = {
+        "eor": spectrum(SIGNAL),
+        "residual_without_eor": spectrum(fraction * SIGNAL / SCALE**2, error * SIGNAL / SCALE**2),
+    }
+    return SimpleNamespace(
+        name=name,
+        spherical=lambda variant, modes: spectra[variant],
+        transfer=lambda region: SimpleNamespace(flux_scale=SCALE),
+        measured=lambda quantity: SimpleNamespace(value=product, scatter=0.1 * product),
+    )
+
+
+def verdicts(name, **runs):
+    thing = paper(name)
+    return [statement.evaluate(runs, thing.roles).verdict for statement in thing.statements()]
+
+
+def test_the_bias_is_free_of_the_flux_scale_and_has_the_error_of_the_noise():
+    found = bias(run(0.3, 0.1), 0.2, 0.5)
+    used = spectrum(0).k
+    modes = spectrum(0).n_modes[(used >= 0.2) & (used <= 0.5)]
+    assert found.value == pytest.approx(0.3)
+    assert found.uncertainty == pytest.approx(0.1 * np.sqrt(np.sum(modes**2)) / np.sum(modes))
+
+
+def test_every_statement_has_the_runs_that_it_needs(members):
+    for name in NAMES:
+        thing = paper(name)
+        played = {role: member for role, member in thing.usual_members.items() if member in members}
+        assert set(played) == set(thing.roles)
+        for role, member in played.items():
+            assert thing.refusal(role, members[member]) is None, (name, role)
+            assert name in [item.reference for item in members[member].papers]
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "member", "reason"),
+    [
+        ("barry2016", "incomplete_sky_model", "sky-based", "no sources are missing"),
+        ("barry2016", "complete_sky_model", "sky-based-incomplete", "sky.foregrounds.count"),
+        ("barry2016", "incomplete_sky_model", "redcal-incomplete", "'redcal', not 'sky-based'"),
+        ("barry2016", "complete_sky_model", "dead-dipoles", "as_built"),
+        ("byrne2019", "redundant_incomplete", "redcal", "no sources are missing"),
+        ("byrne2019", "redundant_complete", "sky-based", "'sky-based', not 'redcal'"),
+        ("byrne2023", "delay_weighted", "sky-based-incomplete", "not 'delay-weighted'"),
+        ("joseph2020", "dead_dipoles", "sky-based", "dead_tiles is 0"),
+        ("chokshi2024", "one_beam", "deformed-beams-known", "calibration.assumed has instrument.as_built"),
+        ("chokshi2024", "all_beams", "deformed-beams", "does not have instrument.as_built.dipoles"),
+        ("chokshi2024", "one_beam", "dead-dipoles", "amplitude_scatter is 0"),
+    ],
+)
+def test_another_run_is_refused(members, name, role, member, reason):
+    assert reason in paper(name).refusal(role, members[member])
+
+
+def test_verdicts_follow_the_numbers():
+    assert verdicts("barry2016", incomplete_sky_model=run(50), complete_sky_model=run(0.01)) == ["PASS", "PASS"]
+    assert verdicts("barry2016", incomplete_sky_model=run(0.5), complete_sky_model=run(0.2)) == ["FAIL", "FAIL"]
+    # Above the EoR, but within the noise.
+    assert verdicts("barry2016", incomplete_sky_model=run(1.5, 3), complete_sky_model=run(0.0, 3)) == ["FAIL", "FAIL"]
+    assert verdicts("byrne2019", redundant_incomplete=run(20), redundant_complete=run(0.1)) == ["PASS", "PASS"]
+    assert verdicts("byrne2019", redundant_incomplete=run(0.1), redundant_complete=run(20)) == ["FAIL", "FAIL"]
+    good, bad = run(1, product=1e-4), run(90, product=1e-3)
+    assert verdicts("byrne2023", sky_based=bad, delay_weighted=good) == ["PASS", "PASS"]
+    assert verdicts("byrne2023", sky_based=good, delay_weighted=bad) == ["FAIL", "FAIL"]
+    assert verdicts("byrne2023", sky_based=run(0, 1), delay_weighted=good)[1] == "not evaluated"
+    assert verdicts("joseph2020", dead_dipoles=run(1000 / SIGNAL * SCALE**2)) == ["PASS", "PASS"]
+    assert verdicts("joseph2020", dead_dipoles=run(1e-3)) == ["FAIL", "FAIL"]
+    assert verdicts("chokshi2024", one_beam=run(2000), all_beams=run(0.5)) == ["PASS", "PASS"]
+    assert verdicts("chokshi2024", one_beam=run(20), all_beams=run(2)) == ["FAIL", "FAIL"]
+    assert verdicts("chokshi2024", one_beam=run(20))[1] == "not evaluated"
