@@ -19,6 +19,7 @@ from calstudy.experiment.files import dump, override, validate
 from calstudy.experiment.yaml_files import parse_yaml
 from calstudy.run.store import Store
 from calstudy.studies.json_schema import SCHEMA_FILE, experiment_schema
+from calstudy.studies.load import load_study
 
 REFUSED = 2
 
@@ -214,3 +215,13 @@ def test_runs_are_listed(used_store, capsys):
     listed = output_of(capsys, "runs")
     assert "mine-1234" in listed
     assert str(datetime.now(UTC).year) in listed
+
+
+def test_a_file_about_measured_data_is_valid_and_names_their_band(here, capsys, schema):
+    package = "hera_qm:data/zen.2457698.40355.xx.HH.uvh5"
+    output_of(capsys, "init", "mine", "--data", package)
+    content = parse_yaml((here / "mine.yaml").read_text(), "mine")
+    assert [error.message for error in schema.iter_errors(content)] == []
+    assert content["observed"]["select"]["frequencies"] == "137.500 MHz..162.403 MHz"
+    study = load_study(here / "mine.yaml")
+    assert study.graph.halves.facts["even"].frequencies.size == 256

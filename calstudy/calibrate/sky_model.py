@@ -68,7 +68,7 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
     Parameters
     ----------
     sky, data
-        From `calstudy.observed.reading.prepare`; not changed.
+        From `calstudy.measured.reading.prepare`; not changed.
     autos
         Whether autocorrelations are to be fitted.
 

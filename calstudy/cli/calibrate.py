@@ -27,8 +27,6 @@ EXIT_UNCONVERGED = 3
 # More solves than this that did not converge are counted instead of named.
 NAMED = 5
 SECONDS_BETWEEN_LINES = 10.0
-# Real data of few baselines have directions that converge slowly, at next to no cost.
-PATIENT = {"name": "gauss-newton", "max_steps": 500}
 
 Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format that pyuvdata reads.", show_default=False)]
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
@@ -88,6 +86,7 @@ def calibrate(
     if every solve converged, 3 if some did not, 2 if something given cannot be used.
     """
     from calstudy.base.resources import parse_memory
+    from calstudy.measured.defaults import defaults
     from calstudy.observed.options import read_calibrator
     from calstudy.observed.output import CALFITS, EXPECTED
 
@@ -97,13 +96,11 @@ def calibrate(
         "calibrator": _calibrator(redundant, gains_only),
         "weights": _weights(weights),
     }
-    defaults = {
-        "initial_gains": None if gains is None else {"kind": "file", "path": str(gains)},
-        "solver": PATIENT if solver is None and settings_file is None else None,
-        # Without a model of the sky nothing knows the scale; visibilities of any phase may sum to nothing.
-        "prior": "gains" if sky_model is None else None,
-    }
-    calibrator = read_calibrator(settings_file, changes, defaults, overrides or [])
+    usual = defaults(sky_model is not None)
+    if solver is not None or settings_file is not None:
+        del usual["solver"]
+    assumed = {"initial_gains": None if gains is None else {"kind": "file", "path": str(gains)}, **usual}
+    calibrator = read_calibrator(settings_file, changes, assumed, overrides or [])
     budget = None if max_memory is None else parse_memory(max_memory)
     extras = [name for name, wanted in ((CALFITS, calfits), (EXPECTED, expected_loss)) if wanted]
     request = _Request(data, sky_model, gains, select or [], output, budget, extras, overwrite, dry_run)
@@ -150,9 +147,9 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
 
     if isinstance(calibrator, GainFit):
         load_tensorflow()
+    from calstudy.measured.selection import parse_selection
     from calstudy.observed.output import EXPECTED, describe, require_free, write_result
     from calstudy.observed.pieces import Given, pieces_folder
-    from calstudy.observed.selection import parse_selection
     from calstudy.products.files import quiet_libraries
 
     selection = parse_selection(request.selections)
@@ -200,8 +197,8 @@ def _load(
     paths: list[Path], sky_path: Path | None, selection: Any, autos: bool
 ) -> tuple[UVData, UVData | None, list[str]]:
     from calstudy.calibrate.sky_model import common_baselines
-    from calstudy.observed.reading import prepare, read_visibilities
-    from calstudy.observed.selection import Selection
+    from calstudy.measured.reading import prepare, read_visibilities
+    from calstudy.measured.selection import Selection
 
     data, notes = prepare(read_visibilities(paths), selection)
     if sky_path is None:
@@ -302,7 +299,7 @@ class _ProgressLines:
 
 def _qualities(data: UVData, result: CalibrationResult, console: Console) -> list[dict[str, Any]]:
     """Return what stands out, for each polarization, and warn of it."""
-    from calstudy.observed.quality import assess
+    from calstudy.measured.quality import assess
 
     found = [assess(data, result, index) for index in range(result.model.Npols)]
     for warning in (sentence for quality in found for sentence in quality.warnings):
@@ -321,9 +318,12 @@ def _figure(data: UVData, result: CalibrationResult, notes: list[str]) -> tuple[
 
 def _expected(data: UVData, sky: UVData | None, calibrator: GainFit, result: CalibrationResult) -> dict[str, Any]:
     """Return the expected transfer function of every polarization that has solutions."""
-    from calstudy.observed.expectation import expect
+    from calstudy.base.observation import Observation
+    from calstudy.calibrate.interface import Assumed
+    from calstudy.measured.expectation import expect
 
-    found = {pol: expect(data, calibrator, result, sky, index) for index, pol in enumerate(result.model.get_pols())}
+    assumed = Assumed(None if sky is None else Observation(sky))
+    found = {pol: expect(data, calibrator, result, assumed, index) for index, pol in enumerate(result.model.get_pols())}
     return {pol: expected for pol, expected in found.items() if expected is not None}
 
 

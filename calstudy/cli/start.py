@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
 
+if TYPE_CHECKING:
+    from calstudy.experiment.starter import DataSet
+
 Name = Annotated[str, typer.Argument(help="Of the experiment; the file is NAME.yaml.")]
 Example = Annotated[
     str | None, typer.Option(metavar="NAME", help="Copy a published experiment instead; see `calstudy examples`.")
 ]
-KINDS = {"experiments": "collection", "runtime": "run times", "calibrators": "comparison"}
+Data = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Measured visibilities, or PACKAGE:PATH: write a file about these instead."),
+]
+Beam = Annotated[str, typer.Option(help="The beam of measured data: hera, airy, gaussian, ..., or a file.py.")]
+KINDS = {
+    "experiments": "collection",
+    "runtime": "run times",
+    "calibrators": "comparison",
+    "observed": "measured data",
+}
 """Files that are not one experiment, by the key that says so."""
 
 
@@ -32,19 +46,49 @@ def examples() -> None:
     Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False))
 
 
-def init(name: Name = "my-study", example: Example = None) -> None:
-    """Write a commented experiment file, NAME.yaml, into this folder; nothing is overwritten."""
+def init(name: Name = "my-study", example: Example = None, data: Data = None, beam: Beam = "hera") -> None:
+    """Write a commented experiment file, NAME.yaml, into this folder; nothing is overwritten.
+
+    With --data it is about measured data: calibration, power spectra, and signal loss by injection.
+    """
     from calstudy.base.package_files import published
-    from calstudy.experiment.starter import copy_text, starter_text
+    from calstudy.experiment.starter import copy_text, observed_text, starter_text
     from calstudy.studies.json_schema import SCHEMA_FILE
 
     path = Path(f"{name}.yaml")
     schema_file = published("experiments") / SCHEMA_FILE
-    text = starter_text(name, schema_file) if example is None else copy_text(example, name, schema_file)
+    if example is not None and data is not None:
+        raise InputError("--example and --data: choose one")
+    if data is not None:
+        text = observed_text(name, schema_file, _described(data), beam)
+    else:
+        text = starter_text(name, schema_file) if example is None else copy_text(example, name, schema_file)
     if path.exists():
         raise InputError(f"{path}: exists already, and is not overwritten; choose another name or remove it")
     path.write_text(text, encoding="utf-8")
     typer.echo(f"{path}: next, `calstudy plan {path}`")
+
+
+def _described(data: str) -> DataSet:
+    """Return what a file about measured data says of them, after a look at their metadata."""
+    from calstudy.experiment.starter import DataSet
+    from calstudy.measured.halves import read_facts
+    from calstudy.measured.selection import Selection
+    from calstudy.measured.settings import find_data
+
+    try:
+        facts = read_facts((find_data(data, Path()),), Selection(), even=False)
+    except InputError as error:
+        raise InputError(f"--data: {error}") from None
+    first, last = math.floor(facts.frequencies[0] / 1e3), math.ceil(facts.frequencies[-1] / 1e3)
+    return DataSet(
+        path=data,
+        summary=f"{facts.antennas} antennas, {facts.frequencies.size} channels between {first / 1e3:.3f} and "
+        f"{last / 1e3:.3f} MHz, {facts.times.size} integrations, in {facts.unit!r}.",
+        first=f"{first / 1e3:.3f} MHz",
+        last=f"{last / 1e3:.3f} MHz",
+        in_jansky=facts.unit.lower() == "jy",
+    )
 
 
 def schema(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from calstudy.base.errors import InputError
@@ -54,6 +55,87 @@ outputs:
   store: store                                            # products, shared by all experiments
   runs: runs                                              # a folder for each run
 """
+
+OBSERVED = """\
+# Measured data: {summary}
+# Calibration, power spectra of the data and of what is left, and what the calibration takes from an EoR that is put in.
+# `calstudy plan {name}.yaml` checks it and says what a run takes; `calstudy run {name}.yaml` runs it.
+# All fields: docs/experiments.md; how to read the results: docs/measured-data.md.
+name: {name}
+
+observed:
+  data: {path}
+  # odd: another.uvh5                                     # the same sky on another night; else every second integration
+  select:
+    frequencies: {first}..{last}                          # leave out edges and interference
+    # antennas: 0,1,12                                    # lengths, times and polarizations likewise
+  # flag: [149.7 MHz..150.2 MHz]                          # channels of interference inside the band
+  # positions: antennas.csv                               # number, east_m, north_m, up_m, in place of the file's
+  # sky_model: model.uvh5                                 # visibilities in Jy, if there are any
+  beam: {beam}
+  {scale}
+
+calibration:
+  calibrator: calamity                                    # calamity-redundant, ..., or a file.py
+
+injection:
+  eor: {{nside: 64}}                                        # pixels of 0.9 deg; finer for long baselines
+  level: -30 dB                                           # rms of the EoR over that of the fitted foregrounds
+
+power:
+  pairs: auto                                             # same-baseline, redundant-group
+
+outputs:
+  store: store                                            # products, shared by all experiments
+  runs: runs                                              # a folder for each run
+"""
+SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: factor, unit: 1 Jy}"
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """What a new file says of measured data.
+
+    Attributes
+    ----------
+    path
+        As it is to be written.
+    summary
+        A sentence.
+    first, last
+        Ends of the band.
+    in_jansky
+        Whether they are in Jy.
+    """
+
+    path: str
+    summary: str
+    first: str
+    last: str
+    in_jansky: bool
+
+
+def observed_text(name: str, schema: Path, data: DataSet, beam: str) -> str:
+    """Return the text of a file about measured data.
+
+    Parameters
+    ----------
+    name, schema
+        As for `starter_text`.
+    data
+        What it says of the data.
+    beam
+        Name of the beam.
+
+    Raises
+    ------
+    InputError
+        If the name cannot be one.
+    """
+    _require_name(name)
+    scale = "# " + SCALE if data.in_jansky else SCALE
+    values = {"summary": data.summary, "path": data.path, "first": data.first, "last": data.last}
+    return f"{MODELINE}{schema}\n{OBSERVED.format(name=name, beam=beam, scale=scale, **values)}"
 
 
 def starter_text(name: str, schema: Path) -> str:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from calstudy.products.comparison import Case
     from calstudy.products.graph import Graph
+    from calstudy.products.observed import ObservedGraph
 
 
 class Drawing(NamedTuple):
@@ -189,6 +190,31 @@ class CasesFigure(StudyFigure):
         return Drawing(self.draw_cases(cases, job), shown)
 
 
+class ObservedFigure(StudyFigure):
+    """A figure of measured data.
+
+    Attributes
+    ----------
+    needs_injection
+        Whether a signal must be injected.
+    """
+
+    needs_injection: ClassVar[bool] = False
+
+    def refusal(self, experiment: Experiment) -> str:
+        """Refuse: an experiment has no measured data."""
+        return "shows measured data, and cannot be drawn of an experiment"
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return nothing: there is no experiment that it could show."""
+        del graph
+        return {}
+
+    @abstractmethod
+    def observed_inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+        """Return the products that the figure shows, by names of its own."""
+
+
 def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:
     """Return the figures that an experiment asks for; their registry lets no other plug-ins in."""
     return cast(tuple[StudyFigure, ...], experiment.outputs.figures)
@@ -287,3 +313,20 @@ def cases_task(
     with guarded(figure):
         inputs = {name: figure.inputs(graph)["score"] for name, graph in graphs.items()}
     return _task(figure, stand_ins, labels, inputs)
+
+
+def observed_task(figure: ObservedFigure, graph: ObservedGraph, stand_ins: Sequence[str]) -> Task:
+    """Return the task that draws one figure of measured data.
+
+    Parameters
+    ----------
+    figure
+        Which.
+    graph
+        Of the study.
+    stand_ins
+        To be printed on it, if it shows the sky.
+    """
+    with guarded(figure):
+        inputs = figure.observed_inputs(graph)
+    return _task(figure, stand_ins, {"wedge_buffer": graph.power.wedge_buffer}, inputs)

@@ -84,7 +84,7 @@ def draw_signal_loss(
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     _draw_per_k(left, loss, buffer)
-    _draw_map(figure, right, loss.map, buffer, max_delay)
+    draw_map(figure, right, loss.map, buffer, max_delay)
     style.note_stand_ins(figure, stand_ins)
     return figure
 
@@ -150,7 +150,8 @@ def _limits(loss: SignalLoss) -> tuple[float, float]:
     return min(-0.03, 1.1 * float(np.nanmin(values))), max(1.1, 1.05 * float(np.nanmax(values)))
 
 
-def _draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, max_delay: float | None) -> None:
+def draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, max_delay: float | None) -> None:
+    """Draw T per baseline length and delay, with its colour bar; parameters as for `draw_signal_loss`."""
     norm = Normalize(0.0, 1.0)
     x, y, values = cells(transfer, transfer.transfer)
     axes.set_facecolor(EMPTY)

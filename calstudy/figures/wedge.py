@@ -67,7 +67,6 @@ TITLES = {
 }
 
 
-@style.journal_style()
 def draw_wedge(
     panels: WedgePanels, buffer: float = 100e-9, max_delay: float | None = 2e-6, stand_ins: Sequence[str] = ()
 ) -> Figure:
@@ -90,8 +89,21 @@ def draw_wedge(
         If the axes of a spectrum are not increasing or do not match its power, or the delays of two spectra differ.
     """
     spectra = {name: getattr(panels, name) for name in TITLES}
+    return draw_panels(spectra, TITLES, buffer, max_delay, stand_ins)
+
+
+@style.journal_style()
+def draw_panels(
+    spectra: Mapping[str, CylindricalSpectrum],
+    titles: Mapping[str, str],
+    buffer: float,
+    max_delay: float | None,
+    stand_ins: Sequence[str] = (),
+) -> Figure:
+    """Draw the real parts of several cylindrical power spectra, by their names; for the rest see `draw_wedge`."""
+    first = next(iter(spectra.values()))
     for name, spectrum in spectra.items():
-        _check(name, spectrum, panels.uncorrupted.delay)
+        _check(name, spectrum, first.delay)
     floor, highest, lowest = _colour_limits(spectra.values())
     norms = (LogNorm(floor, highest), LogNorm(floor, lowest))
     figure = style.new_figure(style.TWO_COLUMNS, 3.5)
@@ -101,9 +113,9 @@ def draw_wedge(
         _draw_power(axes, spectrum, floor, norms)
         draw_horizon(axes, spectrum, buffer)
         label_axes(axes, spectrum, max_delay)
-        axes.set_title(TITLES[name], pad=4)
+        axes.set_title(titles[name], pad=4)
     grid[0].set_ylabel(style.K_PARALLEL)
-    delay_axis(grid[-1], spectra["noise"])
+    delay_axis(grid[-1], spectrum)
     grid[0].legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
     _colour_bars(figure, grid, norms)
     style.note_stand_ins(figure, stand_ins)
@@ -118,7 +130,7 @@ def _check(name: str, spectrum: CylindricalSpectrum, delay: np.ndarray) -> None:
         if len(values) < (2 if axis == "delay" else 1) or not (np.diff(values) > 0).all() or values[0] < 0:
             raise ValueError(f"wedge panel '{name}': {axis} is not strictly increasing from 0 or more")
     if not np.array_equal(spectrum.delay, delay):
-        raise ValueError(f"wedge panel '{name}': its delays differ from those of 'uncorrupted'")
+        raise ValueError(f"wedge panel '{name}': its delays differ from those of the first panel")
 
 
 def _colour_limits(spectra: Iterable[CylindricalSpectrum]) -> tuple[float, float, float]:
@@ -145,7 +157,7 @@ def _draw_power(axes: Axes, spectrum: CylindricalSpectrum, floor: float, norms: 
 
 
 def _colour_bars(figure: Figure, grid: np.ndarray, norms: tuple[LogNorm, LogNorm]) -> None:
-    columns = len(grid) - 2
+    columns = max(len(grid) - 2, 1)
     settings: dict[str, Any] = {"location": "bottom", "aspect": 30, "pad": 0.03, "fraction": 0.05}
     for norm, colours, shared, label in (
         (norms[0], POSITIVE, grid[:columns], rf"$P > 0$ ({style.POWER_UNIT})"),

@@ -8,8 +8,8 @@ from pyuvdata import UVData
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
 from calstudy.calibrate.basis import channel_grid
 from calstudy.calibrate.records import CalibrationResult
+from calstudy.measured.quality import assess
 from calstudy.observed.diagnostics_figure import MAX_ANTENNAS, Diagnostics, delay_rms
-from calstudy.observed.quality import assess
 
 
 def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> Diagnostics:

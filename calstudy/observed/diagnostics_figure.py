@@ -51,7 +51,7 @@ class Diagnostics:
     chi2_antennas
         Names of all calibrated antennas, (Nants,).
     chi2_by_antenna, chi2_by_channel, chi2_by_integration
-        As in `calstudy.observed.quality.Quality`.
+        As in `calstudy.measured.quality.Quality`.
     """
 
     polarization: str

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from astropy.time import Time
 from pyuvdata import UVData
@@ -10,13 +12,16 @@ from calstudy.base.visibilities import require_rectangular
 from calstudy.instrument.telescope import use_bundled_earth_orientation
 
 
-def fringe_stop_and_average(uvd: UVData) -> UVData:
+def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:
     """Phase to the zenith at the middle of the run and average all integrations into one.
 
     Parameters
     ----------
     uvd
         Drift-scan visibilities. Not mutated. Flagged samples do not enter the average; samples weigh by nsamples.
+    centre
+        Julian date in place of the middle, for data sets that are to have the same phase centre; integrations may then
+        be missing.
 
     Returns
     -------
@@ -30,11 +35,15 @@ def fringe_stop_and_average(uvd: UVData) -> UVData:
     """
     require_rectangular(uvd)
     use_bundled_earth_orientation()
-    middle = Time((uvd.time_array.min() + uvd.time_array.max()) / 2, format="jd", scale="utc")
+    date = (uvd.time_array.min() + uvd.time_array.max()) / 2 if centre is None else centre
     averaged = uvd.copy()
-    averaged.phase_to_time(middle)
+    averaged.phase_to_time(Time(date, format="jd", scale="utc"))
     if averaged.Ntimes > 1:
-        averaged.downsample_in_time(n_times_to_avg=averaged.Ntimes, allow_drift=False)
+        with warnings.catch_warnings():
+            if centre is not None:
+                for message in ("There is a gap in the times", "The time difference between integrations"):
+                    warnings.filterwarnings("ignore", message=message)
+            averaged.downsample_in_time(n_times_to_avg=averaged.Ntimes, allow_drift=False)
     # pyuvdata sorts by baseline number; bring back the order of the input.
     averaged.reorder_blts(order=_positions(averaged.baseline_array, uvd.baseline_array[: uvd.Nbls]))
     averaged.data_array = averaged.data_array.astype(np.complex128, copy=False)

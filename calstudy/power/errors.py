@@ -65,6 +65,27 @@ def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndar
     return _modes_of_noise(spectra, bins, n_bins, spectra.n_pairs)
 
 
+def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.ndarray) -> np.ndarray:
+    """Return sigma_N of each bin where the units differ in their noise, (n_bins,); NaN for empty bins.
+
+    Parameters
+    ----------
+    spectra
+        The averaged spectra.
+    bins
+        Bin of each mode, (Nu, Nd) int, -1 for those left out.
+    n_bins
+        Number of bins.
+    noise
+        P_N of a single product of each unit, whose real part has the variance P_N^2 / 2, (Nu,).
+    """
+    with np.errstate(divide="ignore"):
+        independent = spectra.n_pairs / (noise**2 / 2)
+        return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan) / np.sqrt(
+            _modes_of_noise(spectra, bins, n_bins, independent)
+        )
+
+
 def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
     """Return how many independent products of signal and noise each bin averages; parameters as in `noise_modes`."""
     return _modes_of_noise(spectra, bins, n_bins, spectra.n_baselines)

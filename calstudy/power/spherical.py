@@ -15,6 +15,21 @@ def make_bin_edges(bins: KBins) -> np.ndarray:
     return bins.min + bins.width * np.arange(count + 1)
 
 
+def modes_in_bins(
+    spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
+) -> np.ndarray:
+    """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those left out; parameters as `spherical_average`."""
+    edges = make_bin_edges(settings.bins)
+    magnitude = np.hypot(spectra.k_perp[:, None], spectra.k_parallel)
+    bins = np.searchsorted(edges, magnitude, side="left") - 1
+    bins[(bins < 0) | (bins >= edges.size - 1)] = -1
+    if exclude_wedge:
+        bins[~outside_wedge(spectra, settings.wedge_buffer)] = -1
+    if only_wedge:
+        bins[outside_wedge(spectra, settings.wedge_buffer)] = -1
+    return bins
+
+
 def spherical_average(
     spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
 ) -> SphericalSpectrum:
@@ -37,13 +52,7 @@ def spherical_average(
     """
     edges = make_bin_edges(settings.bins)
     n_bins = edges.size - 1
-    magnitude = np.hypot(spectra.k_perp[:, None], spectra.k_parallel)
-    bins = np.searchsorted(edges, magnitude, side="left") - 1
-    bins[(bins < 0) | (bins >= n_bins)] = -1
-    if exclude_wedge:
-        bins[~outside_wedge(spectra, settings.wedge_buffer)] = -1
-    if only_wedge:
-        bins[outside_wedge(spectra, settings.wedge_buffer)] = -1
+    bins = modes_in_bins(spectra, settings, exclude_wedge, only_wedge)
     used = bins >= 0
     weights = np.broadcast_to(spectra.n_pairs[:, None], bins.shape)[used]
     total = np.bincount(bins[used], weights, minlength=n_bins)

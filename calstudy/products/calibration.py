@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of
-from calstudy.calibrate.interface import SETTLED
+from calstudy.calibrate.interface import SETTLED, Calibrator
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import LEVELS
@@ -44,18 +44,33 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     parity
         "even" or "odd".
     """
-    data = corruption.data(graph, variant, parity)
     # What is assumed decides the sky model, which is an input, and nothing else.
-    settings = graph.experiment.calibration.for_data(data.key).reset("assumed")
-    solves = -(-graph.experiment.instrument.times.count // settings.integrations_per_solve)
-    # Gains that are smoothed in time are those of all integrations.
-    together = settings.smooth_gains is not None and settings.smooth_gains.over_time
-    count = 1 if together else min(settings.chunks, solves)
-    inputs = {"data": data}
+    inputs = {"data": corruption.data(graph, variant, parity)}
+    settings = graph.experiment.calibration.for_data(inputs["data"].key).reset("assumed")
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
     if settings.needs_noise:
         inputs["levels"] = corruption.levels(graph)
+    return calibration_of(settings, inputs, temporary=not graph.keep_visibilities)
+
+
+def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: bool = False) -> Task:
+    """Return the task of the calibration of any data.
+
+    Parameters
+    ----------
+    settings
+        The calibrator.
+    inputs
+        ``data``; ``sky_model``, if there is one; ``levels``, if the calibrator needs to know the noise.
+    temporary
+        Of the task.
+    """
+    data = inputs["data"]
+    solves = -(-size_of(data).times // settings.integrations_per_solve)
+    # Gains that are smoothed in time are those of all integrations.
+    together = settings.smooth_gains is not None and settings.smooth_gains.over_time
+    count = 1 if together else min(settings.chunks, solves)
     chunks = {
         f"chunk{index:03d}": Task(
             CALIBRATE_CHUNK,
@@ -66,7 +81,7 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
         )
         for index in range(count)
     }
-    return Task(CALIBRATE, data.label, {}, chunks, temporary=not graph.keep_visibilities)
+    return Task(CALIBRATE, data.label, {}, chunks, temporary=temporary)
 
 
 def _integrations(data: UVData, index: int, count: int, together: int) -> UVData:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
@@ -14,6 +14,13 @@ from calstudy.products.corruption import LEVELS
 from calstudy.products.files import DATA, MODEL, VISIBILITIES, read_json, read_visibilities
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from calstudy.calibrate.expected_loss import ExpectedTransfer
+    from calstudy.power.expected import ExpectedBins
+    from calstudy.power.settings import PowerSettings
 
 EXPECTED = "expected-loss.h5"
 # Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
@@ -51,9 +58,6 @@ def expect(job: Job) -> Mapping[str, Any]:
     from calstudy.calibrate.expected_loss import DelayModes, expected_transfer
     from calstudy.calibrate.interface import Assumed
     from calstudy.calibrate.preparation import make_problem, prepare
-    from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
-    from calstudy.power.expected import BaselineModes, bin_expected
-    from calstudy.power.spherical import make_bin_edges
     from calstudy.power.tables import save_spectrum
     from calstudy.products.selection import read_gains
 
@@ -81,9 +85,30 @@ def expect(job: Job) -> Mapping[str, Any]:
     modes = DelayModes(frequency, power.taper)
     gains = fitted.at(index, prepared.data.numbers)
     expected = expected_transfer(problem, gains, model, modes, job.settings["probes"])
-    cosmology, centre = make_cosmology(power.cosmology), float(frequency.mean())
-    lengths = prepared.data.lengths
-    binned = bin_expected(
+    save_spectrum(job.output / EXPECTED, binned(expected, prepared.data.lengths, float(frequency.mean()), power))
+    return {"integration": index, "probes": job.settings["probes"]}
+
+
+def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power: PowerSettings) -> ExpectedBins:
+    """Return an expected T in bins of k and of baseline length and delay.
+
+    Parameters
+    ----------
+    expected
+        Per baseline and delay.
+    lengths
+        Of the baselines, m, (Nbls,).
+    centre
+        Of the band, Hz.
+    power
+        Bins, buffer of the wedge, cosmology.
+    """
+    from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
+    from calstudy.power.expected import BaselineModes, bin_expected
+    from calstudy.power.spherical import make_bin_edges
+
+    cosmology = make_cosmology(power.cosmology)
+    return bin_expected(
         BaselineModes(
             transfer=expected.transfer,
             error=expected.error,
@@ -96,8 +121,6 @@ def expect(job: Job) -> Mapping[str, Any]:
         power.wedge_buffer,
         power.length_bin,
     )
-    save_spectrum(job.output / EXPECTED, binned)
-    return {"integration": index, "probes": job.settings["probes"]}
 
 
 def _cost(task: Task) -> Cost:

@@ -7,7 +7,6 @@ from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.size import Size
 from calstudy.run.task import Task
 
@@ -15,7 +14,17 @@ Made = TypeVar("Made")
 Arguments = ParamSpec("Arguments")
 
 
-class Graph:
+class Memory:
+    """What is made of one file, each thing once; see `once`."""
+
+    def __init__(self) -> None:
+        self.made: dict[Hashable, Any] = {}
+
+
+Owner = TypeVar("Owner", bound=Memory)
+
+
+class Graph(Memory):
     """The tasks of one experiment; the modules of this package make them, each those of its own products.
 
     Parameters
@@ -28,21 +37,21 @@ class Graph:
     """
 
     def __init__(self, experiment: Experiment, keep_visibilities: bool = True) -> None:
+        super().__init__()
         self.experiment = experiment
         self.keep_visibilities = keep_visibilities
         self.size = Size.of(experiment.instrument)
-        self._made: dict[Hashable, Any] = {}
 
 
-def once(make: Callable[Concatenate[Graph, Arguments], Made]) -> Callable[Concatenate[Graph, Arguments], Made]:
+def once(make: Callable[Concatenate[Owner, Arguments], Made]) -> Callable[Concatenate[Owner, Arguments], Made]:
     """Make ``make(graph, ...)`` return the same task whenever it is called with the same graph and arguments."""
 
     @wraps(make)
-    def task(graph: Graph, *arguments: Arguments.args, **named: Arguments.kwargs) -> Made:
+    def task(graph: Owner, *arguments: Arguments.args, **named: Arguments.kwargs) -> Made:
         key = (make, arguments, tuple(named.items()))
-        if key not in graph._made:
-            graph._made[key] = make(graph, *arguments, **named)
-        return graph._made[key]
+        if key not in graph.made:
+            graph.made[key] = make(graph, *arguments, **named)
+        return graph.made[key]
 
     return task
 
@@ -55,14 +64,19 @@ def required(task: Task | None) -> Task:
 
 
 def size_of(task: Task) -> Size:
-    """Return the size of the data that a task works on: of its instrument, or of the nearest it is made from."""
-    instrument = _instrument_of(task)
-    if instrument is None:
+    """Return the size of the data that a task works on: as its settings say, or those of the nearest it is made from.
+
+    That is the size of an instrument's data, or of measured ones.
+    """
+    size = _size_in(task)
+    if size is None:
         raise LookupError(f"{task.stage.name} ({task.label}): made from no instrument")
-    return Size.of(instrument)
+    return size
 
 
-def _instrument_of(task: Task) -> InstrumentSettings | None:
+def _size_in(task: Task) -> Size | None:
     if "instrument" in task.settings:
-        return task.settings["instrument"]
-    return next((found for found in map(_instrument_of, task.needs.values()) if found is not None), None)
+        return Size.of(task.settings["instrument"])
+    if "size" in task.settings:
+        return Size(**task.settings["size"])
+    return next((found for found in map(_size_in, task.needs.values()) if found is not None), None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
@@ -13,6 +13,13 @@ from calstudy.products.corruption import PARITIES
 from calstudy.products.files import AVERAGE, read_json, read_visibilities, spectrum_file, write_json, write_visibilities
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from calstudy.power.settings import PowerSettings
+    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.transfer import Injection
 
 REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Names of the parts of Fourier space, and whether each is inside the wedge."""
@@ -73,29 +80,58 @@ def difference(job: Job) -> Mapping[str, Any]:
 
 def measure(job: Job) -> Mapping[str, Any]:
     """Write T per k outside and inside the wedge and per (|b|, tau), and the residual's power corrected by it."""
-    from calstudy.power.spherical import make_bin_edges
-    from calstudy.power.tables import save_spectrum, write_transfer_csv
-    from calstudy.power.transfer import BANDS, Injection, cylindrical_transfer, spherical_transfer
+    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.tables import load_spectrum
+    from calstudy.power.transfer import Injection
 
     settings = job.settings["power"]
     delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
-    injection = Injection(**delays)
-    fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     known = read_json(job.inputs["scale"] / SCALE)["flux_scale"]
     scale = math.nan if known is None else known
+    summary = write_transfer(job.output, Injection(**delays), settings, scale)
+    residual, signal = (
+        load_spectrum(job.inputs["spectra"] / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
+        for name in ("residual", "eor")
+    )
+    write_corrected(job.output, residual, signal)
+    return {"transfer": summary, "flux_scale": _json(scale)}
+
+
+def write_transfer(folder: Path, injection: Injection, settings: PowerSettings, scale: float) -> dict[str, Any]:
+    """Write T per k outside and inside the wedge, in fine bins and in bands, and per (|b|, tau).
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    injection
+        Spectra of the signal and of the response to it.
+    settings
+        Bins and buffer of the wedge.
+    scale
+        Flux scale of the calibration; NaN if it is not known.
+
+    Returns
+    -------
+    T in bands, as plain JSON types, by part of Fourier space.
+    """
+    from calstudy.power.spherical import make_bin_edges
+    from calstudy.power.tables import save_spectrum, write_transfer_csv
+    from calstudy.power.transfer import BANDS, cylindrical_transfer, spherical_transfer
+
+    fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
         for name, edges in ((TRANSFER, fine), (BAND, BANDS)):
             found = spherical_transfer(injection, edges, buffer, inside, scale)
-            save_spectrum(job.output / spectrum_file(name, region), found)
-            write_transfer_csv(job.output / f"{name}.{region}.csv", found)
+            save_spectrum(folder / spectrum_file(name, region), found)
+            write_transfer_csv(folder / f"{name}.{region}.csv", found)
         summary[region] = [
             {"k": [low, high], "transfer": _json(value), "error": _json(error)}
             for low, high, value, error in zip(BANDS[:-1], BANDS[1:], found.transfer, found.transfer_error, strict=True)
         ]
-    save_spectrum(job.output / spectrum_file(TRANSFER, "wedge"), cylindrical_transfer(injection, settings.length_bin))
-    _write_corrected(job)
-    return {"transfer": summary, "flux_scale": _json(scale)}
+    save_spectrum(folder / spectrum_file(TRANSFER, "wedge"), cylindrical_transfer(injection, settings.length_bin))
+    return summary
 
 
 def measure_flux_scale(job: Job) -> Mapping[str, Any]:
@@ -122,20 +158,24 @@ def _json(value: float) -> float | None:
     return round(float(value), 4) if math.isfinite(value) else None
 
 
-def _write_corrected(job: Job) -> None:
-    from calstudy.power.spectra import SphericalSpectrum
+def write_corrected(folder: Path, residual: SphericalSpectrum, signal: SphericalSpectrum) -> None:
+    """Write the power of the residual outside the wedge, and the same divided by the transfer function in a folder.
+
+    Parameters
+    ----------
+    folder
+        Where `write_transfer` wrote, and where to.
+    residual, signal
+        Spectra of the residual, with errors, and of the signal.
+    """
     from calstudy.power.tables import load_spectrum, write_columns
     from calstudy.power.transfer import TransferFunction, correct
 
-    found = load_spectrum(job.output / spectrum_file(TRANSFER, "outside-wedge"), TransferFunction)
-    residual, signal = (
-        load_spectrum(job.inputs["spectra"] / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
-        for name in ("residual", "eor")
-    )
+    found = load_spectrum(folder / spectrum_file(TRANSFER, "outside-wedge"), TransferFunction)
     power, error = correct(residual, found)
     unit = "[mK2 h-3 Mpc3]"
     write_columns(
-        job.output / "residual-corrected.outside-wedge.csv",
+        folder / "residual-corrected.outside-wedge.csv",
         {
             "k [h/Mpc]": found.k,
             f"residual {unit}": residual.power.real,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import InputError
+from calstudy.report import measured
 from calstudy.report.charts import Chart, read_charts
 from calstudy.report.headline import Number, read_headline
 from calstudy.run.progress import duration
@@ -129,6 +130,7 @@ def read_contents(folder: Path) -> Contents:
         _summary(folder),
         _comparison(folder),
         _realizations(folder),
+        *(Table(*found) for found in measured.tables(folder)),
         _signal_loss(folder, sky_model),
         _convergence(products, sky_model),
         _simulation(products),

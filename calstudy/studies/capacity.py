@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from calstudy.base import ranks
 from calstudy.base.errors import InputError
@@ -50,12 +51,7 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
         cannot help; before anything has started.
     """
     workers, scheduler = budget.workers, budget.scheduler
-    most = max(LEAST_LIMIT, WORKERS_PER_CORE * cores())
-    if scheduler is None and workers is not None and workers > most:
-        raise InputError(
-            f"--workers {workers}: at most {most} are allowed on this machine, which has {cores()} processor core(s); "
-            "leave it out for one per core"
-        )
+    _require_sane(budget)
     if ranks.count() > 1:
         _require_sharing(experiment, workers, scheduler)
     if scheduler is not None:
@@ -65,7 +61,7 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     memory -= LIBRARIES_MEMORY
     hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
     cut = _stream(_cut(experiment, memory / hoped, targets), memory / hoped, targets)
-    needs = {task: task.cost.memory for task in _missing(cut, targets)}
+    needs = {task: task.cost.memory for task in _missing(targets(cut), cut.outputs.store)}
     if not needs:
         return cut, workers or hoped
     largest = max(needs, key=needs.__getitem__)
@@ -76,6 +72,51 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     if workers is not None and budget.max_memory is None:
         return cut, workers
     return cut, min(hoped, fitting)
+
+
+def workers_for(targets: Sequence[Task], store: Path, budget: Budget) -> int:
+    """Return the number of workers for products that cannot be cut further.
+
+    Parameters
+    ----------
+    targets
+        What is to be made.
+    store
+        Folder of products.
+    budget
+        Workers and memory.
+
+    Raises
+    ------
+    InputError
+        As `fit`.
+    """
+    _require_sane(budget)
+    if ranks.count() > 1:
+        raise InputError("mpiexec: measured data are not shared between MPI ranks; use --workers")
+    if budget.scheduler is not None:
+        return budget.workers or 1
+    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
+    memory -= LIBRARIES_MEMORY
+    needs = {task: task.cost.memory for task in _missing(targets, store)}
+    hoped = budget.workers or cores()
+    if not needs:
+        return hoped
+    largest = max(needs, key=needs.__getitem__)
+    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
+    if budget.workers is not None and budget.max_memory is None:
+        return budget.workers
+    return min(hoped, max(1, int(memory // needs[largest])))
+
+
+def _require_sane(budget: Budget) -> None:
+    """Raise InputError if more workers are asked for than can be meant."""
+    most = max(LEAST_LIMIT, WORKERS_PER_CORE * cores())
+    if budget.scheduler is None and budget.workers is not None and budget.workers > most:
+        raise InputError(
+            f"--workers {budget.workers}: at most {most} are allowed on this machine, which has {cores()} processor "
+            "core(s); leave it out for one per core"
+        )
 
 
 def _require_room(largest: Task, need: float, budget: float, source: str) -> None:
@@ -126,13 +167,13 @@ def _stream(experiment: Experiment, share: float, targets: Targets) -> Experimen
 
 
 def _largest(experiment: Experiment, targets: Targets, stage: Stage) -> float:
-    missing = _missing(experiment, targets)
+    missing = _missing(targets(experiment), experiment.outputs.store)
     return max((task.cost.memory for task in missing if task.stage is stage), default=0.0)
 
 
-def _missing(experiment: Experiment, targets: Targets) -> Sequence[Task]:
+def _missing(targets: Sequence[Task], folder: Path) -> Sequence[Task]:
     """Return the tasks whose products a run would have to make, by a quick look into the store."""
-    store, found = Store(experiment.outputs.store), {}
+    store, found = Store(folder), {}
 
     def visit(task: Task) -> None:
         if task.key not in found and store.find(task.stage.name, task.key) is None:
@@ -140,6 +181,6 @@ def _missing(experiment: Experiment, targets: Targets) -> Sequence[Task]:
             for needed in task.needs.values():
                 visit(needed)
 
-    for task in targets(experiment):
+    for task in targets:
         visit(task)
     return tuple(found.values())

@@ -311,7 +311,7 @@ def _base(file: ComparisonFile, folder: Path, scale: str | None, optional: bool)
         source = file.experiment.expanduser()
         source = source if source.is_absolute() else folder / source
         base, folder = read_mapping(source), source.resolve().parent
-    for key in (KEY, "experiments", "runtime"):
+    for key in (KEY, "experiments", "runtime", "observed"):
         if key in base:
             raise ExperimentError([f"experiment: has the key {key!r}, and is no single experiment"])
     has_it = scale in (base.get("scales") or {})

@@ -9,9 +9,10 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from calstudy.experiment.model import Experiment
-from calstudy.studies import collection, comparison, runtime
+from calstudy.studies import collection, comparison, observed, runtime
 from calstudy.studies.collection import CollectionFile
 from calstudy.studies.comparison import ComparisonFile
+from calstudy.studies.observed import ObservedFile
 from calstudy.studies.runtime import RuntimeFile
 
 SCHEMA_FILE = "experiment.schema.json"
@@ -20,7 +21,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def experiment_schema() -> str:
-    """Return the JSON schema of experiments, collections, comparisons and run-time studies as text.
+    """Return the JSON schema of experiments, collections, comparisons, run-time studies and measured data as text.
 
     Quantities are strings there; units and what depends on several fields are checked by ``calstudy plan`` alone.
     """
@@ -28,6 +29,7 @@ def experiment_schema() -> str:
         CollectionFile: collection.KEY,
         RuntimeFile: runtime.KEY,
         ComparisonFile: comparison.KEY,
+        ObservedFile: observed.KEY,
     }
     models: list[type[BaseModel]] = [Experiment, *kinds]
     references, found = models_json_schema([(model, "validation") for model in models])

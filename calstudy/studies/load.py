@@ -8,7 +8,7 @@ from pathlib import Path
 from calstudy.base.package_files import find_experiment
 from calstudy.experiment.files import load
 from calstudy.experiment.yaml_files import read_mapping
-from calstudy.studies import collection, comparison, runtime
+from calstudy.studies import collection, comparison, observed, runtime
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.realizations import Realizations
 from calstudy.studies.study import Study
@@ -16,14 +16,15 @@ from calstudy.studies.sweep import expand
 
 
 def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Study:
-    """Read an experiment, a sweep, realizations, a collection, a comparison or a run-time study, as the file says.
+    """Read an experiment, a sweep, a collection, a comparison, a run-time study or measured data, as the file says.
 
     Parameters
     ----------
     path
         The YAML file, or the name of a published one, such as ``quickstart``. One with the key `experiments` is a
-        collection, one with `calibrators` a comparison, one with `runtime` a run-time study, and an experiment with the
-        key `sweep` is the family of its points, and one with `realizations` all its realizations.
+        collection, one with `calibrators` a comparison, one with `runtime` a run-time study, one with `observed` is
+        about measured data, an experiment with the key `sweep` is the family of its points, and one with `realizations`
+        all its realizations.
     scale
         Name of a set of overrides in the file's `scales`.
     overrides
@@ -44,6 +45,8 @@ def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = 
         return collection.load_collection(path, data, scale, overrides)
     if comparison.KEY in data:
         return comparison.load_comparison(path, data, scale, overrides)
+    if observed.KEY in data:
+        return observed.load_observed(path, data, scale, overrides)
     experiment = load(path, scale, overrides)
     if experiment.realizations:
         return Realizations(experiment)

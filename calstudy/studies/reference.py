@@ -18,6 +18,7 @@ from calstudy.instrument.as_built import DeadDipoles
 from calstudy.instrument.settings import AntennaBeam
 from calstudy.studies.collection import CollectionFile, Member
 from calstudy.studies.comparison import ComparisonFile
+from calstudy.studies.observed import ObservedFile
 from calstudy.studies.runtime import RuntimeFile
 
 
@@ -220,5 +221,12 @@ def field_reference() -> str:
         "one array after the other; what it measured is kept under a key that names the machine.",
         "",
         *_section(RuntimeFile, "", listed),
+        "",
+        "# Files about measured data",
+        "",
+        "A file with the key `observed` is about measured data ([measured-data.md](measured-data.md)): these are",
+        "calibrated, have power spectra, and are calibrated again with an injected EoR.",
+        "",
+        *_section(ObservedFile, "", listed),
     ]
     return "\n".join(lines).rstrip() + "\n"

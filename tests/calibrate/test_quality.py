@@ -16,9 +16,9 @@ from calstudy.calibrate import execution
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.sky_model import common_baselines
 from calstudy.calibrate.standard_formats import make_gains, make_visibilities
-from calstudy.observed.quality import assess
-from calstudy.observed.reading import prepare
-from calstudy.observed.selection import Selection, select
+from calstudy.measured.quality import assess
+from calstudy.measured.reading import prepare
+from calstudy.measured.selection import Selection, select
 
 OPTIONS = ["--gains-only"]
 N_TIMES, CHANNEL, NOISE = 4, 20, 0.01

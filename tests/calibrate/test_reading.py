@@ -10,8 +10,8 @@ from test_calamity import make_uvdata
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
 from calstudy.calibrate.sky_model import match_sky_model
-from calstudy.observed.reading import prepare, read_visibilities
-from calstudy.observed.selection import Selection, parse_selection, select
+from calstudy.measured.reading import prepare, read_visibilities
+from calstudy.measured.selection import Selection, parse_selection, select
 
 
 @pytest.fixture

@@ -7,7 +7,14 @@ from pyuvdata import UVData
 
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import to_cube
-from calstudy.calibrate.expected_loss import DENSE, DelayModes, ExpectedTransfer, expected_transfer, jacobian_size
+from calstudy.calibrate.expected_loss import (
+    DENSE,
+    TAPER,
+    DelayModes,
+    ExpectedTransfer,
+    expected_transfer,
+    jacobian_size,
+)
 from calstudy.calibrate.interface import USABLE, Assumed
 from calstudy.calibrate.preparation import make_problem, prepare
 from calstudy.calibrate.records import CalibrationResult
@@ -20,8 +27,9 @@ def expect(
     data: UVData,
     settings: GainFit,
     result: CalibrationResult,
-    sky_model: UVData | None = None,
+    assumed: Assumed | None = None,
     polarization: int = 0,
+    taper: str = TAPER,
 ) -> ExpectedTransfer | None:
     """Return what is expected to be left of a white signal in the middle one of the usable solves.
 
@@ -30,12 +38,16 @@ def expect(
 
     Parameters
     ----------
-    data, settings, sky_model
+    data, settings
         As they were given to `calstudy.calibrate.execution.run_calibrator`.
     result
         What it returned.
+    assumed
+        Sky model and noise, if there were any.
     polarization
         Index of the polarization.
+    taper
+        Of the delay modes.
 
     Returns
     -------
@@ -47,8 +59,7 @@ def expect(
         return None
     record = usable[len(usable) // 2]
     times = slice(record.integration, record.integration + record.n_integrations)
-    assumed = Assumed(None if sky_model is None else Observation(sky_model))
-    prepared = prepare(Observation(data), settings, assumed)
+    prepared = prepare(Observation(data), settings, assumed or Assumed())
     problem = make_problem(prepared, settings, times, polarization)
     if isinstance(problem, str):
         return None
@@ -58,5 +69,5 @@ def expect(
     gains = solved.gain_array[antennas, :, times.start, polarization]
     model = to_cube(result.model)[times, :, :, polarization].reshape(problem.visibilities.shape)
     probes = None if jacobian_size(problem) <= DENSE else PROBES
-    modes = DelayModes(prepared.data.frequencies)
+    modes = DelayModes(prepared.data.frequencies, taper)
     return expected_transfer(problem, gains, model, modes, probes)

@@ -17,7 +17,7 @@ from pyuvdata import UVData
 
 from calstudy.base.errors import InputError
 from calstudy.calibrate.standard_formats import PARALLEL_HANDS
-from calstudy.observed.selection import Selection, select
+from calstudy.measured.selection import Selection, select
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +47,21 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
         raise InputError(f"{', '.join(names)}: cannot be read as visibilities ({_first_sentence(error)})") from None
     if data.data_array is None:
         raise InputError(f"{', '.join(names)}: holds no visibilities")
+    if not np.isfinite(data.telescope.antenna_positions).all():
+        raise InputError(f"{', '.join(names)}: antenna positions are not finite")
+    _require_plausible(data, ", ".join(names))
+    return data
+
+
+def read_metadata(paths: Sequence[Path]) -> UVData:
+    """Read what `read_visibilities` does without visibilities, where the format allows it; raises likewise."""
+    names = [str(path) for path in paths]
+    data = UVData()
+    try:
+        data.read(names[0] if len(names) == 1 else names, read_data=False)
+    # As above; what cannot be read in parts may be readable as a whole.
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError):
+        return read_visibilities(paths)
     if not np.isfinite(data.telescope.antenna_positions).all():
         raise InputError(f"{', '.join(names)}: antenna positions are not finite")
     _require_plausible(data, ", ".join(names))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +70,26 @@ def parse_selection(texts: Sequence[str]) -> Selection:
             raise InputError(f"--select {key}: given twice")
         found[key] = _value(key, value, f"--select {text}")
     return Selection(**found)
+
+
+def parse_values(values: Mapping[str, str], where: str, autos: bool = False) -> Selection:
+    """Read a value for each of some of the `KEYS`.
+
+    Parameters
+    ----------
+    values
+        By key.
+    where
+        What stands before a key in a message.
+    autos
+        Of the selection.
+
+    Raises
+    ------
+    InputError
+        If a value cannot be read.
+    """
+    return Selection(**{key: _value(key, value, f"{where}{key}") for key, value in values.items()}, autos=autos)
 
 
 def _value(key: str, value: str, where: str) -> Any:

@@ -11,6 +11,7 @@ from pyuvdata import UVData
 
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
 from calstudy.calibrate.records import CalibrationResult
+from calstudy.measured.noise import radiometer_variance
 
 # Bandpasses and the antennas of an array differ by less than this; interference exceeds it by orders of magnitude.
 GAIN_FACTOR = 5.0
@@ -145,8 +146,10 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     products = np.moveaxis(values[first] * values[second].conj(), 2, 0)
     unused = flag_cube(result.residual)[..., polarization]
     power = np.abs(np.where(unused, np.nan, to_cube(result.residual)[..., polarization] * products)) ** 2
-    variance, noise = _variance(data, pairs, polarization)
+    variance = radiometer_variance(data, pairs, polarization)
+    noise = "autocorrelations, by the radiometer equation"
     if variance is None:
+        noise = "the median of the residuals, for the data have no autocorrelations"
         scale = _median(power) / MEDIAN_OVER_MEAN
         chi2 = power / (scale if scale > 0 else np.nan)
     else:
@@ -180,23 +183,3 @@ def _gain_ratios(amplitudes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     own = np.ma.median(masked, axis=(1, 2)).filled(np.nan)
     by_channel = np.ma.median(masked, axis=2).filled(np.nan) / np.where(own > 0, own, np.nan)[:, None]
     return by_channel, own / _median(own)
-
-
-def _variance(data: UVData, pairs: np.ndarray, polarization: int) -> tuple[np.ndarray | None, str]:
-    """Return sigma^2 of the samples of some baselines (NaN where unknown; None without autocorrelations), origin."""
-    all_pairs = antenna_pairs(data)
-    autos = {int(a): row for row, (a, b) in enumerate(all_pairs) if a == b}
-    if not set(np.unique(pairs).tolist()) <= set(autos):
-        return None, "the median of the residuals, for the data have no autocorrelations"
-    flags, cube = flag_cube(data)[..., polarization], to_cube(data)[..., polarization]
-    power = np.where(flags, np.nan, cube.real)
-    places = {tuple(pair): row for row, pair in enumerate(all_pairs.tolist())}
-    rows = [places[tuple(pair)] for pair in pairs.tolist()]
-    first, second = ([autos[int(number)] for number in column] for column in pairs.T)
-    counts = data.nsample_array[..., polarization].reshape(cube.shape)[:, rows]
-    samples = np.abs(np.mean(data.channel_width)) * np.mean(data.integration_time) * counts
-    product = power[:, first] * power[:, second]
-    valid = (product > 0) & (samples > 0)
-    return np.where(
-        valid, product / np.where(valid, samples, 1), np.nan
-    ), "autocorrelations, by the radiometer equation"

@@ -1,0 +1,48 @@
+"""Cylindrical power spectra of measured data, as given, calibrated, and what is left, and of their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from calstudy.figures import Drawing, ObservedFigure
+from calstudy.figures.wedge import draw_panels
+from calstudy.products.files import spectrum_file
+from calstudy.products.observed_spectra import observed_spectra
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, half
+
+if TYPE_CHECKING:
+    from calstudy.products.observed import ObservedGraph
+
+TITLES = {
+    "data": "data as given",
+    "calibrated": "calibrated",
+    "residual": "residual",
+    "noise": r"noise, $P_N$",
+}
+MAX_DELAY = 2e-6
+
+
+class ObservedWedge(ObservedFigure):
+    """Cylindrical power spectra of measured data."""
+
+    caption = (
+        "Cylindrical power spectra of the measured data: as given, calibrated, the residual, and the power of their "
+        "noise from the difference of the two halves; negative values in blue."
+    )
+    tolerances = ((r".*\.power", Drawn(half, "follows from fitted gains; half of it")),)
+
+    def observed_inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+        """Return the averaged spectra."""
+        return {"spectra": observed_spectra(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a panel for each."""
+        from calstudy.power.spectra import CylindricalSpectrum
+        from calstudy.power.tables import load_spectrum
+
+        folder = job.inputs["spectra"]
+        found = {name: load_spectrum(folder / spectrum_file(name, "wedge"), CylindricalSpectrum) for name in TITLES}
+        figure = draw_panels(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY, job.settings["notes"])
+        return Drawing(figure, found)

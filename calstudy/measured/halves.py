@@ -1,0 +1,224 @@
+"""Two halves of measured data that see the same sky with independent noise, even and odd."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.instrument.settings import Channels
+from calstudy.instrument.size import Size
+from calstudy.measured.selection import Selection, parse_values, select
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pyuvdata import UVData
+
+PARITIES = ("even", "odd")
+FEED_TOLERANCE = np.radians(1)
+LEAST_CHANNELS = 8
+SECONDS_PER_DAY = 86400.0
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of measured data from their metadata.
+
+    Attributes
+    ----------
+    unit
+        Of the visibilities.
+    antennas, polarizations
+        Their numbers.
+    times
+        Julian dates of the integrations, (Ntimes,).
+    sidereal_times
+        rad, (Ntimes,).
+    integration
+        Duration of the shortest, s.
+    frequencies
+        Channel centres, ascending, Hz, (Nfreqs,).
+    lengths
+        Of all baselines, m, (Nbls,).
+    autos
+        Whether there are autocorrelations of all antennas.
+    """
+
+    unit: str
+    antennas: int
+    polarizations: int
+    times: np.ndarray
+    sidereal_times: np.ndarray
+    integration: float
+    frequencies: np.ndarray
+    lengths: np.ndarray
+    autos: bool
+
+    @property
+    def channels(self) -> Channels:
+        """Its channels, which are equally spaced."""
+        width = float(np.ptp(self.frequencies)) / (self.frequencies.size - 1)
+        first = float(self.frequencies[0])
+        return Channels.model_construct(first=first, width=float(f"{width:.12g}"), count=self.frequencies.size)
+
+    def size(self, n_times: int) -> Size:
+        """Return the size of `n_times` of its integrations."""
+        return Size(
+            antennas=self.antennas,
+            times=n_times,
+            channels=self.channels,
+            polarizations=self.polarizations,
+            longest=float(self.lengths.max()),
+            mean=float(self.lengths.mean()),
+        )
+
+
+def read_facts(
+    paths: tuple[Path, ...], selection: Selection, positions: Path | None = None, even: bool = True
+) -> Facts:
+    """Read the metadata of measured data.
+
+    Parameters
+    ----------
+    paths
+        Of files or folders that belong together.
+    selection
+        The part that is wanted.
+    positions
+        File of the antennas' positions, in place of those in the data.
+    even
+        Whether channels must be at equal distances, and enough of them for power spectra.
+
+    Raises
+    ------
+    InputError
+        If the files cannot be read, or what is selected has no baselines, or `even` does not hold.
+    """
+    # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
+    from calstudy.calibrate.standard_formats import PARALLEL_HANDS
+    from calstudy.measured.positions import place_antennas
+    from calstudy.measured.reading import read_metadata
+
+    data = read_metadata(paths)
+    if positions is not None:
+        place_antennas(data, positions)
+    data = select(data, selection)
+    places = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
+    pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)
+    crosses = pairs[pairs[:, 0] != pairs[:, 1]]
+    if not len(crosses):
+        raise InputError("observed.data: there are no baselines, only autocorrelations")
+    frequencies = np.sort(np.ravel(data.freq_array))
+    if even:
+        _require_even(frequencies)
+    times, rows = np.unique(data.time_array, return_index=True)
+    return Facts(
+        unit=str(data.vis_units),
+        antennas=np.unique(crosses).size,
+        polarizations=int(np.isin(data.polarization_array, list(PARALLEL_HANDS)).sum()),
+        times=times,
+        sidereal_times=np.asarray(data.lst_array)[rows],
+        integration=float(np.min(data.integration_time)),
+        frequencies=frequencies,
+        lengths=np.array([np.linalg.norm(places[b] - places[a]) for a, b in crosses.tolist()]),
+        autos=set(np.unique(crosses).tolist()) <= set(pairs[pairs[:, 0] == pairs[:, 1], 0].tolist()),
+    )
+
+
+def _require_even(frequencies: np.ndarray) -> None:
+    if frequencies.size < LEAST_CHANNELS:
+        raise InputError(
+            f"observed.select: {frequencies.size} channels are left; power spectra need at least {LEAST_CHANNELS}"
+        )
+    steps = np.diff(frequencies)
+    if np.ptp(steps) > 1e-3 * steps.mean():
+        place = frequencies[int(np.argmax(steps))]
+        raise InputError(
+            f"observed.data: the channels are {steps.min() / 1e3:.6g} to {steps.max() / 1e3:.6g} kHz apart, the "
+            f"largest step being at {place / 1e6:.3f} MHz; power spectra need equal distances: select a part by "
+            "observed.select.frequencies, or fill the gap with flagged channels"
+        )
+
+
+def require_same_sky(even: Facts, odd: Facts) -> None:
+    """Raise InputError unless two data sets can be crossed: the same array, channels and sidereal times.
+
+    Parameters
+    ----------
+    even, odd
+        Of the two data sets.
+    """
+    if even.frequencies.shape != odd.frequencies.shape or not np.allclose(
+        even.frequencies, odd.frequencies, rtol=0, atol=0.01 * even.channels.width
+    ):
+        raise InputError("observed.odd: its channels are not those of observed.data")
+    middles = [np.angle(np.mean(np.exp(1j * facts.sidereal_times))) for facts in (even, odd)]
+    apart = abs(np.angle(np.exp(1j * (middles[0] - middles[1])))) / (2 * np.pi) * SECONDS_PER_DAY
+    if apart > even.integration:
+        raise InputError(
+            f"observed.odd: its mean sidereal time is {apart:.4g} s from that of observed.data, and at most one "
+            f"integration ({even.integration:.4g} s) is allowed: it must see the same sky"
+        )
+
+
+def interleaved(data: UVData, parity: str) -> UVData:
+    """Return every second integration, from the first (even) or the second (odd).
+
+    Parameters
+    ----------
+    data
+        Rectangular and time-major.
+    parity
+        "even" or "odd".
+    """
+    times = np.arange(PARITIES.index(parity), data.Ntimes, 2)
+    rows = (times[:, None] * data.Nbls + np.arange(data.Nbls)).ravel()
+    return data.select(blt_inds=rows, inplace=False, run_check=False)
+
+
+def flag_channels(data: UVData, text: str) -> None:
+    """Flag the channels in a range of frequencies, such as ``149.7 MHz..150.2 MHz``; raises InputError if none is."""
+    low, high = parse_values({"frequencies": text}, "observed.flag: ").frequencies or (None, None)
+    frequencies = np.ravel(data.freq_array)
+    chosen = (frequencies >= (low or -np.inf)) & (frequencies <= (high or np.inf))
+    if not chosen.any():
+        raise InputError(
+            f"observed.flag: {text!r} has no channel of the data, which have {frequencies.min() / 1e6:.3f} to "
+            f"{frequencies.max() / 1e6:.3f} MHz"
+        )
+    data.flag_array[:, chosen] = True
+
+
+def east_and_north(data: UVData) -> list[str]:
+    """Name the feeds of prepared data so that x is east and y is north; return what was changed in words.
+
+    Raises
+    ------
+    InputError
+        If the feeds are not linear, or neither to the east nor to the north.
+    """
+    telescope = data.telescope
+    linear = bool(np.all(np.isin(data.polarization_array, (-5, -6))))
+    feeds: dict[str, set[Any]] = {"x": set(), "y": set()}
+    if linear:
+        for names, angles in zip(telescope.feed_array, telescope.feed_angle, strict=True):
+            for name, angle in zip(names, angles, strict=True):
+                feeds[str(name)].add("east" if _is(angle, np.pi / 2) else "north" if _is(angle, 0) else "other")
+    x, y = feeds["x"] or {"east"}, feeds["y"] or {"north"}
+    if linear and (x, y) == ({"east"}, {"north"}):
+        return []
+    if linear and feeds["x"] <= {"north"} and feeds["y"] <= {"east"}:
+        data.polarization_array = -11 - np.asarray(data.polarization_array)
+        telescope.set_feeds_from_x_orientation("east", feeds=["x", "y"], polarization_array=data.polarization_array)
+        return ["The file calls the northern feed x; it is called y here, and the eastern one x."]
+    raise InputError(
+        f"observed.data: polarizations {', '.join(data.get_pols())} of feeds that are not linear and to the east and "
+        "north; power spectra need such, for the beam is that of such feeds"
+    )
+
+
+def _is(angle: float, wanted: float) -> bool:
+    return abs((angle - wanted + np.pi / 2) % np.pi - np.pi / 2) < FEED_TOLERANCE

@@ -1,0 +1,143 @@
+r"""The noise of measured data: from the difference of two halves, and from the autocorrelations.
+
+With E and O the averages of the halves, of n_e and n_o integrations and phased to the same point of the sky, the sky
+cancels in E - O, and the variance of it is sigma^2 (1/n_e + 1/n_o) for noise of variance sigma^2. The cross power of E
+and O has noise of the geometric mean of the variances of E and O, sigma^2 / sqrt(n_e n_o). Hence the power P_N of
+
+    sqrt(sqrt(n_e n_o) / (n_e + n_o)) (E - O)
+
+is what the noise of even x odd follows from: one real part of a product has the variance P_N^2 / 2.
+
+The autocorrelations give the same by the radiometer equation, sigma^2 = V_aa V_bb / (channel width x time), over
+|g_a g_b|^2 for calibrated data. What the mean of the delay power is of visibilities whose moduli are known does not
+depend on their phases (Parseval), so that it is that of real visibilities sigma(nu).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+from calstudy.power.spectra import outside_wedge
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+    from calstudy.power.spectra import DelaySpectra
+
+
+def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:
+    """Return sigma^2 of samples of some baselines by the radiometer equation, (Ntimes, len(pairs), Nfreqs).
+
+    Parameters
+    ----------
+    data
+        With autocorrelations.
+    pairs
+        Antenna numbers (a, b), (Nbls, 2).
+    polarization
+        Index of the polarization.
+
+    Returns
+    -------
+    NaN where it is not known; None without the autocorrelations of all antennas.
+    """
+    all_pairs = antenna_pairs(data)
+    autos = {int(a): row for row, (a, b) in enumerate(all_pairs) if a == b}
+    if not set(np.unique(pairs).tolist()) <= set(autos):
+        return None
+    flags, cube = flag_cube(data)[..., polarization], to_cube(data)[..., polarization]
+    power = np.where(flags, np.nan, cube.real)
+    places = {tuple(pair): row for row, pair in enumerate(all_pairs.tolist())}
+    rows = [places[tuple(pair)] for pair in pairs.tolist()]
+    first, second = ([autos[int(number)] for number in column] for column in pairs.T)
+    counts = data.nsample_array[..., polarization].reshape(cube.shape)[:, rows]
+    samples = np.abs(np.mean(data.channel_width)) * np.mean(data.integration_time) * counts
+    product = power[:, first] * power[:, second]
+    valid = (product > 0) & (samples > 0)
+    return np.where(valid, product / np.where(valid, samples, 1), np.nan)
+
+
+def half_difference(even: UVData, odd: UVData) -> UVData:
+    """Return the difference of two averages, with the power P_N of the noise of their product.
+
+    Parameters
+    ----------
+    even, odd
+        One integration each, of the same baselines, phased to the same point. Not mutated. What is flagged in either is
+        flagged.
+    """
+    found = even.copy()
+    n_even, n_odd = (_weights(uvd) for uvd in (even, odd))
+    found.flag_array = even.flag_array | odd.flag_array | (n_even <= 0) | (n_odd <= 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.sqrt(np.sqrt(n_even * n_odd) / (n_even + n_odd))
+    found.data_array = np.where(found.flag_array, 0, factor * (even.data_array - odd.data_array))
+    return found
+
+
+def _weights(uvd: UVData) -> np.ndarray:
+    """Return how long each sample was measured, s times nsamples."""
+    return uvd.nsample_array * np.asarray(uvd.integration_time)[:, None, None]
+
+
+def noise_of_average(variance: np.ndarray, uvd: UVData) -> np.ndarray:
+    """Return sigma of the average over integrations, (Nbls, Nfreqs, Npols); NaN where nothing is unflagged.
+
+    Parameters
+    ----------
+    variance
+        sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols).
+    uvd
+        The data that are averaged: flags and numbers of samples, which are the weights.
+    """
+    weights = np.where(flag_cube(uvd), 0, uvd.nsample_array.reshape(variance.shape))
+    total = weights.sum(axis=0)
+    added = np.sum(np.where(weights > 0, weights**2 * variance, 0), axis=0)
+    return np.sqrt(np.divide(added, total**2, out=np.full(total.shape, np.nan), where=total > 0))
+
+
+def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> np.ndarray:
+    """Return P_N of each baseline, the mean over delays, (Nu,).
+
+    Parameters
+    ----------
+    noise
+        Power of `half_difference`, or of the real noise from autocorrelations, of each baseline with itself.
+    buffer
+        Delays within |b|/c + buffer (s) are left out of a difference: what the sky changes between the halves is there.
+    everywhere
+        Whether to take all delays nevertheless.
+
+    Returns
+    -------
+    NaN for a baseline without delays beyond the buffer.
+    """
+    used = np.ones(noise.power.shape, bool) if everywhere else outside_wedge(noise, buffer)
+    count = used.sum(axis=1)
+    total = np.sum(noise.power.real, axis=1, where=used)
+    return np.divide(total, count, out=np.full(count.size, np.nan), where=count > 0)
+
+
+def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarray) -> np.ndarray:
+    """Return P_N of each unit of spectra, (Nu,): the mean over its baselines.
+
+    Parameters
+    ----------
+    spectra
+        Of units: baselines, or redundant groups.
+    noise
+        Of each baseline with itself.
+    levels
+        P_N of each baseline; NaN is left out.
+    """
+    known = np.isfinite(levels)
+    both = np.concatenate([spectra.vectors, -spectra.vectors])
+    unit = cKDTree(both).query(noise.vectors[known])[1] % len(spectra.vectors)
+    count = np.bincount(unit, minlength=len(spectra.vectors))
+    total = np.bincount(unit, levels[known], len(spectra.vectors))
+    mean = np.mean(levels[known]) if known.any() else np.nan
+    return np.divide(total, count, out=np.full(count.size, mean), where=count > 0)

@@ -1,0 +1,196 @@
+"""The sections `observed` and `injection` of a file about measured data."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializeAsAny,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Plugin
+from calstudy.base.schema import Section, choice, fault
+from calstudy.base.units import Decibel, FluxDensity
+from calstudy.corrupt.temperature import SystemTemperature
+from calstudy.instrument.settings import BEAMS
+from calstudy.measured.selection import Selection, parse_values
+from calstudy.simulate.settings import SimulationSettings
+from calstudy.sky.settings import Eor
+
+IN_PACKAGE = re.compile(r"(?P<package>[A-Za-z_][A-Za-z0-9_.]+):(?P<path>[^/\\].*)")
+"""A file of an installed package: ``hera_qm:data/zen.uvh5``."""
+
+
+def find_data(text: str, folder: Path) -> Path:
+    """Return the absolute path of a file or folder, which may be given relative to a folder or to a package.
+
+    Parameters
+    ----------
+    text
+        A path, or ``package:path``.
+    folder
+        Where relative paths start.
+
+    Raises
+    ------
+    InputError
+        If there is no such package, file or folder.
+    """
+    if "\0" in text:
+        raise InputError(f"{text!r} cannot be the path of a file")
+    if (packaged := IN_PACKAGE.fullmatch(text)) is not None:
+        path = _folder_of(packaged["package"], text) / packaged["path"]
+    else:
+        try:
+            path = folder / Path(text).expanduser()
+        except RuntimeError:
+            raise InputError(f"{text!r}: there is no such home folder") from None
+    if not path.exists():
+        raise InputError(f"{text!r}: no such file or folder (looked for {path.resolve()})")
+    return path.resolve()
+
+
+def _find(value: Any, info: ValidationInfo) -> Any:
+    if not isinstance(value, str | Path):
+        return value
+    try:
+        return find_data(str(value), (info.context or {}).get("folder") or Path())
+    except InputError as error:
+        raise fault("", str(error)) from None
+
+
+def _folder_of(package: str, text: str) -> Path:
+    try:
+        found = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        found = None
+    if found is None or not found.submodule_search_locations:
+        raise InputError(f"{text!r}: there is no installed package {package!r}")
+    return Path(found.submodule_search_locations[0])
+
+
+def _as_list(paths: Any) -> Any:
+    return [paths] if isinstance(paths, str | Path) else paths
+
+
+DataFile = Annotated[Path, BeforeValidator(_find), Field(strict=False)]
+DataFiles = Annotated[
+    tuple[DataFile, ...],
+    BeforeValidator(_as_list, json_schema_input_type=str | tuple[str, ...]),
+    Field(strict=False),
+]
+
+
+def _can_be_a_range(value: str) -> str:
+    try:
+        parse_values({"frequencies": value}, "")
+    except InputError as error:
+        raise fault("", f"{value!r}: {str(error).partition(': ')[2]}") from None
+    return value
+
+
+FrequencyRange = Annotated[str, AfterValidator(_can_be_a_range)]
+
+
+class Select(Section):
+    """A part of the data, as `--select` of `calstudy calibrate` takes it; ranges include both ends."""
+
+    antennas: str | None = Field(None, description="Numbers or names: '0,1,12'.")
+    lengths: str | None = Field(None, description="Baseline lengths: '14 m..60 m'.")
+    times: str | None = Field(None, description="Integrations, counted from 0: '0..9'.")
+    frequencies: str | None = Field(None, description="Channel centres: '120 MHz..180 MHz'.")
+    polarizations: str | None = Field(None, description="Such as 'xx' or 'ee,nn'.")
+
+    @field_validator("*")
+    @classmethod
+    def _can_be_read(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is not None:
+            try:
+                parse_values({str(info.field_name): value}, "")
+            except InputError as error:
+                raise fault("", f"{value!r}: {str(error).partition(': ')[2]}") from None
+        return value
+
+    @property
+    def selection(self) -> Selection:
+        """The part of the data; a selection of lengths keeps the autocorrelations, from which the noise is known."""
+        given = {name: value for name, value in self.model_dump().items() if value is not None}
+        return parse_values(given, "observed.select.", autos=True)
+
+
+class Factor(Section):
+    """One unit of the data is so many Jy."""
+
+    kind: Literal["factor"]
+    unit: FluxDensity = Field(gt=0, description="What one unit of the data is.")
+
+
+class FromAutocorrelations(SystemTemperature):
+    """The median autocorrelation is that of the system temperature: receiver + sky (nu / sky_frequency)^sky_index.
+
+    In Jy it is k_B T / A_e with A_e = wavelength^2 over the solid angle of `observed.beam`. One number for all data.
+    """
+
+    kind: Literal["system-temperature"]
+
+
+FluxScale = Annotated[Factor | FromAutocorrelations, Field(discriminator="kind"), choice("kind")]
+
+
+class ObservedSettings(Section):
+    """Measured visibilities in any format that pyuvdata reads; paths start at the file, or are ``package:path``."""
+
+    data: DataFiles = Field(min_length=1, description="A file or folder, or several that belong together.")
+    odd: DataFiles = Field(
+        (),
+        description="Other data of the same sky, such as another night at the same sidereal time: spectra are data x "
+        "odd. Empty: every second integration of `data`.",
+    )
+    select: Select = Select()
+    flag: Annotated[tuple[FrequencyRange, ...], Field(strict=False)] = Field(
+        (), description="Channels that are flagged, such as those of known interference: ['149.7 MHz..150.2 MHz']."
+    )
+    positions: DataFile | None = Field(
+        None,
+        description="Antenna positions in place of those in the data: a CSV file with columns number, east_m, north_m "
+        "and up_m.",
+    )
+    sky_model: DataFile | None = Field(
+        None, description="Visibilities of the sky as far as it is known, in Jy, with the times and channels of `data`."
+    )
+    beam: Annotated[SerializeAsAny[Plugin], BEAMS.field()] = Field(
+        description="The beam of the antennas; it normalizes power spectra, and the injected signal is seen through it."
+    )
+    flux_scale: FluxScale | None = Field(
+        None,
+        description="How data become Jy that are in another unit; null: they are in Jy, or become so by the gains, "
+        "where there is a sky model.",
+    )
+
+    @model_validator(mode="after")
+    def _sky_model_is_of_one_data_set(self) -> ObservedSettings:
+        if self.odd and self.sky_model is not None:
+            raise fault("sky_model", "cannot have the times of both data and odd; leave out one of sky_model and odd")
+        return self
+
+
+class InjectionSettings(Section):
+    """A simulated EoR that is put into the data under the gains that were solved for."""
+
+    eor: Eor = Field(Eor(nside=128), description="As `sky.eor` of an experiment.")
+    level: Decibel | None = Field(
+        -30.0,
+        description="rms of the EoR over that of the fitted foregrounds, 10 log10 of brightness: -30 dB is 1e-3; null: "
+        "as `eor` says.",
+    )
+    simulation: SimulationSettings = SimulationSettings()

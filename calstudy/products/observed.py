@@ -1,0 +1,386 @@
+"""Measured data: two halves, their calibration and averages, and delay power spectra."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.errors import InputError
+from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.interface import Calibrator
+from calstudy.calibrate.settings import GainFit
+from calstudy.measured.settings import Factor, FromAutocorrelations, InjectionSettings, ObservedSettings
+from calstudy.power.settings import PowerSettings
+from calstudy.products.calibration import calibration_of
+from calstudy.products.corruption import LEVELS, PARITIES
+from calstudy.products.files import (
+    AVERAGE,
+    DATA,
+    MODEL,
+    RESIDUAL,
+    VISIBILITIES,
+    read_visibilities,
+    write_json,
+    write_visibilities,
+)
+from calstudy.products.graph import Memory, once, size_of
+from calstudy.products.spectra import BINNING, POWER
+from calstudy.run.task import Job, Stage, Task
+
+if TYPE_CHECKING:
+    import numpy as np
+    from pyuvdata import UVData
+
+    from calstudy.measured.halves import Facts
+
+NOISE = "noise.uvh5"
+"""Of an average: sigma by the autocorrelations."""
+WHAT = ("data", "calibrated", "residual")
+"""What has power spectra: the data as given, V / (g g*), and V / (g g*) - F."""
+SOURCES = ("difference", "autos")
+"""From what the noise is known: the difference of the halves, the autocorrelations."""
+
+
+@dataclass(frozen=True)
+class Halves:
+    """What is known of the two halves before they are read.
+
+    Attributes
+    ----------
+    facts
+        Of the files of each, by parity.
+    """
+
+    facts: Mapping[str, Facts]
+
+    @property
+    def interleaved(self) -> bool:
+        """Whether both are in the same files."""
+        return self.facts["even"] is self.facts["odd"]
+
+    def times(self, parity: str) -> np.ndarray:
+        """Return the Julian dates of the integrations of a half."""
+        times = self.facts[parity].times
+        return times[PARITIES.index(parity) :: 2] if self.interleaved else times
+
+    @property
+    def centre(self) -> float | None:
+        """Julian date at which the phase centre of both is at the zenith; None for that of each one's own middle."""
+        if not self.interleaved:
+            return None
+        times = self.facts["even"].times
+        return float((times.min() + times.max()) / 2)
+
+
+class ObservedGraph(Memory):
+    """The tasks of one study of measured data.
+
+    Parameters
+    ----------
+    observed, calibration, power, injection
+        Sections of its file; no injection if None.
+    halves
+        Of the files.
+    """
+
+    def __init__(
+        self,
+        observed: ObservedSettings,
+        calibration: Calibrator,
+        power: PowerSettings,
+        injection: InjectionSettings | None,
+        halves: Halves,
+    ) -> None:
+        super().__init__()
+        self.observed, self.calibration, self.power = observed, calibration, power
+        self.injection, self.halves = injection, halves
+
+    @property
+    def beam_settings(self) -> dict[str, Any]:
+        """Beam and channels."""
+        return {"beam": self.observed.beam, "channels": self.halves.facts["even"].channels}
+
+
+@once
+def observed(graph: ObservedGraph, parity: str) -> Task:
+    """Return the task of one half of the data, in Jy, and of the sky model at the same samples."""
+    section, halves = graph.observed, graph.halves
+    files = section.odd if parity == "odd" and not halves.interleaved else section.data
+    size = halves.facts[parity].size(len(halves.times(parity)))
+    settings: dict[str, Any] = {
+        "files": list(files),
+        "select": section.select,
+        "size": {name: getattr(size, name) for name in size.__dataclass_fields__},
+        "parity": parity if halves.interleaved else None,
+    }
+    if section.flag:
+        settings["flag"] = list(section.flag)
+    if section.positions is not None:
+        settings["positions"] = section.positions
+    if section.sky_model is not None:
+        autos = isinstance(graph.calibration, GainFit) and graph.calibration.autos
+        settings |= {"sky_model": section.sky_model, "autos": autos}
+    if section.flux_scale is not None:
+        settings["flux_scale"] = section.flux_scale
+        if isinstance(section.flux_scale, FromAutocorrelations):
+            settings["beam"] = section.beam
+    return Task(OBSERVE, f"data {parity}", settings)
+
+
+def calibration_inputs(graph: ObservedGraph, data: Task, parity: str) -> dict[str, Task]:
+    """Return what a calibration of data of one half needs."""
+    inputs, source = {"data": data}, observed(graph, parity)
+    if graph.observed.sky_model is not None:
+        inputs["sky_model"] = source
+    if graph.calibration.needs_noise:
+        inputs["levels"] = source
+    return inputs
+
+
+@once
+def calibrated(graph: ObservedGraph, parity: str) -> Task:
+    """Return the task of the calibration of one half."""
+    data = observed(graph, parity)
+    return calibration_of(graph.calibration.reset("assumed"), calibration_inputs(graph, data, parity))
+
+
+@once
+def average(graph: ObservedGraph, what: str, parity: str) -> Task:
+    """Return the task of one half, fringe-stopped and averaged; `what` is one of `WHAT`."""
+    inputs = {"data": observed(graph, parity), "calibration": calibrated(graph, parity)}
+    return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, "centre": graph.halves.centre}, inputs)
+
+
+def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: PowerSettings | None = None) -> Task:
+    """Return the task of the delay power spectra of two averages.
+
+    Parameters
+    ----------
+    graph
+        Of the study.
+    label
+        What the data are.
+    even, odd
+        Averages.
+    power
+        In place of the study's own.
+    """
+    settings = {**graph.beam_settings, "power": (power or graph.power).reset(*BINNING)}
+    return Task(POWER, label, settings, {"even": even, "odd": odd})
+
+
+@once
+def power_of(graph: ObservedGraph, what: str) -> Task:
+    """Return the task of the delay power spectra even x odd; `what` is one of `WHAT`."""
+    return crossed(graph, what, average(graph, what, "even"), average(graph, what, "odd"))
+
+
+@once
+def noise_power(graph: ObservedGraph, what: str, source: str) -> Task:
+    """Return the task of the power of the noise of each baseline.
+
+    Parameters
+    ----------
+    graph
+        Of the study.
+    what
+        "data" as given, or "residual": calibrated.
+    source
+        One of `SOURCES`.
+    """
+    inputs = {parity: average(graph, what, parity) for parity in PARITIES}
+    label = f"noise of {what} from {source}"
+    noise = Task(NOISE_STAGE, label, {"source": source}, inputs)
+    own = graph.power.model_copy(update={"pairs": "same-baseline"}).reset("redundancy_tolerance")
+    return crossed(graph, label, noise, noise, own)
+
+
+def observe(job: Job) -> Mapping[str, Any]:
+    """Write the data of one half to data.uvh5, and the sky model to visibilities.uvh5."""
+    from calstudy.calibrate.sky_model import common_baselines
+    from calstudy.measured.halves import east_and_north, flag_channels, interleaved
+    from calstudy.measured.positions import place_antennas
+    from calstudy.measured.reading import prepare, read_visibilities
+    from calstudy.measured.selection import Selection
+
+    settings, placed = job.settings, []
+    data = read_visibilities(settings["files"])
+    if "positions" in settings:
+        placed = [place_antennas(data, settings["positions"])]
+    try:
+        data, notes = prepare(data, settings["select"].selection)
+    except InputError as error:
+        raise InputError(str(error).replace("--select ", "observed.select.")) from None
+    notes = placed + notes + east_and_north(data)
+    for text in settings.get("flag", ()):
+        flag_channels(data, text)
+    sky = None
+    if "sky_model" in settings:
+        sky, sky_notes = prepare(read_visibilities([settings["sky_model"]]), Selection())
+        sky_notes += east_and_north(sky)
+        sky, data, left_out = common_baselines(sky, data, settings["autos"])
+        notes += [f"Sky model: {note}" for note in sky_notes] + left_out
+    if settings["parity"] is not None:
+        data, sky = (uvd and interleaved(uvd, settings["parity"]) for uvd in (data, sky))
+    factor = _factor(job, data)
+    data.data_array = data.data_array.astype(complex) * factor
+    data.vis_units = "Jy"
+    write_visibilities(data, job.output / DATA)
+    if sky is not None:
+        sky.vis_units = "Jy"
+        write_visibilities(sky, job.output / VISIBILITIES)
+    _write_level(job, data)
+    flagged = float(data.flag_array.mean())
+    return {"integrations": int(data.Ntimes), "jansky_per_unit": factor, "flagged_fraction": flagged, "changes": notes}
+
+
+def _factor(job: Job, data: UVData) -> float:
+    """Return what one unit of the data is in Jy."""
+    import numpy as np
+
+    from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+    from calstudy.corrupt.temperature import effective_area
+    from calstudy.instrument.beams import make_beam
+
+    scale = job.settings.get("flux_scale")
+    if scale is None:
+        return 1.0
+    if isinstance(scale, Factor):
+        return scale.unit
+    autos = np.equal(*antenna_pairs(data).T)
+    measured = np.where(flag_cube(data), np.nan, to_cube(data).real)[:, autos]
+    frequencies = np.asarray(data.freq_array, float)
+    beam = make_beam(job.settings["beam"], job.settings["size"]["channels"])
+    ratios = []
+    for index, number in enumerate(data.polarization_array):
+        omega_p, _ = beam.solid_angles(frequencies, {-5: "xx", -6: "yy"}[int(number)])
+        expected = scale.autocorrelations(frequencies, effective_area(frequencies, omega_p))
+        ratios.append(expected / measured[..., index])
+    found = np.nanmedian(ratios) if np.isfinite(ratios).any() else np.nan
+    if not found > 0:
+        raise InputError("observed.flux_scale: the data have no autocorrelations that are unflagged and positive")
+    return float(found)
+
+
+def _write_level(job: Job, data: UVData) -> None:
+    """Write the rms of the noise as the calibrators that need it find it, if the autocorrelations tell."""
+    import numpy as np
+
+    from calstudy.base.visibilities import antenna_pairs
+    from calstudy.measured.noise import radiometer_variance
+
+    pairs = antenna_pairs(data)
+    variance = radiometer_variance(data, pairs[pairs[:, 0] != pairs[:, 1]], 0)
+    if variance is not None and np.isfinite(variance).any():
+        write_json(job.output / LEVELS, {"noise_std": float(np.sqrt(np.nanmean(variance)))})
+
+
+def make_average(job: Job) -> Mapping[str, Any]:
+    """Write the average of one half to average.uvh5, and sigma of its noise to noise.uvh5 if there are autos.
+
+    All averages have the samples, flags and baselines of the residual.
+    """
+    import numpy as np
+
+    from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, to_cube
+    from calstudy.measured.noise import noise_of_average
+    from calstudy.power.average import fringe_stop_and_average
+
+    what, folder = job.settings["what"], job.inputs["calibration"]
+    residual, data = read_visibilities(folder / RESIDUAL), read_visibilities(job.inputs["data"] / DATA)
+    pairs = antenna_pairs(residual)
+    crosses = pairs[:, 0] != pairs[:, 1]
+    residual = residual.select(blt_inds=_rows(residual, crosses), inplace=False, run_check=False)
+    pairs = pairs[crosses]
+    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(data).tolist())}
+    if what == "residual":
+        cube = to_cube(residual)
+    elif what == "data":
+        cube = to_cube(data)[:, [places[tuple(pair)] for pair in pairs.tolist()]]
+    else:
+        cube = to_cube(residual) + to_cube(read_visibilities(folder / MODEL))[:, crosses]
+    found = from_cube(residual, np.where(flag_cube(residual), 0, cube))
+    averaged = fringe_stop_and_average(found, job.settings["centre"])
+    write_visibilities(averaged, job.output / AVERAGE)
+    variance = _variances(data, pairs)
+    if variance is None:
+        return {}
+    if what != "data":
+        variance = variance / _products(job, pairs)
+    sigma = noise_of_average(variance, found)
+    noise = averaged.copy()
+    noise.data_array = np.nan_to_num(sigma).astype(complex)
+    noise.flag_array = averaged.flag_array | ~np.isfinite(sigma)
+    write_visibilities(noise, job.output / NOISE)
+    return {}
+
+
+def _rows(data: UVData, chosen: np.ndarray) -> np.ndarray:
+    import numpy as np
+
+    return np.flatnonzero(np.tile(chosen, data.Ntimes))
+
+
+def _variances(data: UVData, pairs: np.ndarray) -> np.ndarray | None:
+    """Return sigma^2 of all samples by the autocorrelations, (Ntimes, Nbls, Nfreqs, Npols), or None."""
+    import numpy as np
+
+    from calstudy.measured.noise import radiometer_variance
+
+    found = [radiometer_variance(data, pairs, polarization) for polarization in range(data.Npols)]
+    known = [variance for variance in found if variance is not None]
+    return np.stack(known, axis=-1) if len(known) == len(found) else None
+
+
+def _products(job: Job, pairs: np.ndarray) -> np.ndarray:
+    """Return |g_a g_b*|^2, (Ntimes, Nbls, Nfreqs, Npols), NaN where there is no solution."""
+    import numpy as np
+    from pyuvdata import UVCal
+
+    from calstudy.products.files import GAINS
+
+    gains = UVCal.from_file(job.inputs["calibration"] / GAINS)
+    order = np.argsort(gains.ant_array)
+    first, second = (order[np.searchsorted(gains.ant_array, column, sorter=order)] for column in pairs.T)
+    power = np.where(gains.flag_array, np.nan, np.abs(gains.gain_array) ** 2)
+    return np.moveaxis(power[first] * power[second], 2, 0)
+
+
+def make_noise(job: Job) -> Mapping[str, Any]:
+    """Write visibilities whose power is that of the noise of even x odd to average.uvh5."""
+    import numpy as np
+
+    from calstudy.measured.noise import half_difference
+
+    if job.settings["source"] == "difference":
+        noise = half_difference(*(read_visibilities(job.inputs[parity] / AVERAGE) for parity in PARITIES))
+    else:
+        even, odd = (read_visibilities(job.inputs[parity] / NOISE) for parity in PARITIES)
+        noise = even.copy()
+        noise.data_array = np.sqrt(even.data_array * odd.data_array)
+        noise.flag_array = even.flag_array | odd.flag_array
+    write_visibilities(noise, job.output / AVERAGE)
+    return {}
+
+
+def _cost_of_reading(task: Task) -> Cost:
+    size = size_of(task)
+    disk = size.samples * COMPLEX128
+    return Cost(5 + 1e-6 * size.samples, LIBRARIES_MEMORY + 12 * disk, disk)
+
+
+def _cost_of_average(task: Task) -> Cost:
+    size = size_of(task)
+    disk = 2 * size.samples / size.times * COMPLEX128
+    return Cost(2 + size.samples * 5e-7, LIBRARIES_MEMORY + 10 * size.samples * COMPLEX128, disk)
+
+
+def _cost_of_noise(task: Task) -> Cost:
+    size = size_of(task)
+    return Cost(2, LIBRARIES_MEMORY, size.samples / size.times * COMPLEX64)
+
+
+OBSERVE = Stage(name="observe", version=1, make=observe, cost=_cost_of_reading)
+OBSERVED_AVERAGE = Stage(name="observed-average", version=1, make=make_average, cost=_cost_of_average)
+NOISE_STAGE = Stage(name="observed-noise", version=1, make=make_noise, cost=_cost_of_noise)

@@ -1,0 +1,299 @@
+"""A simulated EoR put into measured data under the solved gains, calibrated again: what is left of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.errors import InputError
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.settings import GainFit
+from calstudy.products import signal_loss
+from calstudy.products.calibration import calibration_of
+from calstudy.products.corruption import LEVELS, PARITIES
+from calstudy.products.expected_loss import EXPECTED, PROBES, binned
+from calstudy.products.files import (
+    AVERAGE,
+    DATA,
+    GAINS,
+    MODEL,
+    RESIDUAL,
+    VISIBILITIES,
+    read_json,
+    read_visibilities,
+    spectrum_file,
+    write_json,
+    write_visibilities,
+)
+from calstudy.products.graph import once, required, size_of
+from calstudy.products.observed import ObservedGraph, average, calibrated, calibration_inputs, crossed, observed
+from calstudy.products.observed_quality import read_result
+from calstudy.products.observed_spectra import observed_spectra
+from calstudy.products.signal_loss import DIFFERENCE
+from calstudy.products.spectra import EXCISION, read_delay_spectra
+from calstudy.run.task import Job, Stage, Task
+from calstudy.simulate.interface import SimulationSize
+
+if TYPE_CHECKING:
+    import numpy as np
+    from pyuvdata import UVData
+
+FACTOR = "factor.json"
+
+
+@once
+def eor(graph: ObservedGraph, parity: str) -> Task:
+    """Return the task of the EoR at the baselines, integrations and channels of one half."""
+    injection = graph.injection
+    if injection is None:
+        raise LookupError("the study injects nothing")
+    settings = {
+        "eor": injection.eor,
+        "simulation": injection.simulation,
+        "cosmology": graph.power.cosmology,
+        **graph.beam_settings,
+    }
+    return Task(SIMULATE_EOR, f"eor {parity}", settings, {"data": observed(graph, parity)})
+
+
+@once
+def factor(graph: ObservedGraph) -> Task:
+    """Return the task of what the EoR is multiplied by, which is the same for both halves."""
+    inputs = {"eor": eor(graph, "even"), "calibration": calibrated(graph, "even")}
+    level = graph.injection.level if graph.injection else None
+    return Task(SET_LEVEL, "level of the eor", {"level": level}, inputs)
+
+
+@once
+def injected(graph: ObservedGraph, parity: str) -> Task:
+    """Return the task of the data of one half with the EoR in them."""
+    inputs = {
+        "data": observed(graph, parity),
+        "eor": eor(graph, parity),
+        "factor": factor(graph),
+        "calibration": calibrated(graph, parity),
+    }
+    return Task(INJECT, f"data + eor {parity}", {}, inputs)
+
+
+@once
+def response(graph: ObservedGraph, parity: str) -> Task:
+    """Return the task of the averaged response of the residual of one half to the EoR."""
+    data = injected(graph, parity)
+    again = calibration_of(graph.calibration.reset("assumed"), calibration_inputs(graph, data, parity))
+    own = average(graph, "residual", parity)
+    with_signal = Task(own.stage, f"residual + eor {parity}", own.settings, {"data": data, "calibration": again})
+    inputs = {"with_signal": with_signal, "without_signal": own}
+    return Task(DIFFERENCE, f"response to the eor {parity}", {}, inputs)
+
+
+@once
+def signal(graph: ObservedGraph, parity: str) -> Task:
+    """Return the task of the averaged EoR of one half, as it is put in but for the gains."""
+    inputs = {"eor": eor(graph, parity), "factor": factor(graph), "calibration": calibrated(graph, parity)}
+    return Task(AVERAGE_EOR, f"eor {parity}", {"centre": graph.halves.centre}, inputs)
+
+
+@once
+def transfer(graph: ObservedGraph) -> Task | None:
+    """Return the task that measures T, or None if nothing is injected."""
+    if graph.injection is None:
+        return None
+    signals, responses = ({parity: make(graph, parity) for parity in PARITIES} for make in (signal, response))
+    inputs = {
+        "signal": crossed(graph, "eor", signals["even"], signals["odd"]),
+        "response": crossed(graph, "response to the eor", responses["even"], responses["odd"]),
+        "cross": crossed(graph, "eor x response", signals["even"], responses["odd"]),
+        "spectra": observed_spectra(graph),
+    }
+    return Task(OBSERVED_TRANSFER, "signal loss", {"power": graph.power}, inputs)
+
+
+@once
+def expected(graph: ObservedGraph) -> Task | None:
+    """Return the task of the T that the fit predicts of itself, or None if it is no fit by least squares."""
+    if not isinstance(graph.calibration, GainFit):
+        return None
+    inputs = {"data": observed(graph, "even"), "calibration": calibrated(graph, "even")}
+    settings = {
+        "calibration": graph.calibration.reset("assumed"),
+        "power": graph.power.reset("pairs", "redundancy_tolerance"),
+        "sky_model": graph.observed.sky_model is not None,
+        "probes": PROBES,
+    }
+    return Task(EXPECT, "expected signal loss", settings, inputs)
+
+
+def injection_tables(graph: ObservedGraph) -> list[Task]:
+    """Return the products of an injection whose files are tables of a run."""
+    return [] if graph.injection is None else [required(transfer(graph)), *filter(None, [expected(graph)])]
+
+
+def simulate_eor(job: Job) -> Mapping[str, Any]:
+    """Write the EoR of one half, in Jy and as its P(k) says, to visibilities.uvh5."""
+    import numpy as np
+
+    from calstudy.base.visibilities import antenna_pairs, from_cube
+    from calstudy.instrument.beams import make_beam
+    from calstudy.instrument.telescope import subset_template
+    from calstudy.power.cosmology import make_cosmology
+    from calstudy.simulate.chunks import assemble, plan_chunks, simulate_chunk
+    from calstudy.sky.eor import EorField
+
+    settings = job.settings
+    data = read_visibilities(job.inputs["data"] / DATA)
+    pairs = antenna_pairs(data)
+    crosses = np.flatnonzero(np.tile(pairs[:, 0] != pairs[:, 1], data.Ntimes))
+    data = data.select(blt_inds=crosses, inplace=False, run_check=False)
+    template = subset_template(data, np.unique(data.time_array), np.asarray(data.freq_array, float))
+    if not np.array_equal(antenna_pairs(template), antenna_pairs(data)):
+        raise ValueError("the template of the simulation has other baselines than the data")
+    field = EorField(settings["eor"], template.freq_array, make_cosmology(settings["cosmology"]))
+    beam, simulation = make_beam(settings["beam"], settings["channels"]), settings["simulation"]
+    chunks = plan_chunks(template, simulation, smooth_in_frequency=False)
+    cubes = [simulate_chunk(simulation.engine, field.sky(chunk.channels), beam, template, chunk) for chunk in chunks]
+    found = from_cube(data, assemble(chunks, cubes))
+    found.flag_array[:] = False
+    write_visibilities(found, job.output / VISIBILITIES)
+    return {"rms_jy": float(np.sqrt(np.mean(np.abs(found.data_array) ** 2)))}
+
+
+def set_level(job: Job) -> Mapping[str, Any]:
+    """Write what the EoR is multiplied by to factor.json."""
+    import numpy as np
+
+    level, found = job.settings["level"], 1.0
+    sky = read_visibilities(job.inputs["eor"] / VISIBILITIES).data_array
+    if level is not None:
+        model = read_visibilities(job.inputs["calibration"] / MODEL)
+        values = model.data_array[~model.flag_array]
+        if not values.size or not np.any(values):
+            raise InputError("injection.level: is relative to the fitted foregrounds, which are zero or all flagged")
+        rms = [np.sqrt(np.mean(np.abs(array) ** 2)) for array in (values, sky)]
+        found = float(10 ** (level / 10) * rms[0] / rms[1])
+    write_json(job.output / FACTOR, {"factor": found})
+    return {"factor": found}
+
+
+def inject(job: Job) -> Mapping[str, Any]:
+    """Write the data with g_a g_b* times the EoR added to data.uvh5; where there is no solution, nothing is added."""
+    import numpy as np
+    from pyuvdata import UVCal
+
+    from calstudy.base.visibilities import antenna_pairs, to_cube
+
+    data, sky = read_visibilities(job.inputs["data"] / DATA), _signal(job)
+    gains = UVCal.from_file(job.inputs["calibration"] / GAINS)
+    order = np.argsort(gains.ant_array)
+    pairs = antenna_pairs(sky)
+    first, second = (order[np.searchsorted(gains.ant_array, column, sorter=order)] for column in pairs.T)
+    solved = np.where(gains.flag_array, 0, gains.gain_array)
+    products = np.moveaxis(solved[first] * solved[second].conj(), 2, 0)
+    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(data).tolist())}
+    rows = [places[tuple(pair)] for pair in pairs.tolist()]
+    to_cube(data)[:, rows] += products * to_cube(sky)
+    write_visibilities(data, job.output / DATA)
+    return {}
+
+
+def _signal(job: Job) -> UVData:
+    """Return the EoR at its level."""
+    sky = read_visibilities(job.inputs["eor"] / VISIBILITIES)
+    sky.data_array *= read_json(job.inputs["factor"] / FACTOR)["factor"]
+    return sky
+
+
+def average_eor(job: Job) -> Mapping[str, Any]:
+    """Write the average of the EoR to average.uvh5, with the baselines and flags of the residual."""
+    from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
+    from calstudy.power.average import fringe_stop_and_average
+
+    residual, sky = read_visibilities(job.inputs["calibration"] / RESIDUAL), _signal(job)
+    pairs = antenna_pairs(residual)
+    crosses = [row for row, (a, b) in enumerate(pairs.tolist()) if a != b]
+    rows = [time * residual.Nbls + row for time in range(residual.Ntimes) for row in crosses]
+    residual = residual.select(blt_inds=rows, inplace=False, run_check=False)
+    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(sky).tolist())}
+    cube = to_cube(sky)[:, [places[tuple(pair)] for pair in antenna_pairs(residual).tolist()]]
+    averaged = fringe_stop_and_average(from_cube(residual, cube), job.settings["centre"])
+    write_visibilities(averaged, job.output / AVERAGE)
+    return {}
+
+
+def measure(job: Job) -> Mapping[str, Any]:
+    """Write T, spectra of the injected EoR, and the power of the residual corrected by T."""
+    from calstudy.power.errors import with_errors
+    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.spherical import spherical_average
+    from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
+    from calstudy.power.transfer import Injection
+
+    settings = job.settings["power"]
+    delays = {name: read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
+    # The signal went in under the gains that were fitted: T is free of the flux scale, which nobody knows.
+    summary = signal_loss.write_transfer(job.output, Injection(**delays), settings, 1.0)
+    signals = {}
+    for modes, excise in EXCISION.items():
+        spectrum = spherical_average(delays["signal"], settings, excise)
+        signals[modes] = with_errors(spectrum, signal=spectrum)
+        save_spectrum(job.output / spectrum_file("eor", modes), signals[modes])
+        write_csv(job.output / f"eor.{modes}.csv", signals[modes])
+    residual = load_spectrum(job.inputs["spectra"] / spectrum_file("residual", "outside-wedge"), SphericalSpectrum)
+    signal_loss.write_corrected(job.output, residual, signals["outside-wedge"])
+    return {"transfer": summary}
+
+
+def expect(job: Job) -> Mapping[str, Any]:
+    """Write the expected T of the middle integration of the even half, in bins of k and of length and delay."""
+    import numpy as np
+
+    from calstudy.base.observation import Observation
+    from calstudy.base.visibilities import baseline_vectors
+    from calstudy.calibrate.interface import Assumed
+    from calstudy.measured.expectation import expect as expect_of
+    from calstudy.power.tables import save_spectrum
+
+    folder, settings, power = job.inputs["data"], job.settings["calibration"], job.settings["power"]
+    data, result = read_visibilities(folder / DATA), read_result(job.inputs["calibration"])
+    sky = Observation(read_visibilities(folder / VISIBILITIES)) if job.settings["sky_model"] else None
+    noise = read_json(folder / LEVELS)["noise_std"] if settings.needs_noise else None
+    found = expect_of(data, settings, result, Assumed(sky, noise=noise), taper=power.taper)
+    if found is None:
+        raise InputError("expected-loss: no solve of the calibration gave gains")
+    lengths: np.ndarray = np.linalg.norm(baseline_vectors(result.model), axis=1)
+    centre = float(np.mean(data.freq_array))
+    save_spectrum(job.output / EXPECTED, binned(found, np.resize(lengths, len(found.transfer)), centre, power))
+    return {"probes": job.settings["probes"]}
+
+
+def _cost_of_eor(task: Task) -> Cost:
+    size, settings = size_of(task), task.settings
+    pixels, channels = 12 * settings["eor"].nside ** 2, size.channels.count
+    engine = settings["simulation"].engine.cost(SimulationSize(pixels, size.times * channels, size.antennas, 1))
+    at_once = channels / min(settings["simulation"].chunks, channels)
+    disk = size.samples * COMPLEX128
+    memory = engine.memory + pixels * (300 + 55 * at_once) + 3 * disk
+    return Cost(10 + engine.seconds, max(memory, LIBRARIES_MEMORY), disk)
+
+
+def _cost_of_data(task: Task) -> Cost:
+    disk = size_of(task).samples * COMPLEX128
+    return Cost(3 + disk * 1e-8, LIBRARIES_MEMORY + 6 * disk, disk)
+
+
+def _cost_of_average(task: Task) -> Cost:
+    size = size_of(task)
+    return Cost(2, LIBRARIES_MEMORY + 8 * size.samples * COMPLEX128, size.samples / size.times * COMPLEX128)
+
+
+def _cost_of_expectation(task: Task) -> Cost:
+    samples = size_of(task).samples
+    return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * samples * COMPLEX128, 1e6)
+
+
+SIMULATE_EOR = Stage(name="observed-eor", version=1, make=simulate_eor, cost=_cost_of_eor)
+SET_LEVEL = Stage(name="observed-level", version=1, make=set_level, cost=_cost_of_average)
+INJECT = Stage(name="inject", version=1, make=inject, cost=_cost_of_data)
+AVERAGE_EOR = Stage(name="observed-eor-average", version=1, make=average_eor, cost=_cost_of_average)
+OBSERVED_TRANSFER = Stage(name="observed-transfer", version=1, make=measure, cost=lambda task: Cost(4, disk=1e6))
+EXPECT = Stage(name="observed-expected-loss", version=1, make=expect, cost=_cost_of_expectation)

@@ -1,0 +1,68 @@
+"""How well measured data are fitted, and how strong their noise is, as tables of a report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+QUALITY, NOISE = "quality.json", "noise.json"
+FIT_TITLE, NOISE_TITLE = "Fit to the measured data", "Noise of the measured data"
+FIT_NOTE = (
+    "chi^2 is the mean of |V - g g* F|^2 / sigma^2, with sigma by the radiometer equation from the autocorrelations: "
+    "per sample, per degree of freedom (complex unknowns subtracted), and of integrations that were not fitted, from "
+    "the solutions of the integrations before and after, with what noise alone would make of it."
+)
+NOISE_NOTE = (
+    "P_N, the mean over baselines of the power of the noise, in mK2 h-3 Mpc3: from the difference of the two halves, "
+    "outside the wedge, and from the autocorrelations. The residual has less noise by what the fit absorbs; the "
+    "difference of the data as given also has what the sky changes from one half to the other, times their gains."
+)
+
+
+def tables(folder: Path) -> Iterator[tuple[str, Sequence[str], Sequence[Sequence[str]], str]]:
+    """Yield title, columns, rows and note of the tables that a run of measured data has; nothing for other runs."""
+    found = (
+        (FIT_TITLE, FIT_COLUMNS, _fits(folder), FIT_NOTE),
+        (NOISE_TITLE, NOISE_COLUMNS, _noise(folder), NOISE_NOTE),
+    )
+    for title, columns, rows, note in found:
+        if rows:
+            yield title, columns, rows, note
+
+
+def _fits(folder: Path) -> list[tuple[str, ...]]:
+    """Return chi^2 of both halves of a run's measured data; nothing for other runs, and without autocorrelations."""
+    path = folder / "tables" / QUALITY
+    if not path.is_file():
+        return []
+    found = json.loads(path.read_text(encoding="utf-8"))
+    return [_fit(parity, part) for parity, part in found.items() if part.get("samples")]
+
+
+FIT_COLUMNS = ("half", "samples", "complex unknowns", "per sample", "per degree of freedom", "not fitted", "expected")
+
+
+def _fit(parity: str, part: Mapping[str, Any]) -> tuple[str, ...]:
+    held = part.get("held_out", {})
+    numbers = (part["per_sample"], part["per_degree_of_freedom"], held.get("per_sample"), held.get("expected"))
+    unknowns = "" if part["unknowns"] is None else f"{part['unknowns']:g}"
+    return (parity, str(part["samples"]), unknowns, *("" if item is None else f"{item:.3f}" for item in numbers))
+
+
+NOISE_COLUMNS = ("of", "from the difference", "from the autocorrelations", "ratio, mean over baselines")
+
+
+def _noise(folder: Path) -> list[tuple[str, ...]]:
+    """Return the noise of a run's measured data; nothing for other runs."""
+    path = folder / "tables" / NOISE
+    if not path.is_file():
+        return []
+    rows = []
+    for what, levels in json.loads(path.read_text(encoding="utf-8")).items():
+        ratio = levels.get("difference_over_autos")
+        powers = ("" if levels[source] is None else f"{levels[source]:.3g}" for source in ("difference", "autos"))
+        name = "data as given" if what == "data" else what
+        rows.append((name, *powers, "" if ratio is None else f"{ratio['mean']:.3f} ± {ratio['error']:.3f}"))
+    return rows

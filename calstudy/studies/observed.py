@@ -1,0 +1,219 @@
+"""Measured data as a study: calibration, power spectra of data and residual, and what an injected signal loses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import yaml
+from pydantic import Field, SerializeAsAny, ValidationError, model_validator
+
+from calstudy.base.errors import ExperimentError, InputError, nearest
+from calstudy.base.identity import identity
+from calstudy.base.plugins import Plugin, guarded
+from calstudy.base.schema import Section, fault
+from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.interface import CALIBRATORS, Calibrator
+from calstudy.experiment.files import apply_scale, override, parse_override
+from calstudy.experiment.messages import sentences
+from calstudy.experiment.model import FIGURES, StudyName
+from calstudy.figures import ObservedFigure, observed_task
+from calstudy.instrument.interface import model_of
+from calstudy.measured.defaults import with_defaults
+from calstudy.measured.halves import read_facts, require_same_sky
+from calstudy.measured.settings import InjectionSettings, ObservedSettings
+from calstudy.power.settings import PowerSettings
+from calstudy.products.observed import Halves, ObservedGraph
+from calstudy.products.observed_injection import injection_tables
+from calstudy.products.observed_quality import quality
+from calstudy.products.observed_spectra import observed_spectra
+from calstudy.run.task import Task
+from calstudy.studies.capacity import workers_for
+from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
+from calstudy.studies.study import Budget, Made, Study
+
+KEY = "observed"
+"""The key that makes a file one about measured data."""
+DEFAULT_FIGURES = ("observed-wedge", "observed-spherical")
+INJECTION_FIGURES = ("observed-signal-loss",)
+
+
+class ObservedOutputs(Section):
+    """What is drawn, and where products and run folders go."""
+
+    figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] | None = (
+        Field(None, description="Figures of measured data; null: all.")
+    )
+    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all experiments.")
+    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
+
+
+class ObservedFile(Section):
+    """Measured data: what is calibrated and how, and what is measured of it."""
+
+    name: StudyName
+    description: str = ""
+    observed: ObservedSettings
+    calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Field(
+        default_factory=Calamity,
+        description="As in an experiment. Without `solver`, Gauss-Newton steps go on longer, for data of few baselines "
+        "converge slowly; without `prior` and sky model, the size of the gains fixes the scale.",
+    )
+    power: PowerSettings = PowerSettings()
+    injection: InjectionSettings | None = Field(None, description="Measure what the calibration loses; null: do not.")
+    outputs: ObservedOutputs = Field(default_factory=ObservedOutputs)
+    scales: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
+    )
+
+    @model_validator(mode="after")
+    def _nothing_is_assumed(self) -> ObservedFile:
+        if self.calibration.assumed:
+            raise fault("calibration.assumed", "is for simulated data; give the sky model as observed.sky_model")
+        return self
+
+
+class ObservedStudy(Study):
+    """Measured data.
+
+    Parameters
+    ----------
+    file
+        What the file says.
+    halves
+        What is known of the data from their metadata.
+    """
+
+    def __init__(self, file: ObservedFile, halves: Halves) -> None:
+        self.file, self.halves = file, halves
+        self.name, self.description = file.name, file.description
+        self.graph = ObservedGraph(file.observed, file.calibration, file.power, file.injection, halves)
+
+    @property
+    def outputs(self) -> ObservedOutputs:
+        """Store and folder of runs."""
+        return self.file.outputs
+
+    @property
+    def stand_ins(self) -> tuple[str, ...]:
+        """What the units of the power spectra rest on."""
+        scale = self.file.observed.flux_scale
+        if scale is None or scale.kind == "factor":
+            return ()
+        return ("flux scale: autocorrelations at an assumed system temperature",)
+
+    @property
+    def folder(self) -> Path:
+        """The run folder: the name, and a digest of what the file says but for where results go."""
+        outputs = self.file.outputs.reset("store", "runs")
+        return run_folder(
+            self.outputs.runs, self.name, identity(self.file.model_copy(update={"outputs": outputs}).reset("scales"))
+        )
+
+    def fitted(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study itself and the number of workers; raises InputError if a beam or the memory do not do."""
+        beam = self.file.observed.beam
+        with guarded(beam):
+            model_of(beam).require_usable(self.halves.facts["even"].channels)
+        return self, workers_for(self.targets, self.outputs.store, budget)
+
+    @cached_property
+    def shown(self) -> list[ObservedFigure]:
+        """The figures asked for."""
+        figures = self.file.outputs.figures
+        if figures is None:
+            names = DEFAULT_FIGURES + (INJECTION_FIGURES if self.file.injection else ())
+            figures = tuple(FIGURES.make(name) for name in names)
+        return [figure for figure in figures if isinstance(figure, ObservedFigure)]
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """Their tasks."""
+        return [observed_task(figure, self.graph, self.stand_ins) for figure in self.shown]
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The products whose files are the tables of a run."""
+        return [observed_spectra(self.graph), quality(self.graph), *injection_tables(self.graph)]
+
+    @property
+    def targets(self) -> Sequence[Task]:
+        """Figures and tables."""
+        return [*self.figures, *self.tables]
+
+    def fill(self, made: Made) -> None:
+        """Write figures, tables, the file and the manifest."""
+        folder, products = self.folder, made.products
+        publish([products[task.key] for task in self.figures], folder / "figures")
+        publish([products[task.key] for task in self.tables], folder / "tables")
+        text = yaml.safe_dump(self.file.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)
+        write(folder / EXPERIMENT, text)
+        fields = {
+            "description": self.description,
+            "stand_ins": list(self.stand_ins),
+            "captions": {figure.label: figure.caption for figure in self.shown},
+            "products": product_entries(self.tasks, made.products, made.tasks),
+        }
+        write_manifest(folder, self.name, fields)
+
+
+def load_observed(
+    path: Path, data: Mapping[str, Any], scale: str | None = None, overrides: Sequence[str] = ()
+) -> ObservedStudy:
+    """Validate the content of a file about measured data, and read the metadata of these.
+
+    Parameters and errors are as for `calstudy.studies.load.load_study`.
+    """
+    plain, folder = apply_scale(data, scale), path.resolve().parent
+    for text in overrides:
+        plain = override(plain, *parse_override(text))
+    plain = with_defaults(plain, folder)
+    try:
+        file = ObservedFile.model_validate(plain, context={"folder": folder})
+    except ValidationError as error:
+        raise ExperimentError(sentences(error, ObservedFile, plain)) from None
+    for place, figure in enumerate(file.outputs.figures or ()):
+        if not isinstance(figure, ObservedFigure):
+            built_in = [name for name in FIGURES.built_in() if issubclass(FIGURES.find(name), ObservedFigure)]
+            hint = f"{nearest(figure.label, built_in)} (built in: {', '.join(built_in)})"
+            raise ExperimentError([f"outputs.figures.{place}: {figure.label!r} is no figure of measured data{hint}"])
+        if file.injection is None and figure.needs_injection:
+            raise ExperimentError([f"outputs.figures.{place}: {figure.label!r} needs the section injection"])
+    return ObservedStudy(file, _halves(file))
+
+
+def _halves(file: ObservedFile) -> Halves:
+    """Return what the metadata tell of the halves; raises InputError if they cannot be calibrated or crossed."""
+    section = file.observed
+    selection = section.select.selection
+    try:
+        even = read_facts(section.data, selection, section.positions)
+        odd = read_facts(section.odd, selection, section.positions) if section.odd else even
+    except InputError as error:
+        raise InputError(str(error).replace("--select ", "observed.select.")) from None
+    if section.odd:
+        require_same_sky(even, odd)
+    elif even.times.size < 2:
+        raise InputError(
+            f"observed.data: {even.times.size} integration; two are needed, for even and odd, or other data of the "
+            "same sky as observed.odd"
+        )
+    if even.unit.lower() != "jy" and section.flux_scale is None and section.sky_model is None:
+        raise InputError(
+            f"observed.flux_scale: the data are in {even.unit!r}, and power spectra need Jy: give {{kind: factor, "
+            "unit: 1 Jy}, or system-temperature, or a sky model"
+        )
+    if file.calibration.needs_noise and not (even.autos and odd.autos):
+        raise InputError(
+            "calibration.foreground_prior.noise: must be given, for the data have no autocorrelations that tell it"
+        )
+    together = file.calibration.integrations_per_solve
+    halves = Halves({"even": even, "odd": odd})
+    shortest = min(len(halves.times(parity)) for parity in ("even", "odd"))
+    if together > shortest:
+        raise InputError(
+            f"calibration.integrations_per_solve = {together}: a half of the data has {shortest} integrations"
+        )
+    return halves
