@@ -13,6 +13,7 @@ from calstudy.studies.collection import Collection
 from calstudy.studies.comparison import Comparison
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
+from calstudy.studies.observed import ObservedStudy
 from calstudy.studies.preflight import require_calibration
 from calstudy.studies.realizations import Realizations
 from calstudy.studies.runtime import RuntimeStudy
@@ -23,7 +24,7 @@ EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 HERE = Path(__file__).parent
 # Steps of the validation ladder are no experiments; tests/validation loads them.
 FILES = sorted(path for path in EXPERIMENTS.rglob("*.yaml") if path.parent.name != "validation")
-SINGLE = [path for path in FILES if not {"experiments", "calibrators", "runtime"} & set(read_mapping(path))]
+SINGLE = [path for path in FILES if not {"experiments", "calibrators", "runtime", "observed"} & set(read_mapping(path))]
 
 
 def faults_of(text: str) -> list[str]:
@@ -36,7 +37,7 @@ def scales_of(study: Study) -> set[str]:
     """Return the names of the scales of a file, or of all members of a collection."""
     if isinstance(study, Collection):
         return set.intersection(*(set(experiment.scales) for experiment in study.members.values()))
-    if isinstance(study, RuntimeStudy | Comparison):
+    if isinstance(study, RuntimeStudy | Comparison | ObservedStudy):
         return set(study.file.scales)
     if isinstance(study, Sweep):
         return set(study.base.scales)
