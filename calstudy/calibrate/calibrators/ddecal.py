@@ -183,8 +183,8 @@ def _write_measurement_set(folder: Path, measured: Measured, groups: list[slice]
 def _empty(frame: Frame, n_times: int) -> UVData:
     """Return visibilities without values.
 
-    Of each baseline the first antenna has the lower number, for then pyuvdata writes it as measurement sets have it. Site,
-    times and phase centre are any: they are the same for data and model, so that gains do not depend on them.
+    Of each baseline the first antenna has the lower number, for then pyuvdata writes it as measurement sets have it.
+    Site, times and phase centre are any: they are the same for data and model, so that gains do not depend on them.
     """
     from astropy.coordinates import EarthLocation
     from pyuvdata import Telescope, UVData, utils
