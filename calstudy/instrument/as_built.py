@@ -124,6 +124,13 @@ class AsBuilt(Section):
         return f"as built: {', '.join(words)}" if words else None
 
 
+COLUMNS = (
+    *("east_m", "north_m", "up_m", "dipoles_x", "dipoles_y"),
+    *("tilt_east_deg", "tilt_north_deg", "rotation_deg", "width", "swapped"),
+)
+"""What `as_built_rows` says of an antenna."""
+
+
 @dataclass(frozen=True)
 class Misalignment:
     """Orientation and width of the beam of one antenna.
@@ -189,4 +196,23 @@ def misalignments(settings: BeamErrors, count: int) -> list[Misalignment]:
     return [
         Misalignment(float(east), float(north), float(rotation), float(width), antenna in settings.swapped)
         for antenna, ((east, north), rotation, width) in enumerate(zip(tilts, rotations, widths, strict=True))
+    ]
+
+
+def as_built_rows(settings: AsBuilt, count: int) -> list[tuple[str, ...]]:
+    """Return what differs from the nominal instrument for each of `count` antennas, as texts in the order of `COLUMNS`.
+
+    Dipoles are 16 amplitudes, nominally one and zero where dead; the width is that over the nominal one.
+    """
+    offsets = position_offsets(settings.positions, count)
+    amplitudes = dipole_amplitudes(settings.dipoles, count)
+    return [
+        (
+            *(f"{value:.6f}" for value in offset),
+            *(" ".join(f"{value:g}" for value in np.round(feed, 6)) for feed in dipoles),
+            *(f"{np.degrees(angle):.6f}" for angle in (beam.east, beam.north, beam.rotation)),
+            f"{beam.width:.6f}",
+            str(beam.swapped).lower(),
+        )
+        for offset, dipoles, beam in zip(offsets, amplitudes, misalignments(settings.beams, count), strict=True)
     ]

@@ -14,6 +14,8 @@ from calstudy.claims.product import claims
 from calstudy.experiment.files import dump
 from calstudy.experiment.model import Experiment, Outputs
 from calstudy.figures import figure_task, figures_of
+from calstudy.instrument.as_built import COLUMNS, as_built_rows
+from calstudy.instrument.layouts import make_layout
 from calstudy.products import sky_model
 from calstudy.products.agreement import agreement
 from calstudy.products.graph import Graph
@@ -27,6 +29,7 @@ from calstudy.studies.preflight import notes_of, require_possible
 from calstudy.studies.study import Budget, Made, Study
 
 SKY_MODEL_TABLE = "sky-model.csv"
+AS_BUILT_TABLE = "as-built.csv"
 
 
 class ExperimentStudy(Study):
@@ -111,6 +114,8 @@ class ExperimentStudy(Study):
             publish([products[self.claims.key]], folder)
         if self.calibrates:
             write(folder / "tables" / SKY_MODEL_TABLE, self._sky_model_table())
+        if self.experiment.instrument.as_built.note:
+            write(folder / "tables" / AS_BUILT_TABLE, self._as_built_table())
         write(folder / EXPERIMENT, dump(self.experiment))
         fields = {
             "stand_ins": list(self.stand_ins),
@@ -120,6 +125,17 @@ class ExperimentStudy(Study):
             "products": product_entries(self.tasks, made.products, made.tasks),
         }
         write_manifest(folder, self.name, fields)
+
+    def _as_built_table(self) -> str:
+        """Return as CSV what differs from the nominal instrument, antenna by antenna."""
+        instrument = self.experiment.instrument
+        numbers = make_layout(instrument.layout).numbers
+        table = io.StringIO()
+        rows = csv.writer(table, lineterminator="\n")
+        rows.writerow(("number", *COLUMNS))
+        found = as_built_rows(instrument.as_built, len(numbers))
+        rows.writerows((number, *row) for number, row in zip(numbers, found, strict=True))
+        return table.getvalue()
 
     def _sky_model_table(self) -> str:
         """Return as CSV what the calibrator assumes that is not true, below a line that says it in a sentence."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from astropy.table import Table
 from pyuvdata import UVCal, UVData
 from rich.console import Console
 from tiny import tiny
@@ -215,6 +216,21 @@ def test_a_run_says_that_its_sky_model_is_perfect(folder):
     run = run_study(study, Budget(workers=1), Console(file=io.StringIO()))
     assert read_contents(run.folder).facts["sky model of the calibrator"].startswith("perfect: ")
     assert "perfect" in (run.folder / "tables" / "sky-model.csv").read_text()
+
+
+def test_a_run_says_how_its_antennas_are_built(folder):
+    data = override(sky_based(folder), "instrument.as_built", {"positions": {"scatter": "2 cm"}})
+    experiment = validate(data, folder)
+    run = run_study(ExperimentStudy(experiment), Budget(workers=1), Console(file=io.StringIO()))
+    table = Table.read(run.folder / "tables" / "as-built.csv", format="ascii.csv")
+    nominal, true = (make_template(experiment.instrument, as_built=built).telescope for built in (False, True))
+    assert list(table["number"]) == list(nominal.antenna_numbers)
+    offsets = np.column_stack([table[name] for name in ("east_m", "north_m", "up_m")])
+    # The table has micrometres, and positions of telescopes are differences of geocentric ones.
+    np.testing.assert_allclose(nominal.get_enu_antpos() + offsets, true.get_enu_antpos(), atol=1e-5)
+    assert np.std(offsets) > 0.01
+    assert set(table["dipoles_x"]) == {" ".join(16 * "1")}
+    assert set(table["width"]) == {1.0}
 
 
 def test_the_store_shares_simulations_between_experiments(finished, folder):
