@@ -32,6 +32,10 @@ REDUCED = {
         "{corruption.eor_level: [-50 dB, -40 dB]},"
         "{sky.eor.seed: [2, 3]}]",
     ],
+    "which-calibration": [
+        "instrument.times.count=2",
+        "worlds={ideal: {}, 'coupling: 0.001': {corruption.effects: [{kind: mutual-coupling, amplitude: 1.0e-3}]}}",
+    ],
 }
 """Fields that make each notebook's experiments quick, on top of what it does itself."""
 

@@ -41,7 +41,7 @@ def draw_matrix(
     cases
         By world and calibrator.
     calibrators
-        Their labels, in order; a case that is not there is left white.
+        Their labels, in order; a case without scores is left white, and says so.
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
@@ -64,8 +64,11 @@ def draw_matrix(
 def _draw_band(axes: Axes, cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], band: int) -> None:
     colours = np.full((len(calibrators), len(cases), 4), 1.0)
     for column, found in enumerate(cases.values()):
-        for name, case in found.items():
-            row = calibrators.index(name)
+        for row, name in enumerate(calibrators):
+            if name not in found:
+                axes.text(column, row, "no scores", ha="center", va="center", size=style.SMALL_SIZE, color=style.GREY)
+                continue
+            case = found[name]
             bias, error = case.bands.bias[band], case.bands.bias_error[band]
             shown = max(abs(bias), SIGNIFICANT * error) if np.isfinite(error) else abs(bias)
             if np.isfinite(shown):

@@ -65,8 +65,10 @@ def draw_tolerances(
             axes.set_xticks(positions, [f"{severity:g}" for severity in fault.severities])
             axes.set_xticks([], minor=True)
     grid[0, 0].set_title(rf"$k = {BAND[0]:g}$–${BAND[1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
-    handles = [Line2D([], [], linewidth=0.7, **look(place)) for place in range(len(calibrators))]
-    figure.legend(handles, list(calibrators), loc="outside upper center", ncols=min(len(calibrators), 5))
+    scored = {name for found in cases.values() for name in found}
+    looks = {name: look(place) for place, name in enumerate(calibrators) if name in scored}
+    handles = [Line2D([], [], linewidth=0.7, **its) for its in looks.values()]
+    figure.legend(handles, list(looks), loc="outside upper center", ncols=min(len(looks), 5))
     style.note_stand_ins(figure, stand_ins)
     return figure
 

@@ -70,7 +70,11 @@ def require_calibration(experiment: Experiment) -> None:
 
 
 def refusal_of_calibrator(experiment: Experiment) -> str:
-    """Return why the calibrator cannot work on the antennas, baselines and channels of an experiment, or nothing."""
+    """Return why the calibrator cannot work on the antennas, baselines and channels of an experiment, or nothing.
+
+    Raises InputError for an array that cannot be made: that is no refusal of a calibrator.
+    """
+    make_array(experiment.instrument)
     try:
         _require_calibrators(experiment)
     except InputError as error:

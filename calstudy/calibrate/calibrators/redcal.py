@@ -11,7 +11,7 @@ from calstudy.base.observation import Frame
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import fault
 from calstudy.base.units import Length
-from calstudy.calibrate.calibrators._hera_cal import FEED, POL, HeraCal, Measured, patterns
+from calstudy.calibrate.calibrators._other_packages import FEED, POL, Measured, OtherPackage, patterns
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Outcome
 from calstudy.instrument.layouts import RedundantGroups, redundant_groups
@@ -32,7 +32,7 @@ Visibilities = dict[tuple[int, int, str], np.ndarray]
 """In the terms of hera_cal, (Ntimes, Nfreqs)."""
 
 
-class Redcal(HeraCal):
+class Redcal(OtherPackage):
     """hera_cal's redundant calibration: firstcal, logcal and omnical, then abscal against the sky model.
 
     Redundant baselines are taken to see the same; what redundancy leaves open in each channel, an amplitude and a phase

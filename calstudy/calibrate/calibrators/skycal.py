@@ -6,12 +6,12 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.calibrate.calibrators._hera_cal import FEED, HeraCal, Measured, patterns
+from calstudy.calibrate.calibrators._other_packages import FEED, Measured, OtherPackage, patterns
 from calstudy.calibrate.interface import Outcome
 from calstudy.instrument.size import Size
 
 
-class Skycal(HeraCal):
+class Skycal(OtherPackage):
     """hera_cal's skycal: a delay and a phase per antenna, then gains by channel; the sky model is taken for the truth.
 
     Amplitudes come from the cross-correlations alone, and not from the autocorrelations as in HERA's own pipeline.

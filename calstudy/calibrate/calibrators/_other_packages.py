@@ -1,4 +1,4 @@
-"""What the calibrators of the package hera_cal have in common."""
+"""What the calibrators of other packages have in common: they find gains alone, from data and a sky model."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Measured:
         return [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
 
 
-class HeraCal(Calibrator):
-    """A calibrator of hera_cal, which subtracts the sky model from the calibrated data."""
+class OtherPackage(Calibrator):
+    """A calibrator that finds gains alone; the residual is that of the sky model."""
 
     weights: Weights = FlagWeights()
 
@@ -111,7 +111,7 @@ class HeraCal(Calibrator):
         ended = [Outcome(status="skipped", message="every sample is flagged or has no weight")] * len(groups)
         if full:
             with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
-                # hera_cal divides by what may be zero, and tells of numbers that it replaces itself.
+                # They divide by what may be zero, and tell of numbers that they replace themselves.
                 warnings.simplefilter("ignore")
                 gains[:, :, full], found = self.solve(measured, [groups[number] for number in full])
             for number, outcome in zip(full, found, strict=True):
