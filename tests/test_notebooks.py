@@ -11,6 +11,12 @@ NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 EXPERIMENTS = NOTEBOOKS.parent / "experiments"
 REDUCED = {
     "first-study": ["instrument.times.count=3", "sky.foregrounds.count=500", "sky.eor.nside=16"],
+    "hera19": [
+        "observed.select.antennas='9,10,20,22,31,43,53,64,65,72'",
+        "observed.select.frequencies=138.5 MHz..144 MHz",
+        "injection.eor.nside=16",
+        "injection.simulation.chunks=1",
+    ],
     "own-calibrator": ["instrument.times.count=2", "sky.eor.nside=16", "outputs.figures=[]"],
     "signal-loss": [
         "instrument.times.count=2",

@@ -16,6 +16,8 @@ from calstudy.base.visibilities import antenna_pairs
 
 CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
 """Reads and writes CASA tables and measurement sets."""
+SAME_CHANNEL = 0.1
+"""Channels of two files are the same if they differ by less than this, in units of their width."""
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,6 +43,31 @@ def read_gains(path: Path, where: str) -> UVCal:
     except (OSError, ValueError, KeyError, IndexError, RuntimeError) as error:
         kind = "CASA table of gains" if path.is_dir() else "CalH5 or calfits file"
         raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({error})") from None
+
+
+def at_common_channels(first: UVCal, second: UVCal) -> tuple[UVCal, UVCal]:
+    """Return two sets of gains at the channels that both have, within a tenth of a channel; neither is changed.
+
+    Raises
+    ------
+    InputError
+        If there is no such channel, or one of them holds no gains by channel.
+    """
+    for name, cal in (("first", first), ("second", second)):
+        if cal.cal_type != "gain" or cal.wide_band:
+            kind = f"solutions of type {cal.cal_type!r}" if cal.cal_type != "gain" else "gains of whole bands"
+            raise InputError(f"the {name} file holds {kind}; gains by channel are needed")
+    width = min(np.min(cal.channel_width) for cal in (first, second))
+    same = np.abs(first.freq_array[:, None] - second.freq_array) <= SAME_CHANNEL * width
+    if not same.any():
+        bands = [f"{cal.freq_array.min() / 1e6:.3f} to {cal.freq_array.max() / 1e6:.3f} MHz" for cal in (first, second)]
+        raise InputError(f"the two files have no channel in common: {bands[0]}, and {bands[1]}")
+    chosen = [np.flatnonzero(same.any(axis=axis)) for axis in (1, 0)]
+    kept = [
+        cal if len(channels) == cal.Nfreqs else cal.select(freq_chans=channels, inplace=False)
+        for cal, channels in zip((first, second), chosen, strict=True)
+    ]
+    return kept[0], kept[1]
 
 
 def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = None) -> UVCal:
@@ -133,7 +160,7 @@ def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, 
     if missing.size:
         raise InputError(f"gains: no solution for antenna(s) {', '.join(map(str, missing))} of the data")
     offset = np.abs(cal.freq_array[None] - frequencies[:, None]).min(axis=1)
-    if offset.max() > 0.1 * width:
+    if offset.max() > SAME_CHANNEL * width:
         worst = frequencies[offset.argmax()]
         raise InputError(f"gains: no channel at {worst / 1e6:.4f} MHz, where the data have one")
 

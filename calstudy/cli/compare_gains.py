@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,17 +31,21 @@ def compare_gains(
 ) -> None:
     """Compare two files of gains by antenna, channel and delay.
 
-    One phase in every channel and one real scale are taken out in every integration, for no data determine them.
+    Antennas, feeds and channels that only one of them has are left out. One phase in every channel and one real scale
+    are taken out in every integration, for no data determine them.
     """
-    from calstudy.base.gains import read_gains
+    from calstudy.base.gains import at_common_channels, read_gains
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
     from calstudy.observed.gain_comparison_figure import draw_gain_difference
+    from calstudy.observed.gain_gradients import without_gradients
     from calstudy.plotting.save import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
 
     with quiet_libraries():
-        pair = pair_gains(read_gains(first, "the first file"), read_gains(second, "the second file"), feed)
-        found = compare_gains(pair, redundant)
+        files = read_gains(first, "the first file"), read_gains(second, "the second file")
+        given = pair_gains(*at_common_channels(*files), feed)
+        found = compare_gains(without_gradients(given) if redundant else given, redundant)
+        found = replace(found, as_given=compare_gains(given).as_given)
     numbers = _numbers(found)
     for name, value in numbers.items():
         typer.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
@@ -51,13 +56,15 @@ def compare_gains(
     typer.echo(f"{path}")
 
 
-def _numbers(found: GainDifference) -> dict[str, float | str]:
+def _numbers(found: GainDifference) -> dict[str, float | int | str]:
     import numpy as np
 
     from calstudy.observed.gain_comparison_figure import together
 
     worst = int(np.nanargmax(found.of_antenna))
     return {
+        "antennas": len(found.pair.antennas),
+        "channels": len(found.pair.frequency),
         "difference": together(found),
         "difference as given": found.as_given,
         "median over antennas": float(np.nanmedian(found.of_antenna)),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.observation import Frame
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
 from calstudy.measured.selection import Selection, parse_values, select
@@ -31,31 +32,34 @@ class Facts:
     ----------
     unit
         Of the visibilities.
-    antennas, polarizations
-        Their numbers.
+    frame
+        Antennas, baselines, autocorrelations among them, and channels, ascending.
     times
         Julian dates of the integrations, (Ntimes,).
     sidereal_times
         rad, (Ntimes,).
     integration
         Duration of the shortest, s.
-    frequencies
-        Channel centres, ascending, Hz, (Nfreqs,).
-    lengths
-        Of all baselines, m, (Nbls,).
     autos
         Whether there are autocorrelations of all antennas.
     """
 
     unit: str
-    antennas: int
-    polarizations: int
+    frame: Frame
     times: np.ndarray
     sidereal_times: np.ndarray
     integration: float
-    frequencies: np.ndarray
-    lengths: np.ndarray
     autos: bool
+
+    @property
+    def antennas(self) -> int:
+        """Number of antennas that are in a cross-correlation."""
+        return np.unique(self.frame.antennas[~self.frame.autos]).size
+
+    @property
+    def frequencies(self) -> np.ndarray:
+        """Channel centres, ascending, Hz, (Nfreqs,)."""
+        return self.frame.frequencies
 
     @property
     def channels(self) -> Channels:
@@ -66,13 +70,14 @@ class Facts:
 
     def size(self, n_times: int) -> Size:
         """Return the size of `n_times` of its integrations."""
+        lengths = np.array([np.linalg.norm(vector) for vector in self.frame.vectors[~self.frame.autos]])
         return Size(
             antennas=self.antennas,
             times=n_times,
             channels=self.channels,
-            polarizations=self.polarizations,
-            longest=float(self.lengths.max()),
-            mean=float(self.lengths.mean()),
+            polarizations=self.frame.n_polarizations,
+            longest=float(lengths.max()),
+            mean=float(lengths.mean()),
         )
 
 
@@ -106,26 +111,59 @@ def read_facts(
     if positions is not None:
         place_antennas(data, positions)
     data = select(data, selection)
-    places = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)
-    crosses = pairs[pairs[:, 0] != pairs[:, 1]]
+    crosses, autos = pairs[pairs[:, 0] != pairs[:, 1]], pairs[pairs[:, 0] == pairs[:, 1], 0]
     if not len(crosses):
         raise InputError("observed.data: there are no baselines, only autocorrelations")
     frequencies = np.sort(np.ravel(data.freq_array))
     if even:
         _require_even(frequencies)
     times, rows = np.unique(data.time_array, return_index=True)
+    places = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
+    numbers = np.unique(pairs)
     return Facts(
         unit=str(data.vis_units),
-        antennas=np.unique(crosses).size,
-        polarizations=int(np.isin(data.polarization_array, list(PARALLEL_HANDS)).sum()),
+        frame=Frame(
+            numbers,
+            np.array([places[number] for number in numbers.tolist()]),
+            np.searchsorted(numbers, pairs),
+            frequencies,
+            times.size,
+            int(np.isin(data.polarization_array, list(PARALLEL_HANDS)).sum()),
+        ),
         times=times,
         sidereal_times=np.asarray(data.lst_array)[rows],
         integration=float(np.min(data.integration_time)),
-        frequencies=frequencies,
-        lengths=np.array([np.linalg.norm(places[b] - places[a]) for a, b in crosses.tolist()]),
-        autos=set(np.unique(crosses).tolist()) <= set(pairs[pairs[:, 0] == pairs[:, 1], 0].tolist()),
+        autos=set(np.unique(crosses).tolist()) <= set(autos.tolist()),
     )
+
+
+def modelled(frame: Frame, path: Path) -> Frame:
+    """Return what is left of a frame with a sky model: the baselines of its file, and autocorrelations.
+
+    Parameters
+    ----------
+    frame
+        Of the data.
+    path
+        Of the sky model, whose metadata are read.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or has none of the cross-correlations.
+    """
+    from calstudy.measured.reading import read_metadata
+
+    sky = read_metadata((path,))
+    known = {frozenset(pair) for pair in zip(sky.ant_1_array.tolist(), sky.ant_2_array.tolist(), strict=True)}
+    chosen = np.array([frozenset(pair) in known for pair in frame.pairs.tolist()])
+    if not (chosen & ~frame.autos).any():
+        raise InputError(
+            f"observed.sky_model: {path} has none of the cross-correlations of the data (antennas are told by their "
+            "numbers)"
+        )
+    return frame.baselines(chosen | frame.autos)
 
 
 def _require_even(frequencies: np.ndarray) -> None:

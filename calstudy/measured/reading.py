@@ -9,6 +9,7 @@ import logging
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
+from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import numpy as np
 from pyuvdata import UVData
 
 from calstudy.base.errors import InputError
+from calstudy.base.gains import CASACORE
 from calstudy.calibrate.standard_formats import PARALLEL_HANDS
 from calstudy.measured.selection import Selection, select
 
@@ -36,9 +38,7 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
     InputError
         If a path does not exist, pyuvdata cannot read it, or its antennas have no place.
     """
-    for path in paths:
-        if not path.exists():
-            raise InputError(f"{path}: no such file or folder")
+    _require_readable(paths)
     names = [str(path) for path in paths]
     try:
         data = UVData.from_file(names[0] if len(names) == 1 else names)
@@ -55,6 +55,7 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
 
 def read_metadata(paths: Sequence[Path]) -> UVData:
     """Read what `read_visibilities` does without visibilities, where the format allows it; raises likewise."""
+    _require_readable(paths)
     names = [str(path) for path in paths]
     data = UVData()
     try:
@@ -62,10 +63,23 @@ def read_metadata(paths: Sequence[Path]) -> UVData:
     # As above; what cannot be read in parts may be readable as a whole.
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError):
         return read_visibilities(paths)
+    # The times of Miriad folders come with the visibilities.
+    if data.time_array is None:
+        return read_visibilities(paths)
     if not np.isfinite(data.telescope.antenna_positions).all():
         raise InputError(f"{', '.join(names)}: antenna positions are not finite")
     _require_plausible(data, ", ".join(names))
     return data
+
+
+def _require_readable(paths: Sequence[Path]) -> None:
+    """Raise InputError unless all paths exist, and measurement sets have the package that reads them."""
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+        # All CASA tables have this file.
+        if (path / "table.dat").is_file() and find_spec("casacore") is None:
+            raise InputError(f"{path}: reading a measurement set takes {CASACORE}")
 
 
 def _require_plausible(data: UVData, names: str) -> None:

@@ -14,7 +14,9 @@ from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.schema import Section, fault
+from calstudy.calibrate.calibrators.by_file import ByFile
 from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.experiment.files import apply_scale, override, parse_override
 from calstudy.experiment.messages import sentences
@@ -22,7 +24,7 @@ from calstudy.experiment.model import FIGURES, StudyName
 from calstudy.figures import ObservedFigure, observed_task
 from calstudy.instrument.interface import model_of
 from calstudy.measured.defaults import with_defaults
-from calstudy.measured.halves import read_facts, require_same_sky
+from calstudy.measured.halves import PARITIES, modelled, read_facts, require_same_sky
 from calstudy.measured.settings import InjectionSettings, ObservedSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.products.observed import Halves, ObservedGraph
@@ -69,9 +71,11 @@ class ObservedFile(Section):
     )
 
     @model_validator(mode="after")
-    def _nothing_is_assumed(self) -> ObservedFile:
+    def _calibration_is_of_measured_data(self) -> ObservedFile:
         if self.calibration.assumed:
             raise fault("calibration.assumed", "is for simulated data; give the sky model as observed.sky_model")
+        if isinstance(self.calibration, ByFile) and self.calibration.folder is not None:
+            raise fault("calibration.folder", "is for simulated data; give gains of measured data as calibration.gains")
         return self
 
 
@@ -113,10 +117,18 @@ class ObservedStudy(Study):
         )
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
-        """Return the study itself and the number of workers; raises InputError if a beam or the memory do not do."""
-        beam = self.file.observed.beam
-        with guarded(beam):
-            model_of(beam).require_usable(self.halves.facts["even"].channels)
+        """Return the study itself and the number of workers.
+
+        Raises InputError if the beam or the memory do not do, or the calibrator refuses the data.
+        """
+        section = self.file.observed
+        with guarded(section.beam):
+            model_of(section.beam).require_usable(self.halves.facts["even"].channels)
+        for parity in PARITIES[:1] if self.halves.interleaved else PARITIES:
+            frame = self.halves.facts[parity].frame
+            if section.sky_model is not None:
+                frame = modelled(frame, section.sky_model)
+            require_calibratable(self.file.calibration, frame, section.sky_model is not None)
         return self, workers_for(self.targets, self.outputs.store, budget)
 
     @cached_property

@@ -12,7 +12,9 @@ from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal
-from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
+from calstudy.calibrate.gain_comparison import GainPair, compare_gains, pair_gains
+from calstudy.observed.gain_comparison_figure import together
+from calstudy.observed.gain_gradients import without_gradients
 
 N_ANTENNAS = 9
 
@@ -50,6 +52,45 @@ def test_amplitudes_and_gradients_count_unless_the_array_is_redundant(template, 
     assert np.median(differ(template, changed, gains).of_antenna) > 0.05
     found = differ(template, changed, gains, redundant=True)
     assert max(found.of_antenna.max(), found.of_channel.max()) < 1e-10
+
+
+def test_gradients_may_be_several_turns_across_a_redundant_array():
+    """On a lattice a whole turn per step changes nothing: any gradient is found, up to the errors of the gains."""
+    rng = np.random.default_rng(6)
+    lattice = np.array([(i + j / 2, j * np.sqrt(3) / 2) for i in range(4) for j in range(4)])
+    angle = rng.uniform(-np.pi, np.pi, (2, 16))
+    gradients = 5 * np.pi / 14.6 * np.stack([np.cos(angle), np.sin(angle)])
+    second = 1 + 0.1 * complex_normal(rng, (2, len(lattice), 16))
+    turned = second * np.exp(1j * np.einsum("ai,itf->taf", 14.6 * lattice, gradients))
+    first = turned * (1 + 0.01 * complex_normal(rng, second.shape))
+    frequency = np.linspace(100e6, 115e6, 16)
+    pair = GainPair(np.arange(len(lattice)).astype(str), 14.6 * lattice, frequency, "x", first, second)
+    found = compare_gains(without_gradients(pair), redundant=True)
+    # Of 16 antennas, amplitude, phase and gradient of each channel take four of 32 real numbers.
+    assert together(found) == pytest.approx(0.01 * np.sqrt(28 / 32), rel=0.1)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_only_common_channels_are_compared(template, gains, tmp_path, capsys):
+    changed = gains.copy()
+    changed[:, :8] *= 2
+    make_uvcal(template, gains).write_calh5(tmp_path / "all.calh5")
+    part = make_uvcal(template, changed).select(freq_chans=np.arange(8, 40), inplace=False)
+    part.write_calh5(tmp_path / "part.calh5")
+    for files in (("all", "part"), ("part", "all")):
+        paths = [tmp_path / f"{name}.calh5" for name in files]
+        status, told = run_command(capsys, "compare-gains", *paths, "--output", tmp_path / "out")
+        assert status == 0, told
+        numbers = json.loads((tmp_path / "out" / "gain-comparison.json").read_text())
+        assert numbers["channels"] == 32
+        # Doubles agree to rounding.
+        assert numbers["difference"] < 1e-12
+    other = part.copy()
+    other.freq_array += 1e9
+    other.write_calh5(tmp_path / "other.calh5")
+    status, told = run_command(capsys, "compare-gains", tmp_path / "all.calh5", tmp_path / "other.calh5")
+    assert status == 2
+    assert "the two files have no channel in common" in told
 
 
 def test_an_error_is_found_where_it_is(template, gains):

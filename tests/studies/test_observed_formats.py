@@ -1,0 +1,167 @@
+"""Measured data in folders, and what a plan of measured data refuses before anything is computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from observations import small_instrument
+from pyuvdata import UVData
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
+from calstudy.instrument.telescope import make_template
+from calstudy.measured import reading
+from calstudy.products.corruption import PARITIES
+from calstudy.products.files import DATA
+from calstudy.products.observed import observe, observed
+from calstudy.run.task import Job
+from calstudy.studies.load import load_study
+from calstudy.studies.observed import ObservedStudy
+from calstudy.studies.study import Budget
+
+# Antenna 3 shares no baseline with another pair: redundancy does not tie it to the others.
+SCATTERED = "number,east_m,north_m,up_m\n0,0,0,0\n1,14,0,0\n2,28,0,0\n3,3,57,0\n"
+
+
+def measurement(**changes: object) -> UVData:
+    """Random visibilities, in Jy."""
+    template = make_template(small_instrument(times={"count": 4, "integration": "10 s"}, **changes))
+    generator = np.random.default_rng(16)
+    shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
+    data = from_cube(template, generator.normal(size=shape) + 1j * generator.normal(size=shape))
+    data.vis_units = "Jy"
+    return data
+
+
+def study(directory: Path, section: dict, **calibration: object) -> ObservedStudy:
+    content = {
+        "name": "formats",
+        "observed": {"beam": "gaussian", **section},
+        "calibration": {"calibrator": "calamity", **calibration},
+        "outputs": {"store": str(directory / "store"), "runs": str(directory / "runs")},
+    }
+    path = directory / "formats.yaml"
+    path.write_text(yaml.safe_dump(content))
+    found = load_study(path)
+    assert isinstance(found, ObservedStudy)
+    return found
+
+
+def halves(folder: Path, name: str) -> dict[str, UVData]:
+    """What is read of a data set."""
+    graph, found = study(folder, {"data": name}).graph, {}
+    for parity in PARITIES:
+        output = folder / f"{name}-{parity}"
+        output.mkdir()
+        observe(Job(settings=observed(graph, parity).settings, inputs={}, output=output))
+        found[parity] = UVData.from_file(output / DATA, run_check=False)
+    return found
+
+
+def write_folder(data: UVData, path: Path) -> None:
+    """Write data to a folder, in the format of its suffix."""
+    if path.suffix == ".ms":
+        pytest.importorskip("casacore", reason="the extra [ms] is not installed")
+        data.phase_to_time(data.time_array[0])
+        data.write_ms(str(path))
+    else:
+        data.write_miriad(str(path))
+
+
+# Miriad has variables that other formats lack, which pyuvdata tells.
+@pytest.mark.filterwarnings("ignore:writing default values for restfreq:UserWarning")
+# pyuvdata 3.2 leaves the SIGMA of samples without weight undefined.
+@pytest.mark.filterwarnings("ignore:'where' used without 'out':UserWarning")
+@pytest.mark.parametrize("suffix", ["uv", "ms"])
+def test_folders_are_read_as_files_are(tmp_path, suffix):
+    """Both formats store single precision: 6e-8 of each sample, and 1e-6 after unphasing."""
+    data = measurement()
+    data.write_uvh5(tmp_path / "data.uvh5")
+    write_folder(data, tmp_path / f"data.{suffix}")
+    expected, found = halves(tmp_path, "data.uvh5"), halves(tmp_path, f"data.{suffix}")
+    for parity in PARITIES:
+        assert np.array_equal(antenna_pairs(found[parity]), antenna_pairs(expected[parity]))
+        difference = np.abs(to_cube(found[parity]) - to_cube(expected[parity]))
+        assert difference.max() < 1e-6 * np.abs(expected[parity].data_array).max()
+
+
+@pytest.mark.filterwarnings("ignore:writing default values for restfreq:UserWarning")
+def test_products_depend_on_what_is_in_a_folder(tmp_path):
+    """Reading leaves keys alone, as does the name of the folder; a changed file changes them."""
+    path = tmp_path / "data.uv"
+    write_folder(measurement(), path)
+    keys = [observed(study(tmp_path, {"data": "data.uv"}).graph, "even").key for _ in range(2)]
+    renamed = path.rename(tmp_path / "other.uv")
+    keys.append(observed(study(tmp_path, {"data": "other.uv"}).graph, "even").key)
+    assert len(set(keys)) == 1
+    content = (renamed / "history").read_bytes()
+    (renamed / "history").write_bytes(content + b"\nflagged by hand\n")
+    assert observed(study(tmp_path, {"data": "other.uv"}).graph, "even").key != keys[0]
+
+
+def test_a_measurement_set_without_its_reader_gets_a_sentence(tmp_path, monkeypatch):
+    (tmp_path / "data.ms").mkdir()
+    (tmp_path / "data.ms" / "table.dat").touch()
+    monkeypatch.setattr(reading, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"reading a measurement set takes python-casacore, .* 'calstudy\[ms\]'"):
+        study(tmp_path, {"data": "data.ms"})
+
+
+@pytest.mark.parametrize(
+    ("calibrator", "layout", "modelled", "sentence"),
+    [
+        ("redcal", None, None, "calibrator = 'redcal': needs a sky model, and there is none"),
+        ("unified", None, None, "foreground_prior.mean: 'sky-model' needs a sky model"),
+        ("redcal", "scattered.csv", slice(None), "calibrator = 'redcal': redundant"),
+        ("redcal", None, slice(0, 5), "calibrator = 'redcal': redundant"),
+        ("redcal", None, slice(None), None),
+        ("unified", "scattered.csv", slice(None), None),
+    ],
+)
+def test_a_plan_asks_the_calibrator(tmp_path, calibrator, layout, modelled, sentence):
+    """With the baselines that the data and the sky model, where there is one, have in common.
+
+    The first five baselines of five antennas on a hexagon's lattice begin at two antennas: too few for redundancy.
+    """
+    changes = {}
+    if layout is not None:
+        (tmp_path / layout).write_text(SCATTERED)
+        changes["layout"] = {"kind": "csv", "path": str(tmp_path / layout)}
+    data = measurement(**changes)
+    data.write_uvh5(tmp_path / "data.uvh5")
+    section = {"data": "data.uvh5"}
+    if modelled is not None:
+        pairs = antenna_pairs(data)[modelled].tolist()
+        data.select(bls=[tuple(pair) for pair in pairs], inplace=False).write_uvh5(tmp_path / "sky.uvh5")
+        section["sky_model"] = "sky.uvh5"
+    # The data have no autocorrelations that tell the noise, which finite priors need to know.
+    noise = {"foreground_prior": {"noise": "1 Jy"}} if calibrator == "unified" else {}
+    found = study(tmp_path, section, calibrator=calibrator, **noise)
+    if sentence is None:
+        found.fitted(Budget(workers=1))
+        return
+    with pytest.raises(InputError) as caught:
+        found.fitted(Budget(workers=1))
+    assert sentence in str(caught.value)
+
+
+def test_gains_of_an_export_are_not_those_of_measured_data(tmp_path):
+    measurement().write_uvh5(tmp_path / "data.uvh5")
+    with pytest.raises(ExperimentError, match=r"calibration.folder: is for simulated data; .* as calibration.gains"):
+        study(tmp_path, {"data": "data.uvh5"}, calibrator="by-file", folder=str(tmp_path))
+
+
+def test_a_sky_model_of_other_antennas_is_refused(tmp_path):
+    measurement().write_uvh5(tmp_path / "data.uvh5")
+    sky = measurement(layout={"kind": "mwa-compact-minredundant", "count": 3})
+    numbers = sky.telescope.antenna_numbers + 500
+    sky.telescope.antenna_numbers = numbers
+    sky.ant_1_array, sky.ant_2_array = sky.ant_1_array + 500, sky.ant_2_array + 500
+    sky.baseline_array = sky.antnums_to_baseline(sky.ant_1_array, sky.ant_2_array)
+    sky.write_uvh5(tmp_path / "sky.uvh5")
+    found = study(tmp_path, {"data": "data.uvh5", "sky_model": "sky.uvh5"})
+    with pytest.raises(InputError, match=r"observed.sky_model: .* has none of the cross-correlations of the data"):
+        found.fitted(Budget(workers=1))

@@ -1,0 +1,58 @@
+"""The gallery shows what is in figures/: every folder, with its figure, its verdicts, and the command that made it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from calstudy.studies.collection import Collection
+from calstudy.studies.load import load_study
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = sorted(path.name for path in (ROOT / "figures").iterdir() if path.is_dir())
+SECTIONS = dict(
+    re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", (ROOT / "docs/gallery.md").read_text(), re.DOTALL | re.MULTILINE)
+)
+VERDICTS = ("PASS", "FAIL", "not evaluated")
+
+folders = pytest.mark.parametrize("folder", FOLDERS)
+
+
+@cache
+def names_made_by(experiment: str) -> set[str]:
+    """Of the study of a file, and of its members."""
+    study = load_study(ROOT / experiment)
+    members = set(study.members) if isinstance(study, Collection) else set()
+    return {study.name} | members
+
+
+def test_every_folder_has_a_section():
+    assert sorted(SECTIONS) == FOLDERS
+
+
+@folders
+def test_the_figure_is_of_the_folder(folder):
+    [path] = re.findall(r"!\[[^\]]+\]\(\.\./(.*?)\)", SECTIONS[folder])
+    assert path.startswith(f"figures/{folder}/")
+    assert (ROOT / path).is_file()
+
+
+@folders
+def test_the_verdicts_are_those_of_the_claims(folder):
+    path = ROOT / "figures" / folder / "claims.json"
+    counts = Counter(claim["verdict"] for claim in json.loads(path.read_text())) if path.exists() else Counter()
+    told = {
+        verdict: int(count) for count, verdict in re.findall(r"(\d+)\s+(PASS|FAIL|not\s+evaluated)", SECTIONS[folder])
+    }
+    assert told == {verdict: counts[verdict] for verdict in VERDICTS if counts[verdict]}
+
+
+@folders
+def test_the_command_makes_the_study(folder):
+    [experiment] = re.findall(r"^python -m calstudy run (\S+)$", SECTIONS[folder], re.MULTILINE)
+    assert folder in names_made_by(experiment)
