@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
+from calstudy.base.gains import SAME_CHANNEL
 from calstudy.calibrate.agreement import TAPER, aligned_gains
 from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.delay import channel_width, delay_transform, delays
 
-SAME_CHANNEL = 0.1
-"""Channels of two files are the same if they differ by less than this, in units of their width."""
 GRADIENT_STEPS, GRADIENT_TOLERANCE = 50, 1e-12
+REDUNDANT = 1.0
+"""m. Baselines that differ by less count as the same."""
+NOT_PARALLEL = 0.3
+"""The sine of the angle between two baselines that span a plane is larger."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +135,8 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         What is compared. Not mutated.
     redundant
         Whether one amplitude and one phase gradient across the array in every channel are left out as well, which the
-        redundancy of an array does not determine. Gradients must be below about half a turn across the array.
+        redundancy of an array does not determine. A gradient may be of any number of turns per baseline on a lattice, and
+        must be less than half a turn per baseline elsewhere.
 
     Raises
     ------
@@ -142,7 +147,7 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         raise InputError("all gains that the two files have in common are flagged in either")
     first = pair.first
     if redundant:
-        both = zip(first, pair.second, strict=True)
+        both = zip(_without_turns(pair).first, pair.second, strict=True)
         first = np.stack([_without_gradients(*gains, pair.positions) for gains in both])
     solved = first.any(axis=(1, 2))
     aligned = np.zeros_like(first)
@@ -166,6 +171,43 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
 def _relative(difference: np.ndarray, gains: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
     above, below = (np.sum(np.abs(values) ** 2, axis=axes) for values in (difference, gains))
     return np.sqrt(np.divide(above, below, out=np.full(np.shape(above), np.nan), where=below > 0))
+
+
+def _without_turns(pair: GainPair) -> GainPair:
+    """Take the phase gradient between two sets of gains out of the first, however many turns it is across the array.
+
+    Gains g_a' = g_a exp(i q x_a) have the products of antennas of one redundant group all turned by q d: the mean of
+    those products gives q d for the shortest group, and for the shortest that is not parallel to it. On a lattice these
+    are its steps, and whole turns per step make no difference. Elsewhere q must be less than half a turn per baseline.
+    """
+    first, second = np.triu_indices(len(pair.antennas), 1)
+    if not first.size:
+        return pair
+    vectors = pair.positions[second] - pair.positions[first]
+    groups = redundant_groups(np.column_stack([vectors, np.zeros(len(vectors))]), REDUNDANT)
+    overlap = pair.first * pair.second.conj()
+    products = overlap[:, second] * overlap[:, first].conj()
+    products[:, groups.conjugated] = products[:, groups.conjugated].conj()
+    vectors = np.where(groups.conjugated[:, None], -vectors, vectors)
+    steps, turns = [], []
+    for group in _spanning([vectors[groups.index == number].mean(axis=0) for number in range(groups.index.max() + 1)]):
+        members = groups.index == group
+        steps.append(vectors[members].mean(axis=0))
+        turns.append(np.angle(products[:, members].sum(axis=1)))
+    gradients = np.einsum("ij,jtf->tif", np.linalg.pinv(np.array(steps)), np.array(turns))
+    phases = np.einsum("ai,tif->taf", pair.positions - pair.positions.mean(axis=0), gradients)
+    return replace(pair, first=pair.first * np.exp(-1j * phases))
+
+
+def _spanning(vectors: list[np.ndarray]) -> list[int]:
+    """Return the places of the shortest vector, and of the shortest that is not parallel to it if there is one."""
+    order = np.argsort([np.linalg.norm(vector) for vector in vectors])
+    shortest = vectors[order[0]] / np.linalg.norm(vectors[order[0]])
+    for place in order[1:]:
+        across = shortest[0] * vectors[place][1] - shortest[1] * vectors[place][0]
+        if abs(across) > NOT_PARALLEL * np.linalg.norm(vectors[place]):
+            return [int(order[0]), int(place)]
+    return [int(order[0])]
 
 
 def _without_gradients(first: np.ndarray, second: np.ndarray, positions: np.ndarray) -> np.ndarray:

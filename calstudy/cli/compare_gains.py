@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,15 +36,12 @@ def compare_gains(
     from calstudy.base.gains import at_common_channels, read_gains
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
     from calstudy.observed.gain_comparison_figure import draw_gain_difference
-    from calstudy.observed.gain_gradients import without_gradients
     from calstudy.plotting.save import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
 
     with quiet_libraries():
         files = read_gains(first, "the first file"), read_gains(second, "the second file")
-        given = pair_gains(*at_common_channels(*files), feed)
-        found = compare_gains(without_gradients(given) if redundant else given, redundant)
-        found = replace(found, as_given=compare_gains(given).as_given)
+        found = compare_gains(pair_gains(*at_common_channels(*files), feed), redundant)
     numbers = _numbers(found)
     for name, value in numbers.items():
         typer.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
