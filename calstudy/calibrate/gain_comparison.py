@@ -135,8 +135,8 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         What is compared. Not mutated.
     redundant
         Whether one amplitude and one phase gradient across the array in every channel are left out as well, which the
-        redundancy of an array does not determine. A gradient may be of any number of turns per baseline on a lattice, and
-        must be less than half a turn per baseline elsewhere.
+        redundancy of an array does not determine. On a lattice a gradient may be of any number of turns per baseline,
+        elsewhere it must be less than half a turn per baseline.
 
     Raises
     ------
