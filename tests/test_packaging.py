@@ -19,7 +19,13 @@ def normalized(name):
 
 
 def declared():
-    return {normalized(re.match(r"[\w.-]+", requirement)[0]) for requirement in PROJECT["dependencies"]}
+    """Of the package and of the extras that calibrators and file formats need; setup installs all of them."""
+    requirements = [
+        *PROJECT["dependencies"],
+        *PROJECT["optional-dependencies"]["ms"],
+        *PROJECT["optional-dependencies"]["dp3"],
+    ]
+    return {normalized(re.match(r"[\w.-]+", requirement)[0]) for requirement in requirements}
 
 
 def imported():
