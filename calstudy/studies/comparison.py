@@ -36,6 +36,8 @@ KEY = "calibrators"
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 """Keys of the experiment that the cases do not take from it."""
+OWN = ("name", "description", KEY, "worlds", "figures")
+"""Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
 VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
 )
@@ -253,7 +255,8 @@ def load_comparison(
     scale
         Name of a set of changes in the `scales` of the file, of the experiment, or of both.
     overrides
-        ``path=value`` texts, applied to the experiment of every case.
+        ``path=value`` texts. Those that begin with a key of `OWN` change the file, such as ``worlds={ideal: {}}``; all
+        others are applied to the experiment of every case.
     calibrators
         In place of those of the file.
 
@@ -266,6 +269,9 @@ def load_comparison(
     """
     own = scale if scale in (data.get("scales") or {}) else None
     data = apply_scale(data, own)
+    changes = dict(parse_override(text) for text in overrides)
+    for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
+        data = override(data, dotted, changes.pop(dotted))
     if calibrators is not None:
         data[KEY] = dict(calibrators)
     folder = path.resolve().parent
@@ -279,7 +285,6 @@ def load_comparison(
             hint = f"does not compare calibrators{nearest(figure.label, built_in)} (built in: {', '.join(built_in)})"
             raise ExperimentError([f"figures.{place}: {figure.label!r} {hint}; ask for it in an experiment"])
     base, origin = _base(file, folder, scale, optional=own is not None)
-    changes = dict(parse_override(text) for text in overrides)
     worlds = {world: {**fields, **changes} for world, fields in file.worlds.items()}
     cases = _make_cases(file.calibrators, worlds, base, origin)
     figures = [figure.model_dump(mode="json") for figure in _shown(file)]

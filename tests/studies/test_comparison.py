@@ -170,6 +170,17 @@ def test_scales_of_the_file_and_of_its_experiment_go_together(tmp_path):
     assert {case.experiment.sky.eor.seed for case in study.cases} == {9}
 
 
+def test_worlds_and_calibrators_can_be_set_as_fields_of_the_experiment_can(tmp_path):
+    overrides = ["worlds={ideal: {}}", "calibrators.CALAMITY={calibrator: calamity}", "name=mine", "sky.eor.seed=9"]
+    study = load_study(comparison_file(tmp_path), overrides=overrides)
+    assert {case.world for case in study.cases} == {"ideal"}
+    assert [case.calibrator for case in study.cases] == list(CALIBRATORS)
+    assert {case.experiment.sky.eor.seed for case in study.cases} == {9}
+    assert study.folder.name.startswith("mine-")
+    with pytest.raises(ExperimentError, match=r"sky\.eor\.sed"):
+        load_study(comparison_file(tmp_path), overrides=["worlds={ideal: {sky.eor.sed: 9}}"])
+
+
 def test_the_file_in_the_run_folder_is_the_same_comparison(compared, tmp_path):
     again = load_study(compared.folder / "experiment.yaml")
     assert again.table.key in compared.made.products
