@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calstudy.calibrate.interface import Calibrator
     from calstudy.calibrate.records import CalibrationResult
     from calstudy.calibrate.settings import GainFit
+    from calstudy.measured.selection import Selection
     from calstudy.observed.pieces import Given
 
 EXIT_UNCONVERGED = 3
@@ -43,6 +44,9 @@ Select = Annotated[
         metavar="KEY=VALUE",
         help="antennas=0,1,12  lengths='14 m..60 m'  times=0..9  frequencies='120 MHz..'  polarizations=xx",
     ),
+]
+FlagInterference = Annotated[
+    bool, typer.Option("--flag-interference", help="First flag what stands out in time and frequency, by hera_qm.")
 ]
 Set = Annotated[
     list[str] | None,
@@ -71,6 +75,7 @@ def calibrate(
     gains_only: GainsOnly = False,
     weights: Weighting = None,
     select: Select = None,
+    interference: FlagInterference = False,
     overrides: Set = None,
     output: Output = Path("calibrated"),
     calfits: Calfits = False,
@@ -103,7 +108,7 @@ def calibrate(
     calibrator = read_calibrator(settings_file, changes, assumed, overrides or [])
     budget = None if max_memory is None else parse_memory(max_memory)
     extras = [name for name, wanted in ((CALFITS, calfits), (EXPECTED, expected_loss)) if wanted]
-    request = _Request(data, sky_model, gains, select or [], output, budget, extras, overwrite, dry_run)
+    request = _Request(data, sky_model, gains, select or [], interference, output, budget, extras, overwrite, dry_run)
     sys.exit(_run(request, calibrator))
 
 
@@ -115,6 +120,7 @@ class _Request:
     sky_path: Path | None
     gains_path: Path | None
     selections: list[str]
+    interference: bool
     output: Path
     budget: float | None
     extras: list[str]
@@ -162,7 +168,7 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
     started = time.perf_counter()
     with quiet_libraries():
         autos = isinstance(calibrator, GainFit) and calibrator.autos
-        data, sky, notes = _load(request.paths, request.sky_path, selection, autos)
+        data, sky, notes = _load(request, selection, autos)
         calibrator, plan = _plan(data, calibrator, sky is not None, notes, request.budget)
         for note in notes:
             console.print(note, markup=False)
@@ -174,11 +180,12 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
             "sky_model": None if request.sky_path is None else str(request.sky_path),
             "gains": None if request.gains_path is None else str(request.gains_path),
             "selection": asdict(selection),
+            "flag_interference": request.interference,
             "settings": calibrator.model_dump(mode="json"),
             "notes": notes,
             "plan": plan,
         }
-        settings = {name: context[name] for name in ("selection", "settings")}
+        settings = {name: context[name] for name in ("selection", "flag_interference", "settings")}
         folder = pieces_folder(request.output, request.files, settings)
         result = _calibrate(Given(data, sky, _start(request.gains_path)), calibrator, folder, console)
         context["quality"] = _qualities(data, result, console)
@@ -193,17 +200,19 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
     return _verdict(result)
 
 
-def _load(
-    paths: list[Path], sky_path: Path | None, selection: Any, autos: bool
-) -> tuple[UVData, UVData | None, list[str]]:
+def _load(request: _Request, selection: Selection, autos: bool) -> tuple[UVData, UVData | None, list[str]]:
     from calstudy.calibrate.sky_model import common_baselines
+    from calstudy.measured.interference import flag_interference
     from calstudy.measured.reading import prepare, read_visibilities
     from calstudy.measured.selection import Selection
+    from calstudy.measured.settings import Interference
 
-    data, notes = prepare(read_visibilities(paths), selection)
-    if sky_path is None:
+    data, notes = prepare(read_visibilities(request.paths), selection)
+    if request.interference:
+        notes.append(flag_interference(data, Interference()))
+    if request.sky_path is None:
         return data, None, notes
-    sky, sky_notes = prepare(read_visibilities([sky_path]), Selection(polarizations=selection.polarizations))
+    sky, sky_notes = prepare(read_visibilities([request.sky_path]), Selection(polarizations=selection.polarizations))
     sky, data, left_out = common_baselines(sky, data, autos)
     return data, sky, notes + [f"Sky model: {note}" for note in sky_notes] + left_out
 

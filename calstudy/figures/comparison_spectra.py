@@ -18,8 +18,10 @@ from calstudy.run.task import Job
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
-LINEAR = {"recovered": 2.0, "bias": 0.1}
+LINEAR = {"recovered": 1.0, "bias": 0.1}
 """An axis is linear up to this, and logarithmic beyond where there is more."""
+DECADES = {"recovered": 1.5, "bias": 0.7}
+"""As long as so many decades is the linear part of a logarithmic axis."""
 ROW_HEIGHT, LARGEST_K = 1.7, 1.0
 
 
@@ -56,9 +58,8 @@ def draw_spectra(
             shift = 0.15 * (place - (len(calibrators) - 1) / 2) / len(calibrators)
             _draw_points(left, case, "recovered", place, shift)
             _draw_points(right, case, "bias", place, shift)
-        for axes, name in ((left, "recovered"), (right, "bias")):
-            if max(np.abs(axes.get_ylim())) > 2 * LINEAR[name]:
-                axes.set_yscale("symlog", linthresh=LINEAR[name])
+        _scale(left, "recovered")
+        _scale(right, "bias")
         left.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
         right.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
         left.set_title(world, loc="left")
@@ -79,6 +80,19 @@ def _draw_points(axes: Axes, case: Case, name: str, place: int, shift: float) ->
     k = bins.k + shift * np.diff(bins.bin_edges)
     bars = SIGMAS_95 * np.nan_to_num(errors[used])
     axes.errorbar(k[used], values[used], yerr=bars, elinewidth=0.5, linewidth=0.6, markersize=2.5, **look(place))
+
+
+def _scale(axes: Axes, name: str) -> None:
+    """Make an axis logarithmic where its values are large, with limits that they fill."""
+    low, high = axes.dataLim.intervaly
+    low = min(low, 0.0)
+    if max(-low, high) <= 2 * LINEAR[name]:
+        return
+    axes.set_yscale("symlog", linthresh=LINEAR[name], linscale=DECADES[name])
+    transform = axes.yaxis.get_transform()
+    bottom, top = transform.transform(np.array([low, high]))
+    margin = 0.05 * (top - bottom)
+    axes.set_ylim(*transform.inverted().transform(np.array([bottom - margin, top + margin])))
 
 
 class ComparisonSpectra(CasesFigure):

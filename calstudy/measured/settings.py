@@ -147,6 +147,20 @@ class FromAutocorrelations(SystemTemperature):
 FluxScale = Annotated[Factor | FromAutocorrelations, Field(discriminator="kind"), choice("kind")]
 
 
+class Interference(Section):
+    """How far data must stand out from their surroundings to be flagged."""
+
+    significance: float = Field(6.0, ge=2, le=100, description="Standard deviations.")
+    adjacent_significance: float = Field(
+        2.0, ge=1, le=100, description="For samples beside flagged ones, in time or frequency."
+    )
+
+
+def _as_block(value: Any) -> Any:
+    """Take true for the defaults, and false for none."""
+    return {True: {}, False: None}[value] if isinstance(value, bool) else value
+
+
 class ObservedSettings(Section):
     """Measured visibilities in any format that pyuvdata reads; paths start at the file, or are ``package:path``."""
 
@@ -159,6 +173,13 @@ class ObservedSettings(Section):
     select: Select = Select()
     flag: Annotated[tuple[FrequencyRange, ...], Field(strict=False)] = Field(
         (), description="Channels that are flagged, such as those of known interference: ['149.7 MHz..150.2 MHz']."
+    )
+    flag_interference: Annotated[
+        Interference | None, BeforeValidator(_as_block, json_schema_input_type=Interference | bool | None)
+    ] = Field(
+        None,
+        description="Flag what stands out in time and frequency in several baselines, by hera_qm: true, or a block; "
+        "null: nothing.",
     )
     positions: DataFile | None = Field(
         None,

@@ -116,6 +116,8 @@ def observed(graph: ObservedGraph, parity: str) -> Task:
     }
     if section.flag:
         settings["flag"] = list(section.flag)
+    if section.flag_interference is not None:
+        settings["interference"] = section.flag_interference
     if section.positions is not None:
         settings["positions"] = section.positions
     if section.sky_model is not None:
@@ -200,6 +202,7 @@ def observe(job: Job) -> Mapping[str, Any]:
     """Write the data of one half to data.uvh5, and the sky model to visibilities.uvh5."""
     from calstudy.calibrate.sky_model import common_baselines
     from calstudy.measured.halves import east_and_north, flag_channels, interleaved
+    from calstudy.measured.interference import flag_interference
     from calstudy.measured.positions import place_antennas
     from calstudy.measured.reading import prepare, read_visibilities
     from calstudy.measured.selection import Selection
@@ -215,6 +218,8 @@ def observe(job: Job) -> Mapping[str, Any]:
     notes = placed + notes + east_and_north(data)
     for text in settings.get("flag", ()):
         flag_channels(data, text)
+    if "interference" in settings:
+        notes.append(flag_interference(data, settings["interference"]))
     sky = None
     if "sky_model" in settings:
         sky, sky_notes = prepare(read_visibilities([settings["sky_model"]]), Selection())

@@ -108,7 +108,7 @@ def test_a_program_that_fails_is_a_solve_that_failed(monkeypatch, tmp_path):
     command = tmp_path / "DP3-broken"
     command.write_text("#!/bin/sh\necho no such step\nexit 3\n")
     command.chmod(0o755)
-    monkeypatch.setattr(ddecal, "_program", lambda: (str(command),))
+    monkeypatch.setattr(ddecal, "_program", lambda: str(command))
     toy = make_toy(scattered(8), noise=0.0)
     uvd = make_uvdata(toy, n_times=1)
     result = run_calibrator(Ddecal(), uvd, sky_of(uvd, toy.foregrounds))

@@ -247,6 +247,12 @@ def test_interference_is_warned_of_and_written(files, clean, capsys):
     with np.load(files / "out" / "diagnostics.npz") as arrays:
         assert arrays["chi2_by_channel"].shape == (clean.Nfreqs,)
         assert str(arrays["antennas"][0]).startswith("ant")
+    status, told = run_command(capsys, *CALIBRATE, "--output", "flagged", "--flag-interference")
+    assert status == 0
+    assert "interference?" not in told
+    gains = UVCal.from_file(files / "flagged" / "gains.calh5")
+    assert gains.flag_array[:, CHANNEL].all()
+    assert np.abs(gains.gain_array[~gains.flag_array]) == pytest.approx(2, rel=1e-3)
 
 
 def test_a_field_may_be_given_as_in_an_experiment_file(files, capsys):

@@ -111,7 +111,7 @@ class Ddecal(OtherPackage):
         threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         environment: Mapping[str, str] = {**os.environ, **threads, "CASARCFILES": str(folder / "casarc")}
         return subprocess.run(
-            [*program, *(f"{name}={value}" for name, value in settings.items())],
+            [program, *(f"{name}={value}" for name, value in settings.items())],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -136,13 +136,13 @@ class Ddecal(OtherPackage):
         return outcomes
 
 
-def _program() -> tuple[str, ...] | None:
-    """Return the command that runs DP3: on the path, or beside the Python that runs."""
+def _program() -> str | None:
+    """Return the path of DP3: on the path, or beside the Python that runs."""
     beside = str(Path(sys.executable).parent)
     for name in COMMANDS:
         for path in (None, beside):
             if (command := shutil.which(name, path=path)) is not None:
-                return (command,)
+                return command
     return None
 
 

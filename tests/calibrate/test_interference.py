@@ -1,0 +1,102 @@
+"""Interference that is put into data is found, and little else."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyuvdata import UVData
+from test_calamity import make_uvdata
+from toy import make_toy, scattered
+
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import flag_cube, to_cube
+from calstudy.measured.interference import flag_interference
+from calstudy.measured.reading import prepare, read_visibilities
+from calstudy.measured.selection import Selection
+from calstudy.measured.settings import Interference, find_data
+
+N_TIMES, NOISE = 24, 0.05
+ALWAYS, SOMETIMES = 20, (9, 30)
+"""Channels of a station that is on all the time, and of one that is on in some integrations."""
+INTEGRATIONS = (4, 5, 13)
+SHORT = (7, 15)
+"""Channels and integration of what is seen once, in a narrow band."""
+
+
+@pytest.fixture(scope="module")
+def clean() -> UVData:
+    """Noise, and foregrounds that are smooth in frequency, as data are under a smooth bandpass."""
+    toy = make_toy(scattered(8))
+    uvd = make_uvdata(replace(toy, gains=np.ones_like(toy.gains)), N_TIMES)
+    draws = np.random.default_rng(5).normal(size=(2, *uvd.data_array.shape))
+    scale = np.sqrt(np.mean(np.abs(uvd.data_array) ** 2))
+    uvd.data_array += NOISE * scale * (draws[0] + 1j * draws[1]) / np.sqrt(2)
+    return uvd
+
+
+def spoiled(clean: UVData) -> tuple[UVData, np.ndarray]:
+    """Return data with interference of as much as the data, and where it is, (Ntimes, Nfreqs)."""
+    data, where = clean.copy(), np.zeros((N_TIMES, clean.Nfreqs), bool)
+    where[:, ALWAYS] = True
+    where[np.ix_(INTEGRATIONS, SOMETIMES)] = True
+    where[SHORT[1], SHORT[0]] = True
+    phases = np.random.default_rng(6).uniform(0, 2 * np.pi, (N_TIMES, clean.Nbls, clean.Nfreqs))
+    scale = np.sqrt(np.mean(np.abs(clean.data_array) ** 2))
+    to_cube(data)[..., 0] += 3 * scale * where[:, None] * np.exp(1j * phases)
+    return data, where
+
+
+def test_interference_is_flagged_in_all_baselines_and_little_else(clean):
+    data, where = spoiled(clean)
+    told = flag_interference(data, Interference())
+    flags = flag_cube(data)[..., 0]
+    assert (flags == flags[:, :1]).all()
+    assert flags[:, 0][where].all()
+    # Neighbours are flagged if they stand out by 2 sigma, and channels as a whole.
+    places = np.array([ALWAYS, *SOMETIMES, SHORT[0]])
+    far = np.abs(np.arange(clean.Nfreqs)[:, None] - places).min(axis=1) > 1
+    assert flags[:, 0, far].mean() < 0.005
+    assert f"{clean.freq_array[ALWAYS - 1] / 1e6:.3f} to {clean.freq_array[ALWAYS + 1] / 1e6:.3f}" in told
+    assert told.startswith(f"Interference: {100 * flags.mean():.2g} % of the samples")
+
+
+def test_noise_is_not_interference(clean):
+    data = clean.copy()
+    flag_interference(data, Interference())
+    assert data.flag_array.mean() < 0.005
+
+
+def test_flagged_samples_do_not_count_and_stay_flagged(clean):
+    data, where = spoiled(clean)
+    alone = data.copy()
+    flag_interference(alone, Interference())
+    flag_cube(data)[:, 3, 40:44] = True
+    to_cube(data)[:, 3, 40:44] = np.nan
+    flag_interference(data, Interference())
+    expected = flag_cube(alone).copy()
+    expected[:, 3, 40:44] = True
+    assert (flag_cube(data) == expected).mean() > 0.995
+    assert flag_cube(data)[:, 3, 40:44].all()
+    assert flag_cube(data)[..., 0][:, 0][where].all()
+
+
+def test_the_stations_that_hera_sees_are_found():
+    """Satellites at 137.5 MHz, and at 149.8 to 150 MHz, where data of HERA are known to be bad."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        data = read_visibilities([find_data("hera_qm:data/zen.2457698.40355.xx.HH.uvh5", Path())])
+        data, _ = prepare(data, Selection())
+    told = flag_interference(data, Interference())
+    channels = np.ravel(data.freq_array)[flag_cube(data).all(axis=(0, 1, 3))] / 1e6
+    assert all(np.abs(channels - place).min() < 0.05 for place in (137.5, 149.8, 149.9, 150.0))
+    assert 0.01 < data.flag_array.mean() < 0.06
+    assert "137.500 to 137.598, 149.805 to 150.000" in told
+
+
+def test_autocorrelations_alone_are_refused(clean):
+    autos = clean.copy()
+    autos.ant_2_array = autos.ant_1_array.copy()
+    with pytest.raises(InputError, match="interference is looked for in cross-correlations"):
+        flag_interference(autos, Interference())
