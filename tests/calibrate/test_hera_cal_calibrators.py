@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hera_cal.redcal import RedundantCalibrator
 from test_calamity import make_uvdata
 from toy import HEX, complex_normal, make_toy, scattered
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube, to_cube
+from calstudy.calibrate.calibrators import redcal
 from calstudy.calibrate.calibrators.redcal import Redcal
 from calstudy.calibrate.calibrators.sky_based import SkyBased
 from calstudy.calibrate.calibrators.skycal import Skycal
@@ -150,6 +152,26 @@ def test_logcal_pulls_weak_antennas_up_and_omnical_does_not():
         ratios[steps[1]], scatter[steps[1]] = ratio.mean(), ratio.std() / np.sqrt(ratio.size)
     assert ratios["abscal"] > 0.5 + 10 * scatter["abscal"]
     assert ratios["abscal"] - 0.5 > 5 * abs(ratios["omnical"] - 0.5)
+
+
+def test_cells_with_the_same_weights_are_solved_together(monkeypatch):
+    """With and without, logcal of noisy data is the same: here with four sets of baselines that are not flagged."""
+    toy = make_toy(LARGE_HEX, noise=0.05)
+    uvd = make_uvdata(toy, n_times=2)
+    flags = np.zeros(to_cube(uvd).shape, bool)
+    flags[:, 4, 20:40] = True
+    flags[1, 7:12, 30:] = True
+    uvd.flag_array = flags.reshape(uvd.data_array.shape)
+    found, calls = {}, []
+    true = RedundantCalibrator.logcal
+    monkeypatch.setattr(RedundantCalibrator, "logcal", lambda *args, **more: (calls.append(1), true(*args, **more))[1])
+    for cells in (redcal.CELLS_OF_A_SET, 10**9):
+        monkeypatch.setattr(redcal, "CELLS_OF_A_SET", cells)
+        result = run_calibrator(Redcal(steps=("firstcal", "logcal")), uvd, sky_of(uvd, toy.foregrounds))
+        found[cells] = result.gains.gain_array
+    assert len(calls) == 4 + 1
+    together, apart = found.values()
+    np.testing.assert_allclose(together, apart, rtol=1e-10)
 
 
 def test_abscal_turns_the_sky_to_where_the_model_has_it():
