@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from scipy.spatial.distance import pdist, squareform
 from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
 from calstudy.instrument.hera import SPACING, core_positions, outrigger_positions
-from calstudy.instrument.sites import SITES, earth_location
+from calstudy.instrument.sites import SITES, earth_location, east_north_up
 
 
 def _tiles(receivers: Iterable[int]) -> tuple[str, ...]:
@@ -165,15 +165,15 @@ def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
 
 def _mwa(settings: section.MwaLayout) -> Layout:
     """Tiles from the observatory positions that pyuvdata carries (ECEF relative to the array centre)."""
-    from pyuvdata.utils import ENU_from_ECEF
-
-    with (files("pyuvdata") / "data" / "mwa_ant_pos.csv").open() as table:
+    # Not importlib.resources, which would import the package.
+    package = find_spec("pyuvdata")
+    assert package is not None and package.origin is not None, "a dependency"
+    with (Path(package.origin).parent / "data" / "mwa_ant_pos.csv").open() as table:
         relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
     whole = next(tiles for tiles in MWA_CONFIGURATIONS if set(tiles) >= set(MWA_TILES[settings.kind]))
     tiles = MWA_TILES[settings.kind][: settings.count]
     location = SITES["mwa"]
-    centre = np.array([axis.to_value("m") for axis in location.geocentric])
-    enu = ENU_from_ECEF(centre + [relative[tile] for tile in whole], center_loc=location)
+    enu = east_north_up(np.array([relative[tile] for tile in whole]), location)
     # The table's heights are above the ellipsoid, not the array centre (+377.83 m in all of them).
     enu[:, 2] -= enu[:, 2].mean()
     numbers = np.array([whole.index(tile) for tile in tiles])

@@ -16,7 +16,7 @@ from pyuvdata.utils import ENU_from_ECEF
 from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
 from calstudy.instrument.layouts import GOLOMB_MARKS, make_layout, redundant_groups
-from calstudy.instrument.sites import SITES
+from calstudy.instrument.sites import SITES, east_north_up
 from calstudy.instrument.size import antenna_count, baseline_lengths
 
 
@@ -52,6 +52,16 @@ def test_known_tile_positions():
     assert place["Tile012"][:2] == pytest.approx([-95.365, 270.188], abs=1e-3)
     assert place["HexE01"][:2] == pytest.approx([86.373, 284.121], abs=1e-3)
     assert place["HexS36"][:2] == pytest.approx([32.013, 85.713], abs=1e-3)
+
+
+@pytest.mark.parametrize("site", SITES)
+def test_local_components_are_those_of_pyuvdata(site):
+    place = SITES[site]
+    centre = np.array([axis.to_value("m") for axis in place.geocentric])
+    vectors = np.random.default_rng(1).normal(scale=1e3, size=(20, 3))
+    expected = ENU_from_ECEF(centre + vectors, center_loc=place)
+    # Of coordinates of the order of the Earth's radius, which pyuvdata subtracts.
+    assert east_north_up(vectors, place) == pytest.approx(expected, abs=1e-8)
 
 
 def test_subarrays_are_parts_of_the_whole_array():
