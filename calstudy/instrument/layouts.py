@@ -167,8 +167,8 @@ def _mwa(settings: section.MwaLayout) -> Layout:
     """Tiles from the observatory positions that pyuvdata carries (ECEF relative to the array centre)."""
     # Not importlib.resources, which would import the package.
     package = find_spec("pyuvdata")
-    assert package is not None and package.origin is not None, "a dependency"
-    with (Path(package.origin).parent / "data" / "mwa_ant_pos.csv").open() as table:
+    assert package is not None, "a dependency"
+    with (Path(str(package.origin)).parent / "data" / "mwa_ant_pos.csv").open() as table:
         relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
     whole = next(tiles for tiles in MWA_CONFIGURATIONS if set(tiles) >= set(MWA_TILES[settings.kind]))
     tiles = MWA_TILES[settings.kind][: settings.count]
