@@ -113,7 +113,16 @@ def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
         "machine": machine(),
         **fields,
     }
-    write(folder / MANIFEST, json.dumps(manifest, indent=1))
+    write(folder / MANIFEST, _as_json(manifest))
+
+
+def _as_json(manifest: Mapping[str, Any]) -> str:
+    """Return a manifest as JSON with a line for each product; comparisons have more than a thousand."""
+    if not manifest.get("products"):
+        return json.dumps(manifest, indent=1)
+    text = json.dumps({key: value for key, value in manifest.items() if key != "products"}, indent=1)
+    lines = ",\n  ".join(json.dumps(entry) for entry in manifest["products"])
+    return text.removesuffix("\n}") + f',\n "products": [\n  {lines}\n ]\n}}'
 
 
 RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_bytes", "started", "inputs")
