@@ -19,7 +19,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -149,8 +149,19 @@ class Registry(Generic[P]):
 
     def built_in(self) -> list[str]:
         """Return the names of the built-in things."""
-        found = pkgutil.iter_modules(import_module(self.package).__path__)
-        return sorted(module.name.replace("_", "-") for module in found if not module.name.startswith("_"))
+        return list(self._modules)
+
+    @cached_property
+    def _modules(self) -> dict[str, str]:
+        """The modules of the built-in things, by name."""
+        found = [module.name for module in pkgutil.iter_modules(import_module(self.package).__path__)]
+        names = {name.replace("_", "-"): f"{self.package}.{name}" for name in found if not name.startswith("_")}
+        return dict(sorted(names.items()))
+
+    @cached_property
+    def _found(self) -> dict[str, type[P]]:
+        """The classes of built-in things that were asked for; plans of comparisons ask ten thousand times."""
+        return {}
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""
@@ -175,8 +186,10 @@ class Registry(Generic[P]):
         """
         if (file := FILE_REFERENCE.fullmatch(reference)) is not None:
             return self._in(load_file(Path(file["path"])), reference, file["name"])
-        if reference in self.built_in():
-            return self._in(import_module(f"{self.package}.{reference.replace('-', '_')}"), reference)
+        if reference in self._modules:
+            if reference not in self._found:
+                self._found[reference] = self._in(import_module(self._modules[reference]), reference)
+            return self._found[reference]
         if reference in (installed := self.installed()):
             with user_code(reference):
                 found = installed[reference].load()
@@ -283,7 +296,7 @@ class Registry(Generic[P]):
         file = FILE_REFERENCE.fullmatch(reference)
         if file is not None:
             return f"sha256:{digest_file(Path(file['path']))}:{file['name'] or ''}"
-        if reference in self.built_in():
+        if reference in self._modules:
             version = self.find(reference).version
             return reference if version == 1 else f"{reference}@{version}"
         point = self.installed().get(reference)
