@@ -139,6 +139,8 @@ class Registry(Generic[P]):
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind") -> None:
         self.noun, self.package, self.base_path, self.tag = noun, package, base_path, tag
         self.group = f"calstudy.{noun}s"
+        # Of built-in things that were asked for: plans of comparisons ask ten thousand times.
+        self._found: dict[str, type[P]] = {}
         self.a_noun = f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
 
     @property
@@ -157,11 +159,6 @@ class Registry(Generic[P]):
         found = [module.name for module in pkgutil.iter_modules(import_module(self.package).__path__)]
         names = {name.replace("_", "-"): f"{self.package}.{name}" for name in found if not name.startswith("_")}
         return dict(sorted(names.items()))
-
-    @cached_property
-    def _found(self) -> dict[str, type[P]]:
-        """The classes of built-in things that were asked for; plans of comparisons ask ten thousand times."""
-        return {}
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""

@@ -20,6 +20,8 @@ COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, styl
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 LINEAR = {"recovered": 1.0, "bias": 0.1}
 """An axis is linear up to this, and logarithmic beyond where there is more."""
+REFERENCE = {"recovered": 1.0, "bias": 0.0}
+"""Where a line is drawn: all of the EoR, no bias."""
 DECADES = {"recovered": 1.5, "bias": 0.7}
 """As long as so many decades is the linear part of a logarithmic axis."""
 ROW_HEIGHT, LARGEST_K = 1.7, 1.0
@@ -60,8 +62,8 @@ def draw_spectra(
             _draw_points(right, case, "bias", place, shift)
         _scale(left, "recovered")
         _scale(right, "bias")
-        left.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
-        right.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
+        left.axhline(REFERENCE["recovered"], color=style.GREY, linewidth=0.7, zorder=0)
+        right.axhline(REFERENCE["bias"], color=style.GREY, linewidth=0.7, zorder=0)
         left.set_title(world, loc="left")
         left.set_ylabel(r"$P^R / P^S$")
         right.set_ylabel(r"$s^2 P^{R_0} / P^S$")
@@ -83,9 +85,9 @@ def _draw_points(axes: Axes, case: Case, name: str, place: int, shift: float) ->
 
 
 def _scale(axes: Axes, name: str) -> None:
-    """Make an axis logarithmic where its values are large, with limits that they fill."""
+    """Make an axis logarithmic where its values are large, with limits just beyond them, zero and the reference."""
     low, high = axes.dataLim.intervaly
-    low = min(low, 0.0)
+    low, high = min(low, 0.0), max(high, REFERENCE[name])
     if max(-low, high) <= 2 * LINEAR[name]:
         return
     axes.set_yscale("symlog", linthresh=LINEAR[name], linscale=DECADES[name])

@@ -165,7 +165,7 @@ def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
 
 def _mwa(settings: section.MwaLayout) -> Layout:
     """Tiles from the observatory positions that pyuvdata carries (ECEF relative to the array centre)."""
-    # Not importlib.resources, which would import the package.
+    # Not importlib.resources, which would import the package: a second of every plan.
     package = find_spec("pyuvdata")
     assert package is not None, "a dependency"
     with (Path(str(package.origin)).parent / "data" / "mwa_ant_pos.csv").open() as table:

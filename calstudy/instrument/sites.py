@@ -39,7 +39,7 @@ def earth_location(site: Site | Coordinates) -> EarthLocation:
 def east_north_up(vectors: np.ndarray, place: EarthLocation) -> np.ndarray:
     """Return geocentric vectors (N, 3) by their components to the east, the north and up at a place.
 
-    `pyuvdata.utils.ENU_from_ECEF` does the same; importing it takes a second, a fifth of what a plan does.
+    `pyuvdata.utils.ENU_from_ECEF` does the same; importing it takes a second, a fifth of the time of a plan.
     """
     longitude, latitude = place.lon.rad, place.lat.rad
     up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]

@@ -8,54 +8,89 @@ import numpy as np
 from pyuvdata import UVData
 
 from calstudy.base.errors import InputError
+from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
 from calstudy.measured.settings import Interference
 
+CELL, CHANNEL, INTEGRATION = 0.2, 0.05, 0.5
+"""Fractions of baselines from which on a channel of an integration, a channel and an integration are flagged: those of
+HERA's first season, which took the rms over integrations, and over channels, where the mean is taken here."""
+LEAST_INTEGRATIONS, LEAST_CHANNELS = 3, 17
+"""With fewer there are no surroundings: hera_qm takes eight samples to each side."""
 NAMED = 8
-"""So many ranges of channels are named in a note."""
+"""At most this many ranges of channels are named in a note."""
 
 
 def flag_interference(data: UVData, settings: Interference) -> str:
     """Flag interference in all baselines and polarizations; return in words what was flagged.
 
-    Of each cross-correlation |V| is compared with the median of its surroundings, and with their scatter. A channel of
-    an integration is flagged if it stands out in a fifth of the baselines; a channel if it is flagged in a twentieth of
-    the integrations; an integration if half of its channels are (`hera_qm.xrfi.xrfi_h1c_pipe`, the flagging of HERA's
-    first season; Kerrigan et al. 2019 describe and compare it). Autocorrelations do not take part: their noise is so
-    low that the bandpass stands out.
+    Of each cross-correlation |V| is compared with the median of its surroundings, and with their scatter
+    (`hera_qm.xrfi.xrfi_waterfall`). A channel of an integration is flagged if it stands out in a fifth of the baselines
+    that have it, in any polarization; the channel if the mean of this fraction over all integrations is a twentieth;
+    the integration if the mean over all channels is a half.
+    Autocorrelations do not take part: their noise is so low that the bandpass stands out.
 
     Parameters
     ----------
     data
-        Changed; samples that are flagged do not count, and stay flagged.
+        Rectangular and time-major; changed. Samples that are flagged do not take part, and stay flagged.
     settings
         How far samples must stand out.
 
     Raises
     ------
     InputError
-        If there are only autocorrelations.
+        If there are only autocorrelations, or too few integrations or channels that are not flagged.
     """
-    from hera_qm.xrfi import xrfi_h1c_pipe
-
-    crosses = np.flatnonzero(data.ant_1_array != data.ant_2_array)
-    if not crosses.size:
+    pairs = antenna_pairs(data)
+    crosses = pairs[:, 0] != pairs[:, 1]
+    if not crosses.any():
         raise InputError("interference is looked for in cross-correlations, and the data hold none")
-    searched = data.select(blt_inds=crosses, inplace=False, run_check=False)
-    searched.data_array[searched.flag_array | ~np.isfinite(searched.data_array)] = 0
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # Few integrations, and surroundings without scatter, are what it tells of.
-        warnings.simplefilter("ignore")
-        found = xrfi_h1c_pipe(
-            searched, sig_init=settings.significance, sig_adj=settings.adjacent_significance, run_check=False
-        )[1]
-    hit = found.flag_array.any(axis=2)
-    rows = np.searchsorted(found.time_array, data.time_array)
-    before = data.flag_array.mean()
-    data.flag_array |= hit[rows][..., None]
-    added = data.flag_array.mean() - before
-    ranges = _ranges(np.ravel(data.freq_array), hit.mean(axis=0) > 0.5)
-    where = f", most of {', '.join(ranges)}" if ranges else ""
-    return f"Interference: {100 * added:.2g} % of the samples were flagged{where} (by hera_qm)."
+    cube, flags = to_cube(data), flag_cube(data)
+    known = ~flags[:, crosses] & np.isfinite(cube[:, crosses])
+    times, channels = int(known.any(axis=(1, 2, 3)).sum()), int(known.any(axis=(0, 1, 3)).sum())
+    if times < LEAST_INTEGRATIONS or channels < LEAST_CHANNELS:
+        raise InputError(
+            f"{times} integrations and {channels} channels are not flagged; to look for interference takes at least "
+            f"{LEAST_INTEGRATIONS} and {LEAST_CHANNELS}"
+        )
+    found = np.zeros((data.Ntimes, data.Nfreqs), bool)
+    for index in range(data.Npols):
+        found |= _cells(np.abs(cube[..., index][:, crosses]), known[..., index], settings)
+    added = found[:, None, :, None] & ~flags
+    flags |= added
+    ranges = _ranges(np.ravel(data.freq_array), added.any(axis=(1, 3)).mean(axis=0) > 0.5)
+    where = f", in more than half of the integrations at {', '.join(ranges)}" if ranges else ""
+    return f"Interference: {100 * added.mean():.1f} % of the samples were flagged by hera_qm{where}."
+
+
+def _cells(amplitudes: np.ndarray, known: np.ndarray, settings: Interference) -> np.ndarray:
+    """Return what is to be flagged, (Ntimes, Nfreqs), for |V| and what is known of it, (Ntimes, Nbls, Nfreqs)."""
+    from hera_qm.xrfi import xrfi_waterfall
+
+    hits = np.zeros(known.shape, bool)
+    for baseline in range(known.shape[1]):
+        seen = known[:, baseline]
+        # What is flagged altogether is left out; otherwise it would be the surroundings of its neighbours.
+        part = np.ix_(seen.any(axis=1), seen.any(axis=0))
+        if min(seen[part].shape) < LEAST_INTEGRATIONS:
+            continue
+        values = _filled(amplitudes[:, baseline][part].astype(float), seen[part])
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            # It tells that few integrations are less than its box.
+            warnings.simplefilter("ignore")
+            stand_out = xrfi_waterfall(values, nsig_init=settings.significance, nsig_adj=settings.adjacent_significance)
+        hits[:, baseline][part] = stand_out & seen[part]
+    part_of_baselines = hits.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    by_channel, by_integration = (part_of_baselines.mean(axis=axis) for axis in (0, 1))
+    return (part_of_baselines >= CELL) | (by_channel >= CHANNEL) | (by_integration >= INTEGRATION)[:, None]
+
+
+def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return |V| of a baseline, (Ntimes, Nfreqs), over its median, interpolated in frequency where it is not known."""
+    channels = np.arange(values.shape[1])
+    for row, there in zip(values, known, strict=True):
+        row[~there] = np.interp(channels[~there], channels[there], row[there])
+    return values / (np.median(values) or 1.0)
 
 
 def _ranges(frequencies: np.ndarray, chosen: np.ndarray) -> list[str]:

@@ -16,6 +16,7 @@ from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, choice, fault
+from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import apply_scale, dump, override, parse_override, validate
 from calstudy.experiment.messages import sentences
@@ -255,8 +256,8 @@ def load_comparison(
     scale
         Name of a set of changes in the `scales` of the file, of the experiment, or of both.
     overrides
-        ``path=value`` texts. Those that begin with a key of `OWN` change the file, such as ``worlds={ideal: {}}``; all
-        others are applied to the experiment of every case.
+        ``path=value`` texts. Those that begin with a key of `OWN` change the file, such as ``worlds={ideal: {}}`` or
+        ``calibrators.redcal.max_steps=50``; all others are applied to the experiment of every case.
     calibrators
         In place of those of the file.
 
@@ -271,7 +272,7 @@ def load_comparison(
     data = apply_scale(data, own)
     changes = dict(parse_override(text) for text in overrides)
     for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
-        data = override(data, dotted, changes.pop(dotted))
+        data = _changed(data, dotted, changes.pop(dotted))
     if calibrators is not None:
         data[KEY] = dict(calibrators)
     folder = path.resolve().parent
@@ -290,6 +291,26 @@ def load_comparison(
     figures = [figure.model_dump(mode="json") for figure in _shown(file)]
     said = {"name": file.name, "description": file.description, "experiment": _complete(base, origin), "worlds": worlds}
     return Comparison(file, cases, {**said, "calibrators": dict(file.calibrators), "figures": figures})
+
+
+def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """Return a comparison's content with one of its own keys changed: as a whole, an entry by its label, or its field.
+
+    Labels may have dots. Fields of a world are dotted paths themselves.
+    """
+    key, _, rest = path.partition(".")
+    if not rest:
+        return {**data, key: value}
+    entries = data.get(key)
+    if key not in (KEY, "worlds") or not isinstance(entries, Mapping):
+        raise InputError(f"--set {path}: set {key} as a whole")
+    label = max((known for known in entries if f"{rest}.".startswith(f"{known}.")), key=len, default=rest)
+    field, entry = rest[len(label) + 1 :], entries.get(label)
+    if field and isinstance(entry, str):
+        entry = {CALIBRATORS.tag: entry}
+    if field:
+        value = {**(entry or {}), field: value} if key == "worlds" else override(entry or {}, field, value)
+    return {**data, key: {**entries, label: value}}
 
 
 def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -177,6 +177,15 @@ def test_worlds_and_calibrators_can_be_set_as_fields_of_the_experiment_can(tmp_p
     assert [case.calibrator for case in study.cases] == list(CALIBRATORS)
     assert {case.experiment.sky.eor.seed for case in study.cases} == {9}
     assert study.folder.name.startswith("mine-")
+    fields = ["worlds.flux 2.5 Jy.sky.foregrounds.flux_limit=2.5 Jy", "calibrators.sky-based.solver.max_steps=7"]
+    path = comparison_file(tmp_path, worlds={"ideal": {}, "flux 2.5 Jy": {"sky.eor.seed": 4}})
+    cases = {(case.calibrator, case.world): case.experiment for case in load_study(path, overrides=fields).cases}
+    changed, other = cases["sky-based", "flux 2.5 Jy"], cases["trusting", "ideal"]
+    assert (changed.sky.foregrounds.flux_limit, changed.sky.eor.seed) == (2.5, 4)
+    assert changed.sky.foregrounds.count == other.sky.foregrounds.count
+    assert changed.calibration.solver.max_steps == 7 != other.calibration.solver.max_steps
+    with pytest.raises(InputError, match=r"^--set figures\.0: set figures as a whole$"):
+        load_study(path, overrides=["figures.0=comparison-matrix"])
     with pytest.raises(ExperimentError, match=r"sky\.eor\.sed"):
         load_study(comparison_file(tmp_path), overrides=["worlds={ideal: {sky.eor.sed: 9}}"])
 

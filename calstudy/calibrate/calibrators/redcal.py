@@ -33,7 +33,8 @@ STEP_LENGTH, CHECK_EVERY = 0.3, 10
 """Of omnical: part of the way to the next solution, and after how many steps it looks at chi^2."""
 
 CELLS_OF_A_SET = 8
-"""logcal of a set of cells takes as long as that of so many single ones, but for the number of its cells."""
+"""Cells with equal weights are solved together if a set has on average at least so many; each call of logcal has a
+fixed cost."""
 
 Gains = dict[tuple[int, str], np.ndarray]
 Visibilities = dict[tuple[int, int, str], np.ndarray]
@@ -75,7 +76,7 @@ class Redcal(OtherPackage):
         return _undetermined(crosses.antennas, groups)
 
     def cost(self, size: Size) -> Cost:
-        """Return what the solves take, for some hundred steps of omnical; cells with other weights cost more."""
+        """Return what the solves take, for some hundred steps of omnical; flags that differ in all cells cost more."""
         cells = size.channels.count * size.times * size.polarizations
         alike = isinstance(self.weights, FlagWeights) or "logcal" not in self.steps
         seconds = 5 + (4e-6 if alike else 1.5e-5) * size.samples + (1e-3 * cells if "abscal" in self.steps else 0)
