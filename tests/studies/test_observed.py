@@ -271,6 +271,41 @@ def test_flagged_channels_do_not_enter(simulated, folder):
     np.testing.assert_allclose(power(found["clean"]), power(found["interference"]), rtol=1e-12)
 
 
+@pytest.mark.parametrize("said", [True, {"significance": 8}])
+def test_interference_is_flagged_in_both_halves(simulated, folder, said):
+    """It is looked for in all integrations together, so that halves have the same channels."""
+    data = measurement(simulated, "even")
+    to_cube(data)[:, :, 20] += 1e4
+    data.write_uvh5(folder / "spoiled.uvh5", clobber=True)
+    found = halves(folder, f"spoiled-{said is True}", {"data": "spoiled.uvh5", "flag_interference": said})
+    even, odd = (flag_cube(found[parity]).all(axis=(0, 1, 3)) for parity in PARITIES)
+    assert even[20]
+    np.testing.assert_array_equal(even, odd)
+    assert even.mean() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        (5, "observed.flag_interference = 5: must be a block of keys"),
+        ({"significance": 0.5}, "observed.flag_interference.significance = 0.5"),
+        ({"sigma": 5}, "observed.flag_interference.sigma: unknown key"),
+    ],
+)
+def test_a_search_for_interference_that_cannot_be_meant_is_refused(simulated, folder, said, told):
+    measurement(simulated, "even").write_uvh5(folder / "refused.uvh5", clobber=True)
+    with pytest.raises(ExperimentError) as error:
+        halves(folder, "refused", {"data": "refused.uvh5", "flag_interference": said})
+    assert told in str(error.value)
+
+
+def test_false_and_null_are_no_search(simulated, folder):
+    measurement(simulated, "even").write_uvh5(folder / "as-given.uvh5", clobber=True)
+    for said in (False, None):
+        study = load_study(observed_file(folder, "as-given", {"data": "as-given.uvh5", "flag_interference": said}))
+        assert "interference" not in observed_task(study.graph, "even").settings
+
+
 def test_feeds_that_are_named_otherwise_are_the_same(simulated, folder):
     """x to the north in the file: its east-west feeds are y, and what was xx is yy."""
     data = measurement(simulated, "even")
