@@ -23,7 +23,7 @@ LINEAR = {"recovered": 1.0, "bias": 0.1}
 REFERENCE = {"recovered": 1.0, "bias": 0.0}
 """Where a line is drawn: all of the EoR, no bias."""
 DECADES = {"recovered": 1.5, "bias": 0.7}
-"""As long as so many decades is the linear part of a logarithmic axis."""
+"""Length of the linear part of a logarithmic axis, in decades."""
 ROW_HEIGHT, LARGEST_K = 1.7, 1.0
 
 

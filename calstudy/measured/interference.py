@@ -12,12 +12,21 @@ from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
 from calstudy.measured.settings import Interference
 
 CELL, CHANNEL, INTEGRATION = 0.2, 0.05, 0.5
-"""Fractions of baselines from which on a channel of an integration, a channel and an integration are flagged: those of
-HERA's first season, which took the rms over integrations, and over channels, where the mean is taken here."""
+"""Fractions of samples that stand out, from which on a channel of an integration, a channel, and an integration are
+flagged: those of HERA's first season (`hera_qm.xrfi.xrfi_h1c_pipe`, with the rms of the fractions of baselines)."""
 LEAST_INTEGRATIONS, LEAST_CHANNELS = 3, 17
 """With fewer there are no surroundings: hera_qm takes eight samples to each side."""
 NAMED = 8
 """At most this many ranges of channels are named in a note."""
+
+
+def require_surroundings(integrations: int, channels: int) -> None:
+    """Raise InputError unless so many integrations and channels, that are not flagged, have surroundings."""
+    if integrations < LEAST_INTEGRATIONS or channels < LEAST_CHANNELS:
+        raise InputError(
+            f"flag_interference: takes at least {LEAST_INTEGRATIONS} integrations and {LEAST_CHANNELS} channels that "
+            f"are not flagged, and the data have {integrations} and {channels}"
+        )
 
 
 def flag_interference(data: UVData, settings: Interference) -> str:
@@ -25,9 +34,8 @@ def flag_interference(data: UVData, settings: Interference) -> str:
 
     Of each cross-correlation |V| is compared with the median of its surroundings, and with their scatter
     (`hera_qm.xrfi.xrfi_waterfall`). A channel of an integration is flagged if it stands out in a fifth of the baselines
-    that have it, in any polarization; the channel if the mean of this fraction over all integrations is a twentieth;
-    the integration if the mean over all channels is a half.
-    Autocorrelations do not take part: their noise is so low that the bandpass stands out.
+    that have it, in any polarization; a channel if a twentieth of all its samples stand out; an integration if half of
+    all its samples do. Autocorrelations do not take part: their noise is so low that the bandpass stands out.
 
     Parameters
     ----------
@@ -44,15 +52,11 @@ def flag_interference(data: UVData, settings: Interference) -> str:
     pairs = antenna_pairs(data)
     crosses = pairs[:, 0] != pairs[:, 1]
     if not crosses.any():
-        raise InputError("interference is looked for in cross-correlations, and the data hold none")
+        raise InputError("flag_interference: is for cross-correlations, and the data hold none")
     cube, flags = to_cube(data), flag_cube(data)
     known = ~flags[:, crosses] & np.isfinite(cube[:, crosses])
     times, channels = int(known.any(axis=(1, 2, 3)).sum()), int(known.any(axis=(0, 1, 3)).sum())
-    if times < LEAST_INTEGRATIONS or channels < LEAST_CHANNELS:
-        raise InputError(
-            f"{times} integrations and {channels} channels are not flagged; to look for interference takes at least "
-            f"{LEAST_INTEGRATIONS} and {LEAST_CHANNELS}"
-        )
+    require_surroundings(times, channels)
     found = np.zeros((data.Ntimes, data.Nfreqs), bool)
     for index in range(data.Npols):
         found |= _cells(np.abs(cube[..., index][:, crosses]), known[..., index], settings)
@@ -80,9 +84,10 @@ def _cells(amplitudes: np.ndarray, known: np.ndarray, settings: Interference) ->
             warnings.simplefilter("ignore")
             stand_out = xrfi_waterfall(values, nsig_init=settings.significance, nsig_adj=settings.adjacent_significance)
         hits[:, baseline][part] = stand_out & seen[part]
-    part_of_baselines = hits.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    by_channel, by_integration = (part_of_baselines.mean(axis=axis) for axis in (0, 1))
-    return (part_of_baselines >= CELL) | (by_channel >= CHANNEL) | (by_integration >= INTEGRATION)[:, None]
+    cells, channels, integrations = (
+        hits.sum(axis=axes) / np.maximum(known.sum(axis=axes), 1) for axes in (1, (0, 1), (1, 2))
+    )
+    return (cells >= CELL) | (channels >= CHANNEL) | (integrations >= INTEGRATION)[:, None]
 
 
 def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:

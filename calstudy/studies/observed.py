@@ -25,6 +25,7 @@ from calstudy.figures import ObservedFigure, observed_task
 from calstudy.instrument.interface import model_of
 from calstudy.measured.defaults import with_defaults
 from calstudy.measured.halves import PARITIES, modelled, read_facts, require_same_sky
+from calstudy.measured.interference import require_surroundings
 from calstudy.measured.settings import InjectionSettings, ObservedSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.products.observed import Halves, ObservedGraph
@@ -119,9 +120,13 @@ class ObservedStudy(Study):
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the study itself and the number of workers.
 
-        Raises InputError if the beam or the memory do not do, or the calibrator refuses the data.
+        Raises InputError if the beam or the memory do not do, the calibrator refuses the data, or they are too few for
+        a search for interference.
         """
         section = self.file.observed
+        if section.flag_interference is not None:
+            for facts in self.halves.facts.values():
+                require_surroundings(facts.times.size, facts.frequencies.size)
         with guarded(section.beam):
             model_of(section.beam).require_usable(self.halves.facts["even"].channels)
         for parity in PARITIES[:1] if self.halves.interleaved else PARITIES:

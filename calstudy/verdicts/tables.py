@@ -97,7 +97,8 @@ def number(value: float, uncertainty: float | None = None) -> str:
         return f"{value:.3g}"
     places = max(0, 1 - math.floor(math.log10(uncertainty)))
     size = f"{value:.3g}" if abs(value) >= LARGE else f"{value:.{places}f}"
-    return f"{size} ± {uncertainty:.2g}"
+    plain = uncertainty >= 100 and abs(value) < LARGE
+    return f"{size} ± {uncertainty:.0f}" if plain else f"{size} ± {uncertainty:.2g}"
 
 
 def measured(verdict: Verdict) -> str:

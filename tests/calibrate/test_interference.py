@@ -117,7 +117,7 @@ def test_the_unit_of_the_data_does_not_matter(clean):
     np.testing.assert_array_equal(*found)
 
 
-def test_a_burst_in_many_integrations_leaves_its_channel(clean):
+def test_a_burst_in_one_of_many_integrations_leaves_its_channel(clean):
     """Of 24 integrations one is less than a twentieth, and the channel stays."""
     data = clean.copy()
     to_cube(data)[7, :, 15] *= 50
@@ -127,11 +127,22 @@ def test_a_burst_in_many_integrations_leaves_its_channel(clean):
     assert flags.sum() < 6
 
 
-@pytest.mark.parametrize(("times", "told"), [(1, "1 integrations and 64 channels"), (2, "2 integrations")])
+@pytest.mark.parametrize(("times", "told"), [(1, "the data have 1 and 64"), (2, "the data have 2 and 64")])
 def test_too_few_integrations_are_refused(clean, times, told):
     data = clean.select(times=np.unique(clean.time_array)[:times], inplace=False)
     with pytest.raises(InputError, match=told):
         flag_interference(data, Interference())
+
+
+def test_the_fractions_are_of_samples_that_are_not_flagged(clean):
+    """A station in a tenth of the baselines: its channel is flagged, also if most integrations are flagged before."""
+    data = clean.copy()
+    to_cube(data)[:, :3, ALWAYS] *= 50
+    flag_cube(data)[6:] = True
+    flag_interference(data, Interference())
+    flags = flag_cube(data)[:6, 0, :, 0]
+    assert flags[:, ALWAYS].all()
+    assert flags.mean() < 0.05
 
 
 def test_three_integrations_of_noise_are_enough(clean):
@@ -156,5 +167,5 @@ def test_the_stations_that_hera_sees_are_found():
 def test_autocorrelations_alone_are_refused(clean):
     autos = clean.copy()
     autos.ant_2_array = autos.ant_1_array.copy()
-    with pytest.raises(InputError, match="interference is looked for in cross-correlations"):
+    with pytest.raises(InputError, match="is for cross-correlations, and the data hold none"):
         flag_interference(autos, Interference())

@@ -32,7 +32,7 @@ from calstudy.products.selection import read_gains
 from calstudy.run.task import Job
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Run, run_study
+from calstudy.studies.study import Budget, Run, run_study
 
 ANTENNAS, TIMES, CHANNELS = 12, 4, 48
 CALIBRATION = {"prior": "gains", "solver": {"name": "gauss-newton", "max_steps": 500}, "chunks": 1}
@@ -297,6 +297,13 @@ def test_a_search_for_interference_that_cannot_be_meant_is_refused(simulated, fo
     with pytest.raises(ExperimentError) as error:
         halves(folder, "refused", {"data": "refused.uvh5", "flag_interference": said})
     assert told in str(error.value)
+
+
+def test_a_plan_refuses_to_look_for_interference_in_two_integrations(simulated, folder):
+    measurement(simulated, "even").write_uvh5(folder / "short.uvh5", clobber=True)
+    observed = {"data": "short.uvh5", "flag_interference": True, "select": {"times": "0..1"}}
+    with pytest.raises(InputError, match=r"flag_interference: takes at least 3 integrations.*the data have 2 and 48"):
+        load_study(observed_file(folder, "short", observed)).fitted(Budget())
 
 
 def test_false_and_null_are_no_search(simulated, folder):
