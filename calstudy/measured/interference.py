@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pyuvdata import UVData
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
 from calstudy.measured.settings import Interference
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
 
 CELL, CHANNEL, INTEGRATION = 0.2, 0.05, 0.5
 """Fractions of samples that stand out, from which on a channel of an integration, a channel, and an integration are
