@@ -5,7 +5,13 @@ from __future__ import annotations
 import re
 from functools import cached_property
 from importlib.metadata import version as version_of
+from pathlib import Path
 from typing import Any
+
+import nbformat
+
+NOTEBOOK_OUTPUTS = Path(__file__).parents[1] / "build" / "notebooks"
+"""Where `pytest -m notebook --notebook-outputs build/notebooks` leaves the notebooks as it ran them."""
 
 project = "calstudy"
 author = "The calstudy developers"
@@ -38,7 +44,7 @@ html_title = "calstudy"
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-# Notebooks are run by tests, at a reduced scale.
+# Notebooks are run by tests, at a reduced scale; see `show_outputs`.
 nb_execution_mode = "off"
 
 apidoc_modules = [
@@ -77,7 +83,41 @@ def skip_values(app: Any, what: str, name: str, thing: Any, skip: bool, options:
     return None if computed or what != "class" else True
 
 
+def show_outputs(app: Any, docname: str, source: list[str]) -> None:
+    """Give a notebook the outputs that its test left, if any, and say on the page at which scale they were made."""
+    if not docname.startswith("notebooks/"):
+        return
+    executed = NOTEBOOK_OUTPUTS / f"{Path(docname).name}.ipynb"
+    app.env.note_dependency(str(executed))
+    notebook = nbformat.reads(source[0], as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    told = "The cells of this page were not run when the site was built, so that there are no outputs."
+    if executed.is_file():
+        ran = [cell for cell in nbformat.read(executed, as_version=4).cells if cell.cell_type == "code"]
+        given = [cell for cell in ran if "injected-parameters" in cell.metadata.get("tags", [])]
+        ran = [cell for cell in ran if cell not in given]
+        # Outputs of an earlier version of the notebook are not shown.
+        if [cell.source for cell in ran] == [cell.source for cell in code]:
+            for cell, its in zip(code, ran, strict=True):
+                cell.outputs, cell.execution_count = its.outputs, its.execution_count
+            told = _scale(given[0].metadata["reduced"])
+    notebook.cells.insert(1, nbformat.v4.new_markdown_cell(f"```{{note}}\n{told}\n```"))
+    source[0] = nbformat.writes(notebook)
+
+
+def _scale(reduced: list[str]) -> str:
+    """Say at which scale outputs were made."""
+    if not reduced:
+        return "The outputs on this page are those of the notebook as it is."
+    listed = "\n".join(f"- `{field}`" for field in reduced)
+    return (
+        "The outputs on this page were made at a reduced scale, for which these fields were set besides. Numbers and "
+        f"conclusions in the text are those of the notebook as it is.\n\n{listed}"
+    )
+
+
 def setup(app: Any) -> None:
-    """Register what happens to docstrings."""
+    """Register what happens to notebooks and docstrings."""
+    app.connect("source-read", show_outputs)
     app.connect("autodoc-skip-member", skip_values)
     app.connect("autodoc-process-docstring", escape_mathematics, priority=100)

@@ -19,6 +19,11 @@ settings.register_profile("any-machine", deadline=None, suppress_health_check=[H
 settings.load_profile("any-machine")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add where notebooks are left as they ran, from where the documentation takes their outputs."""
+    parser.addoption("--notebook-outputs", metavar="FOLDER", help="write notebooks that were run to this folder")
+
+
 @pytest.fixture
 def template() -> UVData:
     """A small observation without data."""

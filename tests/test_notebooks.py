@@ -56,7 +56,7 @@ def test_a_notebook_is_stored_clean(path):
 
 @pytest.mark.notebook
 @notebooks
-def test_a_notebook_runs(path, tmp_path):
+def test_a_notebook_runs(path, tmp_path, request):
     """Parameters are injected as papermill does: by a cell after the tagged one."""
     notebook = nbformat.read(path, as_version=4)
     place = next(i for i, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", []))
@@ -66,7 +66,8 @@ def test_a_notebook_runs(path, tmp_path):
         *REDUCED.get(path.stem, []),
     ]
     values = f"EXPERIMENTS = {str(EXPERIMENTS)!r}\nOVERRIDES = {overrides!r}\nWORKERS = 1"
-    notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(values))
+    told = {"tags": ["injected-parameters"], "reduced": REDUCED.get(path.stem, [])}
+    notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(values, metadata=told))
     nbclient.NotebookClient(notebook, timeout=1200, resources={"metadata": {"path": str(tmp_path)}}).execute()
     images = [
         output
@@ -76,3 +77,8 @@ def test_a_notebook_runs(path, tmp_path):
         if "image/png" in output.get("data", {})
     ]
     assert images
+    if folder := request.config.getoption("--notebook-outputs"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        # Outputs name folders of the test where a reader's lie beside the notebooks.
+        text = nbformat.writes(notebook).replace(str(tmp_path), "..")
+        (Path(folder) / path.name).write_text(text, encoding="utf-8")

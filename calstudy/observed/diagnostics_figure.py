@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from scipy.signal.windows import blackmanharris
 
 from calstudy.plotting import style
@@ -18,6 +18,8 @@ from calstudy.power.delay import horizon_delay
 NOTE_CHARACTERS = 150
 MAX_NAMES = 20
 LINEAR_RANGE = 5.0
+SHORT_AXIS = 100.0
+LABELLED_DIGITS = (2, 3, 5)
 MAX_ANTENNAS = 8
 """Gains are drawn of at most so many antennas; more would be a tangle."""
 
@@ -116,6 +118,8 @@ def draw_diagnostics(found: Diagnostics, notes: Sequence[str] = ()) -> Figure:
         grid[key].margins(x=0)
     _make_logarithmic(grid["a"], np.abs(found.gains))
     _draw_chi2([grid[key] for key in "xyz"], found)
+    for axes in grid.values():
+        _label_between_powers(axes)
     grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, title="antenna", title_fontsize=style.SMALL_SIZE)
     if notes:
         lines = [line for note in notes for line in textwrap.wrap(note, width=NOTE_CHARACTERS)]
@@ -168,6 +172,23 @@ def _make_logarithmic(axes: Axes, values: np.ndarray) -> None:
         axes.set_yscale("log")
 
 
+def _label_between_powers(axes: Axes) -> None:
+    """Label 0.2, 0.3 and 0.5 of a logarithmic vertical axis that is shorter than two decades.
+
+    The default labels, such as 6 × 10⁻¹, are so wide that a constrained layout finds no room for the axes.
+    """
+    if axes.get_yscale() != "log":
+        return
+    low, high = axes.get_ylim()
+    short = high < SHORT_AXIS * low
+    axes.yaxis.set_minor_formatter(FuncFormatter(_label_one_digit) if short else NullFormatter())
+
+
+def _label_one_digit(value: float, _: float) -> str:
+    digit = round(value / 10 ** np.floor(np.log10(value)))
+    return f"{value:g}" if digit in LABELLED_DIGITS else ""
+
+
 def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
     antennas = np.arange(found.chi2_antennas.size)
     integrations = np.arange(found.chi2_by_integration.size)
@@ -189,7 +210,7 @@ def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
         positive = np.where(losses > 0, losses, np.nan)
         axes.plot(positive, color=style.BLUE if converged else style.RED, linewidth=0.7, marker=".", markersize=2)
     good, count = int(np.sum(found.converged)), len(found.converged)
-    visible = any((losses > 0).any() for losses in found.losses)
-    axes.set(xlabel="step", ylabel="loss / first loss", yscale="log" if visible else "linear")
+    axes.set(xlabel="step", ylabel="loss / first loss")
+    _make_logarithmic(axes, np.concatenate(found.losses or (np.empty(0),)))
     axes.set_title(f"{good} of {count} solves converged (blue)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
