@@ -16,6 +16,7 @@ import numpy as np
 from calstudy import __version__
 from calstudy.base.errors import InputError, error_number, refusal_of_disk
 from calstudy.calibrate.records import CalibrationResult
+from calstudy.run.store import require_writable
 
 GAINS, CALFITS, MODEL, RESIDUAL = "gains.calh5", "gains.calfits", "model.uvh5", "residual.uvh5"
 SOLUTION, FIGURE, EXPECTED = "solution.json", "diagnostics", "expected-transfer"
@@ -23,7 +24,7 @@ FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
 
 
 def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
-    """Raise InputError if a file that will be written exists and may not be replaced.
+    """Raise InputError if the folder cannot be written, or a file that will be written exists and may not be replaced.
 
     Parameters
     ----------
@@ -42,6 +43,7 @@ def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
         present += [path.name for path in sorted(folder.glob(f"{EXPECTED}.*.h5"))]
     if present and not overwrite:
         raise InputError(f"--output {folder}: holds {', '.join(present)} already; use --overwrite or another folder")
+    require_writable(folder.absolute(), f"--output {folder}")
 
 
 def describe(result: CalibrationResult, context: dict[str, Any]) -> dict[str, Any]:

@@ -54,7 +54,7 @@ def _inside(name: str) -> bool:
     return not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
 
-def require_writable(folder: Path, field: str) -> None:
+def require_writable(folder: Path, name: str) -> None:
     """Raise InputError if a folder cannot be written, or made; tried by a temporary folder in what is there of it.
 
     Permissions alone do not tell: nobody can make a folder in /proc, not even root.
@@ -63,10 +63,9 @@ def require_writable(folder: Path, field: str) -> None:
     ----------
     folder
         Need not exist.
-    field
-        Of the experiment file, for the message.
+    name
+        Of the field or option, with its value, for the message.
     """
-    name = f"{field} = {str(folder)!r}"
     found = folder
     try:
         found = next(path for path in (folder, *folder.parents) if path.exists())
@@ -98,7 +97,7 @@ class Store:
         InputError
             If it cannot.
         """
-        require_writable(self.root, "outputs.store")
+        require_writable(self.root, f"outputs.store = {str(self.root)!r}")
         self.root.mkdir(parents=True, exist_ok=True)
 
     def folder(self, stage: str, key: str) -> Path:

@@ -56,8 +56,8 @@ def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
     store = Store(study.outputs.store)
     plan = schedule(study.targets, store)
     if plan.todo:
-        require_writable(store.root, "outputs.store")
-    require_writable(study.folder.parent, "outputs.runs")
+        require_writable(store.root, f"outputs.store = {str(store.root)!r}")
+    require_writable(study.folder.parent, f"outputs.runs = {str(study.folder.parent)!r}")
     todo = {task.key for task in plan.todo}
     stages = []
     for stage, tasks in _by_stage(study.tasks).items():

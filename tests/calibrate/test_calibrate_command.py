@@ -143,6 +143,14 @@ def test_what_the_memory_does_not_hold_is_refused(command, data, tmp_path):
     assert "--max-memory '5': write a positive number" in command(data, "--max-memory", "5")[1]
 
 
+@pytest.mark.parametrize("output", ["/proc/out", "x" * 300])
+def test_an_output_folder_that_cannot_be_made_is_refused_before_the_data_are_read(output, command):
+    code, error = command("no-such-data.uvh5", "--output", output)
+    assert code == 2
+    assert f"--output {output}: cannot be written" in error or "File name too long" in error
+    assert "no-such-data" not in error
+
+
 @pytest.mark.parametrize("writer", ["write_calh5", "write_uvh5"])
 def test_an_output_folder_that_vanishes_is_told_in_a_sentence(writer, command, data, tmp_path, monkeypatch):
     container = UVCal if writer == "write_calh5" else UVData

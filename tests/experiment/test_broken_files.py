@@ -141,7 +141,7 @@ COMMANDS = [
     (["calibrate", "x", "--solver", "banana"], "calibration.solver"),
     (["calibrate", "x", "--settings", "nowhere.yaml"], "nowhere.yaml: cannot be read"),
     (["calibrate", "x", "--settings", "list.yaml"], "list.yaml"),
-    (["calibrate", "x", "--settings", "empty.yaml"], "calstudy: empty.yaml: must hold a block of keys such as 'calibra"),
+    (["calibrate", "x", "--settings", "empty.yaml"], "calstudy: empty.yaml: must hold a block of keys such as 'cali"),
     (["calibrate", "x" * 300], "cannot be read (File name too long)"),
     (["calibrate", "x", "--gains", "x" * 300], "File name too long"),
     (["calibrate", "x", "--max-memory", "lots"], "write a positive number"),
