@@ -183,15 +183,17 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
 def _cost_of_average(task: Task) -> Cost:
     size = size_of(task)
     disk = size.samples / size.times * COMPLEX128
-    return Cost(1 + size.samples * 5e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
+    return Cost(0.5 + size.samples * 8e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
 
 
 def _cost_of_power(task: Task) -> Cost:
     size = size_of(task)
     # The file of the estimator, the spectra, and what each unit owes to its antennas.
-    return Cost(6, 1.6e9, 4 * size.baselines * size.channels.count * COMPLEX128)
+    return Cost(
+        2 + 1e-5 * size.baselines * size.channels.count, 1.6e9, 4 * size.baselines * size.channels.count * COMPLEX128
+    )
 
 
 AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)
 POWER = Stage(name="power", version=4, make=estimate, cost=_cost_of_power)
-SPECTRA = Stage(name="spectra", version=3, make=average_spectra, cost=lambda task: Cost(10, disk=5e6))
+SPECTRA = Stage(name="spectra", version=3, make=average_spectra, cost=lambda task: Cost(2, disk=5e6))
