@@ -91,11 +91,18 @@ def test_an_experiment_that_cannot_be_read_is_named(file, capsys):
     assert file in message
 
 
+HUGE = [
+    *("--set", "instrument.layout.side=26"),
+    *("--set", "instrument.channels.count=60000"),
+    *("--set", "instrument.channels.width=1 kHz"),
+]
 COMMANDS = [
     (["plan", "file.yaml", "--workers", "99999"], "--workers 99999: at most"),
     (["plan", "file.yaml", "--workers", "0"], "greater than or equal to 1"),
     (["plan", "file.yaml", "--max-memory", "lots"], "--max-memory 'lots': write a positive number"),
     (["plan", "file.yaml", "--max-memory", "-3 GB"], "write a positive number"),
+    # Refused before foreground bases of 60000 channels are made for two million baselines.
+    (["plan", "file.yaml", *HUGE, "--max-memory", "6 GB"], "which take 3,652.3 GB, and there are 6.0 GB of memory"),
     (["plan", "file.yaml", "--max-memory", "1 MB"], "--max-memory leaves"),
     (["plan", "file.yaml", "--scale", "small"], "--scale small: not a scale"),
     (["plan", "file.yaml", "--set", "instrument.channels.width=80 mHz"], "must be at least 100 Hz"),
