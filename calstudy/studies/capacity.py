@@ -89,8 +89,8 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
     need = samples * COMPLEX128
     if need > ABSURD * memory:
         raise InputError(
-            f"the data have {samples:.3g} samples, which take {need / 1e9:,.1f} GB, and there are {memory / 1e9:.1f} GB "
-            "of memory; use fewer antennas, channels or integrations"
+            f"the data have {samples:.3g} samples, which take {need / 1e9:,.1f} GB, and there are "
+            f"{memory / 1e9:.1f} GB of memory; use fewer antennas, channels or integrations"
         )
 
 
