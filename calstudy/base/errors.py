@@ -3,6 +3,23 @@
 from __future__ import annotations
 
 import difflib
+import errno
+import os
+import re
+
+REFUSALS = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.EIO,
+    errno.ESTALE,
+)
+"""What a file system refuses for reasons that no program can know before; a file that is not there is none of them."""
 
 
 class InputError(ValueError):
@@ -18,6 +35,23 @@ class ExperimentError(InputError):
 
     def __reduce__(self) -> tuple:
         return type(self), (self.faults,)
+
+
+def refusal_of_disk(error: OSError | RuntimeError) -> str | None:
+    """Return in words why a file could not be read or written, or None if the file system did not refuse it.
+
+    HDF5 reports a failed write as a RuntimeError or an OSError without errno, with the number in its message.
+    """
+    number = error_number(error)
+    return os.strerror(number) if number in REFUSALS else None
+
+
+def error_number(error: OSError | RuntimeError) -> int | None:
+    """Return the errno of an error, also of one of HDF5; None if it has none."""
+    number = getattr(error, "errno", None)
+    if number is None and (found := re.search(r"errno = (\d+)", str(error))):
+        number = int(found[1])
+    return number
 
 
 def nearest(word: object, allowed: list[str]) -> str:

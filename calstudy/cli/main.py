@@ -16,7 +16,7 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base import ranks
-from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.errors import ExperimentError, InputError, refusal_of_disk
 from calstudy.cli.bench import bench_app
 from calstudy.cli.calibrate import calibrate
 from calstudy.cli.check import check_app
@@ -86,7 +86,9 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def _root(
-    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show it.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
 ) -> None:
     del version
 
@@ -226,6 +228,12 @@ def main() -> None:
         sys.exit(EXIT_INPUT)
     except InputError as error:
         typer.echo(f"calstudy: {error}", err=True)
+        sys.exit(EXIT_INPUT)
+    except OSError as error:
+        reason = refusal_of_disk(error)
+        if reason is None or error.filename is None:
+            raise
+        typer.echo(f"calstudy: {error.filename}: cannot be read or written ({reason})", err=True)
         sys.exit(EXIT_INPUT)
     except KeyboardInterrupt:
         typer.echo("calstudy: interrupted; finished products are kept, the same command resumes", err=True)

@@ -43,7 +43,7 @@ def examples() -> None:
         content = read_mapping(published("experiments") / f"{name}.yaml")
         kind = next((kind for key, kind in KINDS.items() if key in content), "experiment")
         rows.append((name, kind, " ".join(str(content.get("description", "")).split())))
-    Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False))
+    Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False), numbers=False)
 
 
 def init(name: Name = "my-study", example: Example = None, data: Data = None, beam: Beam = "hera") -> None:

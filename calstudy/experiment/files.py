@@ -227,18 +227,21 @@ def _absolute(
         target = getattr(block, field)
         file = base / expand_user(target, f"{prefix}{path}")
         resolved = override(resolved, path, str(file.resolve()))
-        extra = type(block).model_fields[field].json_schema_extra
-        if extra == FOLDER and not file.is_dir():
-            faults.append(f"{prefix}{path} = {str(target)!r}: no such folder (looked for {file})")
-        elif extra != FOLDER and not file.is_file():
-            faults.append(_no_file(f"{prefix}{path}", target, file))
+        folder = type(block).model_fields[field].json_schema_extra == FOLDER
+        faults += _missing(f"{prefix}{path}", target, file, folder)
     if faults:
         raise ExperimentError(faults)
     return resolved
 
 
-def _no_file(field: str, given: Any, file: Path) -> str:
-    return f"{field} = {str(given)!r}: no such file (looked for {file})"
+def _missing(field: str, given: Any, file: Path, folder: bool = False) -> list[str]:
+    """Return a sentence if a file, or a folder, that a field names is not there or cannot be looked at."""
+    try:
+        found = file.is_dir() if folder else file.is_file()
+    except OSError as error:
+        return [f"{field} = {str(given)!r}: cannot be read ({error.strerror}; looked for {file})"]
+    kind = "folder" if folder else "file"
+    return [] if found else [f"{field} = {str(given)!r}: no such {kind} (looked for {file})"]
 
 
 def _require_function(sky: SkySettings, prefix: str = "") -> None:
@@ -284,8 +287,8 @@ def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
     prefix = f"{FIELD}."
     if SKY_MODEL in changes:
         file = base / expand_user(Path(changes[SKY_MODEL]), f"{prefix}{SKY_MODEL}")
-        if not file.is_file():
-            raise ExperimentError([_no_file(f"{prefix}{SKY_MODEL}", changes[SKY_MODEL], file)])
+        if faults := _missing(f"{prefix}{SKY_MODEL}", changes[SKY_MODEL], file):
+            raise ExperimentError(faults)
         resolved = {SKY_MODEL: file.resolve()}
     else:
         world = assumed_world(experiment, base)
@@ -346,6 +349,8 @@ def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) ->
     data = apply_scale(content, scale)
     for text in overrides:
         data = override(data, *parse_override(text))
+    if data.get("scales") != content.get("scales"):
+        _require_scales({**content, "scales": data["scales"]}, path.resolve().parent)
     return validate(data, path.resolve().parent)
 
 

@@ -92,6 +92,8 @@ def _written(data: Any, path: str) -> str:
             data = data[int(step)]
         else:
             return ""
+    if data is None:
+        return " (empty)"
     return f" = {data!r}" if not isinstance(data, dict | list) else ""
 
 

@@ -89,8 +89,8 @@ def _problem(error: yaml.MarkedYAMLError) -> str:
     return f"the tag {tag[1]} is refused: only texts, numbers, lists and blocks of keys are read, never objects"
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
-    """Read a YAML file that must hold a block of keys; raises InputError if it cannot."""
+def read_mapping(path: Path, example: str = "name: quickstart") -> dict[str, Any]:
+    """Read a YAML file that must hold a block of keys, such as the example; raises InputError if it cannot."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
@@ -102,5 +102,5 @@ def read_mapping(path: Path) -> dict[str, Any]:
     data = parse_yaml(text, str(path))
     if not isinstance(data, dict):
         held = "is empty" if data is None else f"holds {KINDS_OF_YAML.get(type(data), 'something else')}"
-        raise InputError(f"{path}: must hold a block of keys such as 'name: quickstart', and {held}")
+        raise InputError(f"{path}: must hold a block of keys such as {example!r}, and {held}")
     return data

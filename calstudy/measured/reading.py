@@ -75,7 +75,11 @@ def read_metadata(paths: Sequence[Path]) -> UVData:
 def _require_readable(paths: Sequence[Path]) -> None:
     """Raise InputError unless all paths exist, and measurement sets have the package that reads them."""
     for path in paths:
-        if not path.exists():
+        try:
+            found = path.exists()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        if not found:
             raise InputError(f"{path}: no such file or folder")
         # All CASA tables have this file.
         if (path / "table.dat").is_file() and find_spec("casacore") is None:

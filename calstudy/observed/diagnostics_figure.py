@@ -120,7 +120,8 @@ def draw_diagnostics(found: Diagnostics, notes: Sequence[str] = ()) -> Figure:
     _draw_chi2([grid[key] for key in "xyz"], found)
     for axes in grid.values():
         _label_between_powers(axes)
-    grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, title="antenna", title_fontsize=style.SMALL_SIZE)
+    # Above the axes: gains of measured data have peaks anywhere.
+    grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2)
     if notes:
         lines = [line for note in notes for line in textwrap.wrap(note, width=NOTE_CHARACTERS)]
         figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=style.NOTE_SIZE, color=style.GREY)

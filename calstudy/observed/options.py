@@ -41,8 +41,9 @@ def read_calibrator(
     # As in an experiment file, whose fields of the section have this in front.
     typed = [(field.removeprefix("calibration."), value) for field, value in map(parse_override, overrides)]
     asked = [(field, value) for field, value in changes.items() if value is not None]
+    wanted = _changed(path, [*asked, *typed])
     try:
-        found, _ = CALIBRATORS.class_of(_changed(path, [*asked, *typed]), DEFAULT, None)
+        found, _ = CALIBRATORS.class_of(wanted, DEFAULT, None)
     except InputError as error:
         raise InputError(f"calibration.calibrator: {error}") from None
     assumed = [(key, value) for key, value in defaults.items() if value is not None and key in found.model_fields]
@@ -73,7 +74,7 @@ def _content(path: Path | None) -> dict[str, Any]:
     """Return the calibration section of a file; the path of a calibrator in it starts at the file."""
     if path is None:
         return {}
-    content = dict(read_mapping(path))
+    content = dict(read_mapping(path, f"{CALIBRATORS.tag}: {DEFAULT}"))
     section = content.get("calibration", content)
     content = {CALIBRATORS.tag: section} if isinstance(section, str) else dict(section)
     reference = content.get(CALIBRATORS.tag)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calstudy import __version__
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, error_number, refusal_of_disk
 from calstudy.calibrate.records import CalibrationResult
+from calstudy.run.store import require_writable
 
 GAINS, CALFITS, MODEL, RESIDUAL = "gains.calh5", "gains.calfits", "model.uvh5", "residual.uvh5"
 SOLUTION, FIGURE, EXPECTED = "solution.json", "diagnostics", "expected-transfer"
@@ -21,7 +24,7 @@ FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
 
 
 def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
-    """Raise InputError if a file that will be written exists and may not be replaced.
+    """Raise InputError if the folder cannot be written, or a file that will be written exists and may not be replaced.
 
     Parameters
     ----------
@@ -40,6 +43,7 @@ def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
         present += [path.name for path in sorted(folder.glob(f"{EXPECTED}.*.h5"))]
     if present and not overwrite:
         raise InputError(f"--output {folder}: holds {', '.join(present)} already; use --overwrite or another folder")
+    require_writable(folder.absolute(), f"--output {folder}")
 
 
 def describe(result: CalibrationResult, context: dict[str, Any]) -> dict[str, Any]:
@@ -61,6 +65,28 @@ def describe(result: CalibrationResult, context: dict[str, Any]) -> dict[str, An
         "seconds": summary["seconds"],
         "records": [record.detail() for record in result.solutions],
     }
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Make a folder for what the block writes; a disk that is full, and a folder that vanishes, are told in a sentence.
+
+    Raises
+    ------
+    InputError
+        In these cases. Any other error is a bug, and passes.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except (OSError, RuntimeError) as error:
+        vanished = error_number(error) == errno.ENOENT
+        reason = "it was removed while it was written" if vanished else refusal_of_disk(error)
+        if reason is None:
+            raise
+        raise InputError(
+            f"--output {folder}: cannot be written ({reason}); make room or choose another folder, and run again"
+        ) from None
 
 
 def write_result(
@@ -91,12 +117,16 @@ def write_result(
     Returns
     -------
     The paths.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or was removed meanwhile.
     """
     from calstudy.plotting.save import save_figure
     from calstudy.power.tables import save_spectrum
 
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as temporary:
+    with writing_to(folder), tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as temporary:
         work = Path(temporary)
         result.gains.write_calh5(str(work / GAINS))
         if CALFITS in extras:

@@ -18,6 +18,7 @@ from calstudy.base.identity import digest_json
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator, Progress
 from calstudy.calibrate.records import CalibrationResult, SolveRecord
+from calstudy.observed.output import writing_to
 from calstudy.products.files import GAINS, MODEL, RESIDUAL
 
 RECORDS = "records.json"
@@ -127,14 +128,14 @@ def _joined(results: Sequence[CalibrationResult]) -> CalibrationResult:
 def _write(result: CalibrationResult, place: Path) -> None:
     """Write a piece; it is there whole or not at all."""
     work = place.with_name(f".writing-{uuid4().hex}")
-    work.mkdir(parents=True)
     try:
-        result.gains.write_calh5(str(work / GAINS))
-        for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
-            uvd.write_uvh5(str(work / name), data_write_dtype=np.dtype(np.complex128))
-        records = [record.detail() for record in result.solutions]
-        (work / RECORDS).write_text(json.dumps(records, allow_nan=False), encoding="utf-8")
-        work.rename(place)
+        with writing_to(work):
+            result.gains.write_calh5(str(work / GAINS))
+            for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
+                uvd.write_uvh5(str(work / name), data_write_dtype=np.dtype(np.complex128))
+            records = [record.detail() for record in result.solutions]
+            (work / RECORDS).write_text(json.dumps(records, allow_nan=False), encoding="utf-8")
+            work.rename(place)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 

@@ -106,7 +106,7 @@ def _redundant_fraction(vectors: np.ndarray, tolerance: float) -> float:
 
 def _cost(task: Task) -> Cost:
     samples = size_of(task).samples
-    return Cost(2 + samples * 1e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
+    return Cost(1 + samples * 1e-6, LIBRARIES_MEMORY + 10 * samples * COMPLEX128, 1e4)
 
 
 MEASURE_AGREEMENT = Stage(name="agreement", version=3, make=measure, cost=_cost)

@@ -169,7 +169,7 @@ def _cost_of_chunk(task: Task) -> Cost:
 
 def _cost(task: Task) -> Cost:
     disk = 2 * size_of(task).samples * COMPLEX64
-    return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 3 * disk, disk)
+    return Cost(0.7 + disk * 5e-9, LIBRARIES_MEMORY + 3 * disk, disk)
 
 
 CALIBRATE_CHUNK = Stage(name="calibrate-chunk", version=4, make=calibrate_chunk, cost=_cost_of_chunk)

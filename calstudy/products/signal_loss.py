@@ -190,9 +190,13 @@ def write_corrected(folder: Path, residual: SphericalSpectrum, signal: Spherical
 
 
 def _cost_of_difference(task: Task) -> Cost:
-    return Cost(1, disk=size_of(task).baselines * 1e4)
+    return Cost(0.3, disk=size_of(task).baselines * 1e4)
+
+
+def _cost_of_flux_scale(task: Task) -> Cost:
+    return Cost(0.5 + size_of(task).samples * 2.5e-7, disk=1e3)
 
 
 DIFFERENCE = Stage(name="difference", version=2, make=difference, cost=_cost_of_difference)
-FLUX_SCALE = Stage(name="flux-scale", version=1, make=measure_flux_scale, cost=lambda task: Cost(4, disk=1e3))
-TRANSFER_STAGE = Stage(name="transfer", version=3, make=measure, cost=lambda task: Cost(4, disk=1e6))
+FLUX_SCALE = Stage(name="flux-scale", version=1, make=measure_flux_scale, cost=_cost_of_flux_scale)
+TRANSFER_STAGE = Stage(name="transfer", version=3, make=measure, cost=lambda task: Cost(1, disk=1e6))

@@ -204,16 +204,17 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
 def _cost_of_average(task: Task) -> Cost:
     size, blocks = size_of(task), task.settings.get("blocks", 1)
     disk = blocks * size.samples / size.times * COMPLEX128
-    return Cost(1 + 0.15 * (blocks - 1) + size.samples * 5e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
+    return Cost(0.5 + 0.15 * (blocks - 1) + size.samples * 8e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
 
 
 def _cost_of_power(task: Task) -> Cost:
     size, blocks = size_of(task), max(average.settings.get("blocks", 1) for average in task.inputs.values())
     # Each block has a file of the estimator; spectra and what each unit owes to its antennas are of all.
-    disk = (3 + blocks) * size.baselines * size.channels.count * COMPLEX128
-    return Cost(6 + (blocks - 1) * (0.9 + 0.005 * size.baselines), 1.6e9, disk)
+    spectra = size.baselines * size.channels.count
+    seconds = 2 + 1e-5 * spectra + (blocks - 1) * (0.9 + 0.005 * size.baselines)
+    return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
 
 
 AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)
 POWER = Stage(name="power", version=4, make=estimate, cost=_cost_of_power)
-SPECTRA = Stage(name="spectra", version=3, make=average_spectra, cost=lambda task: Cost(10, disk=5e6))
+SPECTRA = Stage(name="spectra", version=3, make=average_spectra, cost=lambda task: Cost(2, disk=5e6))

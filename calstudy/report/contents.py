@@ -12,7 +12,7 @@ from typing import Any
 from calstudy.base.errors import InputError
 from calstudy.report import measured
 from calstudy.report.charts import Chart, read_charts
-from calstudy.report.headline import Number, read_headline
+from calstudy.report.headline import Number, read_excess, read_headline
 from calstudy.run.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
@@ -141,7 +141,7 @@ def read_contents(folder: Path) -> Contents:
         description=manifest.get("description") or _description(text),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
-        warnings=[f"{label}: {text}" for label, text in _warnings(products)],
+        warnings=[*read_excess(folder), *(f"{label}: {text}" for label, text in _warnings(products))],
         pictures=_pictures(folder, manifest),
         tables=[table for table in tables if table is not None],
         headline=read_headline(folder),

@@ -11,6 +11,9 @@ from pathlib import Path
 
 BAND = (0.2, 0.5)
 """Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""
+PLACE = f"outside the wedge, k of {BAND[0]:g} to {BAND[1]:g} h/Mpc"
+SIGNIFICANT = 5.0
+"""A bias of fewer standard deviations of the thermal noise may be noise."""
 TINY = 1e-9
 
 
@@ -23,6 +26,50 @@ class Number:
     meaning: str
 
 
+@dataclass(frozen=True)
+class Signal:
+    """What is left of the EoR and what is left besides it, outside the wedge, in the band of the headline.
+
+    Attributes
+    ----------
+    transfer, transfer_error
+        Part of the EoR's power that is left.
+    bias, bias_error
+        Power of the residual without EoR over that of the EoR, and its error by the thermal noise.
+    scale
+        Flux scale of the calibrated data, of which the others are free.
+    """
+
+    transfer: float
+    transfer_error: float
+    bias: float
+    bias_error: float
+    scale: float
+
+    @property
+    def numbers(self) -> list[Number]:
+        """The same for people."""
+        left = f"part of the EoR's power that is left, {PLACE}"
+        bias = (
+            f"power of the residual without EoR over that of the EoR, {PLACE}; the error is that of the thermal noise"
+        )
+        return [
+            Number("T", _with_error(self.transfer, self.transfer_error), left),
+            Number("bias", _with_error(self.bias, self.bias_error), bias),
+            Number("flux scale", f"{self.scale:.4f}", "of the calibrated data; T and bias are free of it"),
+        ]
+
+    @property
+    def excess(self) -> str | None:
+        """A sentence if more is left besides the EoR than of it, by more than the noise explains; else None."""
+        if abs(self.bias) < 1 or abs(self.bias) < SIGNIFICANT * self.bias_error:
+            return None
+        return (
+            f"{PLACE}, the residual without EoR has {_rounded(abs(self.bias))} times the power of the EoR: "
+            "its power spectrum says nothing of the EoR there"
+        )
+
+
 def read_headline(folder: Path) -> list[Number]:
     """Return the numbers of a run folder: T, bias and flux scale, and how many claims hold; as far as there are any.
 
@@ -31,14 +78,31 @@ def read_headline(folder: Path) -> list[Number]:
     folder
         Of a finished run.
     """
-    return [number for number in (*_signal(folder / "tables"), _verdicts(folder / "claims.json")) if number is not None]
+    signal = read_signal(folder)
+    numbers = [] if signal is None else signal.numbers
+    verdicts = _verdicts(folder / "claims.json")
+    return [*numbers, *([] if verdicts is None else [verdicts])]
 
 
-def _signal(tables: Path) -> list[Number | None]:
+def read_excess(folder: Path) -> list[str]:
+    """Return the warning of a run folder whose residual has more power besides the EoR than of it; as a rule none."""
+    signal = read_signal(folder)
+    return [] if signal is None or signal.excess is None else [signal.excess]
+
+
+def read_signal(folder: Path) -> Signal | None:
+    """Return T and bias of a run folder, or None if it has no such tables or no bins in the band.
+
+    Parameters
+    ----------
+    folder
+        Of a finished run.
+    """
+    tables = folder / "tables"
     transfer = tables / "transfer-bands.outside-wedge.csv"
     paths = [tables / f"{name}.outside-wedge.csv" for name in ("eor", "residual_without_eor")]
     if not all(path.is_file() for path in (transfer, *paths)):
-        return []
+        return None
     eor, residual = (_rows(path) for path in paths)
     weights, products, variances = [], [], []
     scale = math.nan
@@ -52,16 +116,10 @@ def _signal(tables: Path) -> list[Number | None]:
     signal, _ = _sums(eor, *BAND)
     left, error = _sums(residual, *BAND)
     if not weights or sum(weights) == 0 or signal == 0:
-        return []
+        return None
     mean, spread = sum(products) / sum(weights), math.sqrt(sum(variances)) / sum(weights)
     unit = signal * scale**2
-    place = f"outside the wedge, k of {BAND[0]:g} to {BAND[1]:g} h/Mpc"
-    bias = f"power of the residual without EoR over that of the EoR, {place}; the error is that of the thermal noise"
-    return [
-        Number("T", _with_error(mean, spread), f"part of the EoR's power that is left, {place}"),
-        Number("bias", _with_error(left / unit, error / abs(unit)), bias),
-        Number("flux scale", f"{scale:.4f}", "of the calibrated data; T and bias are free of it"),
-    ]
+    return Signal(mean, spread, left / unit, error / abs(unit), scale)
 
 
 def _sums(rows: list[dict[str, float]], low: float, high: float) -> tuple[float, float]:
@@ -88,6 +146,11 @@ def _verdicts(path: Path) -> Number | None:
 def _with_error(value: float, error: float) -> str:
     digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < 10 else 0
     return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def _rounded(value: float) -> str:
+    """Write a ratio with two digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):,.10g}"
 
 
 def _rows(path: Path) -> list[dict[str, float]]:

@@ -259,8 +259,9 @@ def execute(
                 product = future.result()
             except KilledWorker:
                 raise InputError(
-                    f"{task.stage.name} ({task.label}): its worker process died repeatedly, most likely for want of "
-                    "memory; use fewer --workers, or smaller chunks, and run again: finished products are kept"
+                    f"{task.stage.name} ({task.label}): its worker process died repeatedly, for want of memory or by a "
+                    "crash of code that it runs; use fewer --workers, or smaller chunks, and run again: finished "
+                    "products are kept"
                 ) from None
             # The client would have a result that it holds computed again if its worker dies.
             future.release()

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy import __version__
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, refusal_of_disk
 from calstudy.base.resources import Usage
 from calstudy.base.schema import plain
 from calstudy.run.store import Product, Store
@@ -78,19 +75,11 @@ def perform(order: WorkOrder) -> Product:
 
 
 def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:
-    """Return in words why a file of the store could not be written, or None if that is not what happened.
-
-    HDF5 reports a failed write as a RuntimeError or an OSError without errno, with the number in its message.
-    """
+    """Return in words why a file of the store could not be written, or None if that is not what happened."""
     name = getattr(error, "filename", None)
     if isinstance(name, str) and not Path(name).is_relative_to(root):
         return None
-    number = getattr(error, "errno", None)
-    if number is None and (found := re.search(r"errno = (\d+)", str(error))):
-        number = int(found[1])
-    if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM):
-        return os.strerror(number)
-    return None
+    return refusal_of_disk(error)
 
 
 def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Path]:

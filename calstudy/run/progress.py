@@ -22,25 +22,43 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-class Forecast:
-    """Estimate the remaining time of a run from the estimated cost of its tasks and the pace so far."""
+PLANNED_SECONDS = 60.0
+"""So much of a run counts as having gone as planned before it began: workers that start, and import libraries, tell
+little of the pace of what follows."""
 
-    def __init__(self, costs: dict[str, float]) -> None:
-        self._costs = costs
-        self._total = sum(costs.values())
+
+class Forecast:
+    """Estimate the remaining time of a run from the estimated cost of its tasks and the pace so far.
+
+    Parameters
+    ----------
+    costs
+        Estimated seconds of each task on one core, by key.
+    workers
+        How many tasks are made at a time.
+    """
+
+    def __init__(self, costs: dict[str, float], workers: int) -> None:
+        self._costs, self._workers = costs, workers
+        self._total, self._made = sum(costs.values()), 0.0
         self._start = time.perf_counter()
-        self.fraction = 0.0
+
+    @property
+    def fraction(self) -> float:
+        """Part of the work that is made."""
+        return self._made / self._total
 
     def finish(self, key: str) -> float:
         """Count a task as made; return the seconds that the rest will take at this pace."""
-        self.fraction += self._costs[key] / self._total
+        self._made += self._costs[key]
         elapsed = time.perf_counter() - self._start
-        return elapsed * max(0.0, 1 - self.fraction) / max(self.fraction, 1e-6)
+        pace = (elapsed + PLANNED_SECONDS) / (self._made / self._workers + PLANNED_SECONDS)
+        return pace * max(0.0, self._total - self._made) / self._workers
 
 
 @contextmanager
 def report(
-    tasks: Sequence[Task], costs: dict[str, float], console: Console
+    tasks: Sequence[Task], costs: dict[str, float], workers: int, console: Console
 ) -> Iterator[Callable[[Task, Product], None]]:
     """Yield a function to call after each product.
 
@@ -50,10 +68,12 @@ def report(
         All that will be made.
     costs
         Estimated seconds per task key.
+    workers
+        How many tasks are made at a time.
     console
         Where to write.
     """
-    forecast = Forecast(costs)
+    forecast = Forecast(costs, workers)
     if not console.is_terminal:
         count = 0
 

@@ -54,21 +54,27 @@ def _inside(name: str) -> bool:
     return not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
 
-def require_writable(folder: Path, field: str) -> None:
-    """Raise InputError if a folder cannot be written, or made, as far as can be seen without trying.
+def require_writable(folder: Path, name: str) -> None:
+    """Raise InputError if a folder cannot be written, or made; tried by a temporary folder in what is there of it.
+
+    Permissions alone do not tell: nobody can make a folder in /proc, not even root.
 
     Parameters
     ----------
     folder
         Need not exist.
-    field
-        Of the experiment file, for the message.
+    name
+        Of the field or option, with its value, for the message.
     """
-    found = next(path for path in (folder, *folder.parents) if path.exists())
-    if not found.is_dir():
-        raise InputError(f"{field} = {str(folder)!r}: cannot be written ({found} is a file; a folder is needed)")
-    if not os.access(found, os.W_OK | os.X_OK):
-        raise InputError(f"{field} = {str(folder)!r}: cannot be written ({found} is read-only, or another user's)")
+    found = folder
+    try:
+        found = next(path for path in (folder, *folder.parents) if path.exists())
+        if not found.is_dir():
+            raise InputError(f"{name}: cannot be written ({found} is a file; a folder is needed)")
+        with tempfile.TemporaryDirectory(prefix=".calstudy-", dir=found):
+            pass
+    except OSError as error:
+        raise InputError(f"{name}: cannot be written ({error.strerror}); no folder can be made in {found}") from None
 
 
 class Store:
@@ -91,12 +97,8 @@ class Store:
         InputError
             If it cannot.
         """
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.root):
-                pass
-        except OSError as error:
-            raise InputError(f"outputs.store = {str(self.root)!r}: cannot be written ({error.strerror})") from None
+        require_writable(self.root, f"outputs.store = {str(self.root)!r}")
+        self.root.mkdir(parents=True, exist_ok=True)
 
     def folder(self, stage: str, key: str) -> Path:
         """Return where the product with this stage and key is, or would be.
@@ -139,7 +141,10 @@ class Store:
 
     def exists(self, stage: str, key: str) -> bool:
         """Return whether there is anything under this key, intact or damaged."""
-        return self.folder(stage, key).exists()
+        try:
+            return self.folder(stage, key).exists()
+        except OSError:
+            return False  # A name that no file can have, or a folder that may not be read.
 
     def discard(self, stage: str, key: str) -> None:
         """Remove a product, if it is there; it vanishes at once under its name."""

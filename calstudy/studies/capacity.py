@@ -8,8 +8,9 @@ from pathlib import Path
 from calstudy.base import ranks
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
-from calstudy.base.resources import LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
 from calstudy.experiment.model import Experiment
+from calstudy.instrument.size import Size
 from calstudy.products.calibration import CALIBRATE_CHUNK
 from calstudy.products.simulation import SIMULATE_CHUNK
 from calstudy.run.store import Store
@@ -18,6 +19,8 @@ from calstudy.studies.study import Budget
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """More workers than cores wait for each other; more than this is a slip."""
+ABSURD = 10
+"""Data of so many times the memory are refused at once; a finished run of somewhat large ones may still be drawn."""
 Targets = Callable[[Experiment], Sequence[Task]]
 """Which products of an experiment are wanted."""
 
@@ -72,6 +75,23 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     if workers is not None and budget.max_memory is None:
         return cut, workers
     return cut, min(hoped, fitting)
+
+
+def require_data_fit(experiment: Experiment, budget: Budget) -> None:
+    """Raise InputError if the data of an experiment alone exceed the memory by far; quick, however large they are.
+
+    `fit` and the foreground bases, which take long for absurd sizes, come after it.
+    """
+    if budget.scheduler is not None:
+        return
+    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
+    samples = Size.of(experiment.instrument).samples
+    need = samples * COMPLEX128
+    if need > ABSURD * memory:
+        raise InputError(
+            f"the data have {samples:.3g} samples, which take {need / 1e9:,.1f} GB, and there are "
+            f"{memory / 1e9:.1f} GB of memory; use fewer antennas, channels or integrations"
+        )
 
 
 def workers_for(targets: Sequence[Task], store: Path, budget: Budget) -> int:

@@ -66,7 +66,7 @@ class CollectionFile(Section):
 
 
 class Collection(Study):
-    """Several experiments, and what compares them.
+    """Several experiments, and the figures and claims that compare them.
 
     Products that several members need have one key, and are one product.
 
@@ -142,7 +142,7 @@ class Collection(Study):
 
     @property
     def targets(self) -> list[Task]:
-        """The products of all members, and what compares them."""
+        """The products of all members, and the figures and claims that compare them."""
         own = [*self.figures, *([self.claims] if self.claims else [])]
         return [task for part in self.parts.values() for task in part.targets] + own
 

@@ -23,7 +23,7 @@ from calstudy.products.signal_loss import transfer
 from calstudy.products.spectra import spectra
 from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
-from calstudy.studies.capacity import fit
+from calstudy.studies.capacity import fit, require_data_fit
 from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
 from calstudy.studies.preflight import notes_of, require_possible
 from calstudy.studies.study import Budget, Made, Study
@@ -61,6 +61,7 @@ class ExperimentStudy(Study):
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the study with simulations and solves cut to the memory, and the number of workers."""
+        require_data_fit(self.experiment, budget)
         require_possible(self.experiment)
         experiment, count = fit(self.experiment, budget, targets_of)
         return type(self)(experiment, self._folder), count

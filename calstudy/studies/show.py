@@ -12,6 +12,8 @@ from rich.table import Table
 
 from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory, total_memory
 from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
+from calstudy.report.headline import PLACE, read_signal
+from calstudy.report.page import REPORT
 from calstudy.run.execution import largest_disk, schedule
 from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
@@ -19,6 +21,9 @@ from calstudy.run.task import Task
 from calstudy.studies.folder import MANIFEST
 from calstudy.studies.study import Budget, Run, Study
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
+
+NAMED = 8
+"""A plan of more run folders counts those beyond."""
 
 
 def _by_stage(tasks: Sequence[Task]) -> dict[str, list[Task]]:
@@ -51,8 +56,8 @@ def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
     store = Store(study.outputs.store)
     plan = schedule(study.targets, store)
     if plan.todo:
-        require_writable(store.root, "outputs.store")
-    require_writable(study.folder.parent, "outputs.runs")
+        require_writable(store.root, f"outputs.store = {str(store.root)!r}")
+    require_writable(study.folder.parent, f"outputs.runs = {str(study.folder.parent)!r}")
     todo = {task.key for task in plan.todo}
     stages = []
     for stage, tasks in _by_stage(study.tasks).items():
@@ -113,8 +118,11 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
         for line in plan[lines]:
             console.print(f"{heading}: {line}", markup=False)
     console.print(f"store: {plan['store']}", markup=False, soft_wrap=True)
-    for folder in plan["run_folders"]:
+    folders = plan["run_folders"]
+    for folder in folders[:NAMED]:
         console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
+    if len(folders) > NAMED:
+        console.print(f"and {len(folders) - NAMED} run folders more; --json names all")
 
 
 def sites(tasks: Sequence[Task]) -> list[str]:
@@ -176,11 +184,25 @@ def _show_products(run: Run, console: Console) -> None:
     console.print(table)
     for warning in run.warnings:
         console.print(f"warning: {warning}", markup=False)
+    _show_signal(run.folder, console)
     for figure in sorted((run.folder / "figures").glob("*.png")):
         console.print(f"figure: {figure}", markup=False)
     if (run.folder / "tables").is_dir():
         console.print(f"tables: {run.folder / 'tables'}", markup=False)
     console.print(f"manifest: {run.folder / MANIFEST}", markup=False)
+    if (run.folder / REPORT).is_file():
+        console.print(f"report: {run.folder / REPORT}", markup=False)
+
+
+def _show_signal(folder: Path, console: Console) -> None:
+    """Print T and bias of a run, and a warning if more than the EoR is left besides it; nothing for other runs."""
+    signal = read_signal(folder)
+    if signal is None:
+        return
+    numbers = ", ".join(f"{number.name} {number.text}" for number in signal.numbers)
+    console.print(f"{PLACE}: {numbers}", markup=False)
+    if signal.excess is not None:
+        console.print(f"warning: {signal.excess}", markup=False)
 
 
 def _show_criteria(folder: Path, console: Console) -> None:

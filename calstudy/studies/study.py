@@ -212,7 +212,7 @@ def make(targets: Sequence[Task], store: Store, workers: Workers, console: Conso
     lifetimes = Lifetimes(targets, plan.todo)
     drop(lifetimes.unused(), store)
     costs = {task.key: task.cost.seconds for task in plan.todo}
-    with report(plan.todo, costs, console) as show:
+    with report(plan.todo, costs, workers.count, console) as show:
 
         def done(task: Task, product: Product) -> None:
             logger.info("%s (%s): %.1f s", task.stage.name, task.label, product.record["seconds"])

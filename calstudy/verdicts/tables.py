@@ -53,11 +53,11 @@ class Table:
     rows: Sequence[Sequence[str]]
     title: str = ""
 
-    def show(self, console: Console) -> None:
-        """Print it: the first column to the left, the others to the right; words with a colour have theirs."""
+    def show(self, console: Console, numbers: bool = True) -> None:
+        """Print it; with `numbers`, all columns but the first are aligned to the right. Outcomes have their colours."""
         table = TerminalTable(title=escape(self.title), title_justify="left")
         for index, heading in enumerate(self.headings):
-            table.add_column(heading, justify="right" if index else "left", overflow="fold")
+            table.add_column(heading, justify="right" if index and numbers else "left", overflow="fold")
         for row in self.rows:
             table.add_row(*(coloured(cell) for cell in row))
         console.print(table)

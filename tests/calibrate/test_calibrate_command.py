@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -140,3 +141,38 @@ def test_what_the_memory_does_not_hold_is_refused(command, data, tmp_path):
     assert "8 antennas, 28 baselines and 64 channels need about 1.2 GB, and 0.5 GB are allowed by --max-memory" in error
     assert not (tmp_path / "out").exists()
     assert "--max-memory '5': write a positive number" in command(data, "--max-memory", "5")[1]
+
+
+@pytest.mark.parametrize("output", ["/proc/out", "x" * 300])
+def test_an_output_folder_that_cannot_be_made_is_refused_before_the_data_are_read(output, command):
+    code, error = command("no-such-data.uvh5", "--output", output)
+    assert code == 2
+    assert f"--output {output}: cannot be written" in error or "File name too long" in error
+    assert "no-such-data" not in error
+
+
+@pytest.mark.parametrize("writer", ["write_calh5", "write_uvh5"])
+def test_an_output_folder_that_vanishes_is_told_in_a_sentence(writer, command, data, tmp_path, monkeypatch):
+    container = UVCal if writer == "write_calh5" else UVData
+    write = getattr(container, writer)
+
+    def vanish(self, *arguments, **options):
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        write(self, *arguments, **options)
+
+    monkeypatch.setattr(container, writer, vanish)
+    code, error = command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
+    assert code == 2
+    assert "--output out: cannot be written (it was removed while it was written)" in error
+    assert "Traceback" not in error
+
+
+def test_a_disk_that_is_full_is_told_in_a_sentence(command, data, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        # The words of h5py, whose error has no errno.
+        raise OSError("Can't synchronously write data (file write failed: errno = 28, error message = 'No space left')")
+
+    monkeypatch.setattr(UVData, "write_uvh5", fail)
+    code, error = command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
+    assert code == 2
+    assert "--output out: cannot be written (No space left on device); make room or choose another folder" in error

@@ -209,6 +209,13 @@ IMPLAUSIBLE: list[tuple[str, Any, str]] = [
     ("calibration.basis.buffer", "1 s", "calibration.basis"),
     ("outputs.store", "/etc/passwd", "is a file; a folder is needed"),
     ("outputs.runs", "/etc/passwd", "is a file; a folder is needed"),
+    # Where nobody can make a folder, not even root.
+    ("outputs.store", "/proc/store", "cannot be written (No such file or directory); no folder can be made in /proc"),
+    ("outputs.runs", "/proc/runs", "cannot be written (No such file or directory); no folder can be made in /proc"),
+    ("outputs.store", "x" * 300, "cannot be written (File name too long)"),
+    ("instrument.layout", {"kind": "csv", "path": "x" * 300}, "cannot be read (File name too long"),
+    ("calibration.assumed", {"sky_model": "x" * 300}, "cannot be read (File name too long"),
+    ("outputs.store", None, "outputs.store (empty): must be a path"),
     ("outputs.convergence.steps", ["a"], "must be a whole number"),
     ("scales", {"small": {"instrument.banana": 3}}, "scales.small: instrument.banana: unknown key"),
     ("scales", {"small": {"instrument.times.count": -3}}, "scales.small: instrument.times.count = -3"),

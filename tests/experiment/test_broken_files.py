@@ -91,11 +91,18 @@ def test_an_experiment_that_cannot_be_read_is_named(file, capsys):
     assert file in message
 
 
+HUGE = [
+    *("--set", "instrument.layout.side=26"),
+    *("--set", "instrument.channels.count=60000"),
+    *("--set", "instrument.channels.width=1 kHz"),
+]
 COMMANDS = [
     (["plan", "file.yaml", "--workers", "99999"], "--workers 99999: at most"),
     (["plan", "file.yaml", "--workers", "0"], "greater than or equal to 1"),
     (["plan", "file.yaml", "--max-memory", "lots"], "--max-memory 'lots': write a positive number"),
     (["plan", "file.yaml", "--max-memory", "-3 GB"], "write a positive number"),
+    # Refused before foreground bases of 60000 channels are made for two million baselines.
+    (["plan", "file.yaml", *HUGE, "--max-memory", "6 GB"], "which take 3,652.3 GB, and there are 6.0 GB of memory"),
     (["plan", "file.yaml", "--max-memory", "1 MB"], "--max-memory leaves"),
     (["plan", "file.yaml", "--scale", "small"], "--scale small: not a scale"),
     (["plan", "file.yaml", "--set", "instrument.channels.width=80 mHz"], "must be at least 100 Hz"),
@@ -105,6 +112,8 @@ COMMANDS = [
     (["plan", "list.yaml"], "and holds a list"),
     (["plan", "."], ".: is a folder"),
     (["plan", "quickstrat"], "neither a file nor a published experiment"),
+    (["plan", "x" * 300], "cannot be read or written (File name too long)"),
+    (["plan", "file.yaml", "--set", "scales={small: {instrument.banana: 3}}"], "scales.small: instrument.banana: unk"),
     (["plan"], "Missing argument"),
     (["plan", "file.yaml", "--banana"], "No such option: --banana"),
     (["run", "file.yaml", "--workers", "99999"], "--workers 99999: at most"),
@@ -139,6 +148,9 @@ COMMANDS = [
     (["calibrate", "x", "--solver", "banana"], "calibration.solver"),
     (["calibrate", "x", "--settings", "nowhere.yaml"], "nowhere.yaml: cannot be read"),
     (["calibrate", "x", "--settings", "list.yaml"], "list.yaml"),
+    (["calibrate", "x", "--settings", "empty.yaml"], "calstudy: empty.yaml: must hold a block of keys such as 'cali"),
+    (["calibrate", "x" * 300], "cannot be read (File name too long)"),
+    (["calibrate", "x", "--gains", "x" * 300], "File name too long"),
     (["calibrate", "x", "--max-memory", "lots"], "write a positive number"),
     (["calibrate", "x", "--output", "list.yaml"], "--output list.yaml: is a file, not a folder"),
     (["banana"], "No such command 'banana'"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calstudy.report.charts import read_charts
-from calstudy.report.headline import read_headline
+from calstudy.report.headline import read_excess, read_headline
 
 K = np.arange(0.05, 1, 0.1)
 SCALE = 1.1
@@ -49,6 +49,26 @@ def test_the_headline_pools_modes_of_its_band_and_is_free_of_the_flux_scale(tabl
     assert numbers["bias"] == f"0.070 ± {0.02 * np.sqrt(10**2 + 2 * 30**2) / 70:.3f}"
     assert numbers["flux scale"] == "1.1000"
     assert "claims" not in numbers
+
+
+@pytest.mark.parametrize(
+    ("power", "told"),
+    # The noise of the band is 0.014 of the EoR; a bias as large as the EoR, of either sign, is told.
+    [(7, None), (90, None), (3400, "34 times"), (-1e6, "10,000 times"), (1.2345e9, "12,000,000 times")],
+)
+def test_a_residual_with_more_power_than_the_eor_is_told(power, told, tables):
+    residual = np.where((K > 0.2) & (K < 0.5), power * SCALE**2, 0)
+    modes = np.where(K < 0.3, 10, 30)
+    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", residual, modes, np.full(K.size, 2 * SCALE**2))
+    warnings = read_excess(tables.parent)
+    assert len(warnings) == (told is not None)
+    assert all(f"0.5 h/Mpc, the residual without EoR has {told} the power of the EoR" in text for text in warnings)
+
+
+def test_noise_above_the_eor_is_no_excess(tables):
+    noisy, modes = np.full(K.size, 400 * SCALE**2), np.where(K < 0.3, 10, 30)
+    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", noisy, modes, np.full(K.size, 300 * SCALE**2))
+    assert read_excess(tables.parent) == []
 
 
 def test_the_headline_counts_verdicts(tmp_path):
