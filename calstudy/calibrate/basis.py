@@ -207,6 +207,25 @@ def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -
     return np.ascontiguousarray(left[:, singular**2 > eigenvalue_cutoff])
 
 
+def gain_vectors(frequencies: np.ndarray, delay: float, eigenvalue_cutoff: float) -> np.ndarray:
+    """Return orthonormal sequences that hold gains with delays up to `delay` s, shape (Nfreqs, Ngain).
+
+    Parameters
+    ----------
+    frequencies
+        Channel centres on an even grid, gaps allowed, Hz, shape (Nfreqs,).
+    delay
+        Half-width in s; the basis is all of the channels if they do not resolve it.
+    eigenvalue_cutoff
+        Sequences with a smaller spectral concentration are left out.
+    """
+    grid = channel_grid(frequencies)
+    if delay * grid.width >= 0.5:
+        return np.eye(len(frequencies))
+    vectors = dpss_vectors(grid.n_channels, grid.n_channels * grid.width * delay, eigenvalue_cutoff)
+    return restrict(vectors, grid, eigenvalue_cutoff)
+
+
 def make_basis(
     lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings, prior: bool = False
 ) -> ForegroundBasis:

@@ -61,7 +61,7 @@ def place_of(site: Site | Coordinates) -> Place:
 def east_north_up(vectors: np.ndarray, place: Place) -> np.ndarray:
     """Return geocentric vectors (N, 3) by their components to the east, the north and up at a place.
 
-    `pyuvdata.utils.ENU_from_ECEF` does the same; importing it takes a second, a fifth of the time of a plan.
+    `pyuvdata.utils.ENU_from_ECEF` does the same; importing it takes a second, half the time of a plan.
     """
     longitude, latitude = np.radians(place.longitude), np.radians(place.latitude)
     up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
