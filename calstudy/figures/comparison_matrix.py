@@ -59,11 +59,20 @@ def draw_matrix(
     for band, axes in enumerate(panels):
         _draw_band(axes, cases, calibrators, band, shades)
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
-    panels[-1].set_xticks(range(len(worlds)), [textwrap.fill(world, LABELS_WIDTH // len(worlds)) for world in worlds])
+    _name_worlds(panels[-1], worlds)
     bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$")
     style.note_stand_ins(figure, stand_ins)
     return figure
+
+
+def _name_worlds(axes: Axes, worlds: Sequence[str]) -> None:
+    """Write the labels of the columns, in several lines or, if words are wider than a column, aslant."""
+    width = LABELS_WIDTH // len(worlds)
+    if max(len(word) for world in worlds for word in world.split()) <= width:
+        axes.set_xticks(range(len(worlds)), [textwrap.fill(world, width) for world in worlds])
+    else:
+        axes.set_xticks(range(len(worlds)), worlds, rotation=30, ha="right", rotation_mode="anchor")
 
 
 def _draw_band(

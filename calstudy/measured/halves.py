@@ -52,6 +52,11 @@ class Facts:
     autos: bool
 
     @property
+    def duration(self) -> float:
+        """From the beginning of the first integration to the end of the last, s."""
+        return float(np.ptp(self.times)) * SECONDS_PER_DAY + self.integration
+
+    @property
     def antennas(self) -> int:
         """Number of antennas that are in a cross-correlation."""
         return np.unique(self.frame.antennas[~self.frame.autos]).size

@@ -84,8 +84,8 @@ def _weights(uvd: UVData) -> np.ndarray:
     return uvd.nsample_array * np.asarray(uvd.integration_time)[:, None, None]
 
 
-def noise_of_average(variance: np.ndarray, uvd: UVData) -> np.ndarray:
-    """Return sigma of the average over integrations, (Nbls, Nfreqs, Npols); NaN where nothing is unflagged.
+def noise_of_average(variance: np.ndarray, uvd: UVData, times: np.ndarray) -> np.ndarray:
+    """Return sigma of the average over some integrations, (Nbls, Nfreqs, Npols); NaN where nothing is unflagged.
 
     Parameters
     ----------
@@ -93,8 +93,11 @@ def noise_of_average(variance: np.ndarray, uvd: UVData) -> np.ndarray:
         sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols).
     uvd
         The data that are averaged: flags and numbers of samples, which are the weights.
+    times
+        Indices of the integrations, (n,).
     """
-    weights = np.where(flag_cube(uvd), 0, uvd.nsample_array.reshape(variance.shape))
+    weights = np.where(flag_cube(uvd), 0, uvd.nsample_array.reshape(variance.shape))[times]
+    variance = variance[times]
     total = weights.sum(axis=0)
     added = np.sum(np.where(weights > 0, weights**2 * variance, 0), axis=0)
     return np.sqrt(np.divide(added, total**2, out=np.full(total.shape, np.nan), where=total > 0))

@@ -14,7 +14,9 @@ Averages have fewer independent modes than modes:
   sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same goes for two polarizations. The product of signal and
   noise has the noise of n baselines in it, and its variance falls by n;
 - the signal of two baselines closer than the size of an antenna is partly the same. For a Gaussian beam with squared
-  integral Omega_pp the visibilities correlate by exp(-pi Omega_pp |db|^2 / lambda^2), powers by its square.
+  integral Omega_pp the visibilities correlate by exp(-pi Omega_pp |db|^2 / lambda^2), powers by its square;
+- powers of several times have independent noise. Their signal is partly the same as long as the beam has not moved on:
+  visibilities of a zenith that moved by theta correlate by exp(-pi theta^2 / (4 Omega_pp)), powers by its square.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ def noise_level(noise: DelaySpectra) -> float:
     -------
     Standard deviation in the unit of ``noise.power``.
     """
-    products = noise.n_pairs * noise.n_polarizations
+    products = noise.n_pairs * noise.n_polarizations * noise.n_times
     return float(np.sqrt(np.mean(products[:, None] * noise.power.real**2)))
 
 
@@ -94,7 +96,8 @@ def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndar
 def _modes_of_noise(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
     """Return the effective modes where a unit averages so many independent samples of each polarization, (Nu,)."""
     units = np.arange(len(spectra.n_pairs))
-    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / (independent * spectra.n_polarizations)))
+    samples = independent * spectra.n_polarizations * spectra.n_times
+    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / samples))
 
 
 def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
@@ -114,7 +117,26 @@ def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.nda
     (n_bins,) float, zero for empty bins.
     """
     first, second, correlation = _signal_correlation(spectra)
-    return _effective_modes(spectra, bins, n_bins, (first, second, correlation))
+    return _effective_modes(spectra, bins, n_bins, (first, second, correlation)) * spectra.independent_times
+
+
+def independent_times(sidereal_times: np.ndarray, latitude: float, omega_pp: float) -> float:
+    """Return how many independent skies an antenna that points to the zenith sees at some times.
+
+    n^2 over the sum of the correlations of the powers of all n times with each other.
+
+    Parameters
+    ----------
+    sidereal_times
+        rad, (n,).
+    latitude
+        Of the array, rad.
+    omega_pp
+        Integral of the squared power beam in sr; the beam is taken as Gaussian.
+    """
+    apart = sidereal_times[:, None] - sidereal_times
+    moved = 2 * np.arcsin(np.cos(latitude) * np.abs(np.sin(apart / 2)))
+    return float(sidereal_times.size**2 / np.exp(-np.pi * moved**2 / (2 * omega_pp)).sum())
 
 
 def with_errors(

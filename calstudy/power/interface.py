@@ -75,23 +75,74 @@ def estimate_spectra(
     Parameters
     ----------
     even, odd, beam, settings
-        As for `Estimator.estimate`.
+        As for `Estimator.estimate`, but of one integration or several, whose powers are averaged. Integrations that are
+        completely flagged in either are left out, and so are baselines that are completely flagged in another one.
     folder
-        Where the estimator may write files of its own; nowhere if None.
+        Where the estimator may write files of its own; nowhere if None. With several integrations there is a folder for
+        each, `block-1` and so on.
 
     Raises
     ------
     InputError
-        If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`.
+        If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`, or if even and odd
+        data have different numbers of integrations.
     """
+    from calstudy.power.errors import independent_times
+    from calstudy.power.spectra import average_times
+
     estimator = cast(Estimator, settings.estimator)
-    with guarded(estimator):
-        if folder is None:
-            found = estimator.estimate(even, odd, beam, settings)
-        else:
-            found = estimator.estimate_and_export(even, odd, beam, settings, folder)
-    if (fault := _fault(found)) is not None:
-        raise InputError(f"estimator {estimator.label!r}: {fault}")
+    found = []
+    blocks = _blocks(even, odd)
+    for number, (first, second) in enumerate(blocks, 1):
+        place = folder
+        if folder is not None and len(blocks) > 1:
+            place = folder / f"block-{number}"
+            place.mkdir()
+        with guarded(estimator):
+            if place is None:
+                spectra = estimator.estimate(first, second, beam, settings)
+            else:
+                spectra = estimator.estimate_and_export(first, second, beam, settings, place)
+        if (fault := _fault(spectra)) is not None:
+            raise InputError(f"estimator {estimator.label!r}: {fault}")
+        found.append(spectra)
+    if len(found) == 1:
+        return found[0]
+    sidereal_times = np.array([first.lst_array[0] for first, _ in blocks])
+    latitude = float(even.telescope.location.lat.rad)
+    return average_times(found, independent_times(sidereal_times, latitude, found[0].omega_pp))
+
+
+def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
+    """Return even and odd data of each integration, time-major; the same baselines are completely flagged in all."""
+    if even.Ntimes == odd.Ntimes == 1:
+        return [(even, odd)]
+    if even.Ntimes != odd.Ntimes:
+        raise InputError(
+            f"power.coherent_time: even and odd data have {even.Ntimes} and {odd.Ntimes} blocks with integrations; a "
+            "longer time may bridge gaps"
+        )
+    pairs = [
+        (_integration(even, number), _integration(odd, number))
+        for number in range(even.Ntimes)
+        if not any(_integration(uvd, number).flag_array.all() for uvd in (even, odd))
+    ]
+    pairs = pairs or [(_integration(even, 0), _integration(odd, 0))]
+    missing = np.any([uvd.flag_array.all(axis=1) for pair in pairs for uvd in pair], axis=0)
+    for pair in pairs:
+        for uvd in pair:
+            uvd.flag_array |= missing[:, None]
+    return pairs
+
+
+def _integration(uvd: UVData, number: int) -> UVData:
+    """Return one integration."""
+    rows = np.arange(number * uvd.Nbls, (number + 1) * uvd.Nbls)
+    found = uvd.select(blt_inds=rows, inplace=False, run_check=False)
+    # hera_pspec refuses data with phase centres besides their own.
+    (centre,) = np.unique(found.phase_center_id_array).tolist()
+    found.phase_center_catalog = {centre: found.phase_center_catalog[centre]}
+    found.Nphase = 1
     return found
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, fault
-from calstudy.base.units import Delay, Length, Wavenumber
+from calstudy.base.units import Delay, Length, Time, Wavenumber
 
 ESTIMATORS: Registry[Any] = Registry("estimator", "calstudy.power.estimators", "calstudy.power.interface:Estimator")
 
@@ -52,6 +53,12 @@ class PowerSettings(Section):
     redundancy_tolerance: Length = Field(
         1.0, gt=0, description="Baselines whose vectors differ by less than this are in one group."
     )
+    coherent_time: Time | None = Field(
+        None,
+        ge=1e-3,
+        description="Integrations are fringe-stopped and averaged in blocks of at most this duration, and the powers "
+        "of the blocks are averaged; null: one block.",
+    )
     wedge_buffer: Delay = Field(100e-9, ge=0, description="Modes with |delay| <= |b|/c + buffer are in the wedge.")
     length_bin: Length = Field(4.0, ge=0.01, description="Width of the cylindrical (wedge) bins in baseline length.")
     bins: KBins = KBins()
@@ -59,3 +66,17 @@ class PowerSettings(Section):
         "Planck15",
         description="Cosmology of the complete study, also used to convert the P(k) of the EoR to brightness.",
     )
+
+    def n_blocks(self, duration: float, integration: float) -> int:
+        """Return in how many blocks a run is averaged: none is longer than `coherent_time`, or one integration if more.
+
+        Parameters
+        ----------
+        duration, integration
+            Of the run and of one of its integrations, s.
+        """
+        if self.coherent_time is None:
+            return 1
+        # Durations that are differences of Julian dates are rounded to some tens of microseconds.
+        longest = max(1, math.floor(self.coherent_time / integration + 1e-3))
+        return math.ceil(round(duration / integration) / longest)

@@ -6,7 +6,8 @@ each other. The pairs of a unit share the signal; their noise products are indep
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +49,9 @@ class DelaySpectra:
         pairs contain the antenna, (Nm,) int; and the sum of the powers of these pairs, (Nm, Nd) complex. From these,
         errors are found by leaving out antennas (`calstudy.power.clusters`). Empty if not known: the errors of ratios
         then come from the scatter of units, which is too small where units share antennas.
+    n_times, independent_times
+        Times whose powers are averaged; each has its own noise. How many independent skies they see, at most as many
+        (`calstudy.power.errors.independent_times`).
     """
 
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
@@ -66,6 +70,8 @@ class DelaySpectra:
     share_power: np.ndarray = field(
         default_factory=lambda: np.zeros((0, 0), complex), metadata={"unit": "mK2 h-3 Mpc3"}
     )
+    n_times: int = field(default=1, metadata={"unit": ""})
+    independent_times: float = field(default=1.0, metadata={"unit": ""})
 
     @property
     def length(self) -> np.ndarray:
@@ -184,6 +190,33 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
     """Return which modes lie outside the wedge: |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool."""
     horizon = horizon_delay(modes.length)
     return np.abs(modes.delay) > horizon[:, None] + buffer
+
+
+def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelaySpectra:
+    """Return the mean of the spectra of several times.
+
+    Parameters
+    ----------
+    spectra
+        Of one time each, of the same units, pairs and delays.
+    independent
+        How many independent skies they see.
+
+    Raises
+    ------
+    ValueError
+        If units differ.
+    """
+    first = spectra[0]
+    if any(not np.array_equal(other.vectors, first.vectors) for other in spectra):
+        raise ValueError("the spectra of several times are of different units, expected the same")
+    return replace(
+        first,
+        power=np.mean([one.power for one in spectra], axis=0),
+        share_power=np.mean([one.share_power for one in spectra], axis=0),
+        n_times=len(spectra),
+        independent_times=independent,
+    )
 
 
 def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:

@@ -71,7 +71,8 @@ def load_spectrum(path: Path, kind: type[Spectrum]) -> Spectrum:
         found = file.attrs.get("kind")
         if found != kind.__name__:
             raise ValueError(f"{path} holds {found!r}, expected {kind.__name__!r}")
-        values = {item.name: _value(file[item.name]) for item in dataclasses.fields(kind)}
+        # A file that is older than a field is what it was when the field had its default.
+        values = {item.name: _value(file[item.name]) for item in dataclasses.fields(kind) if item.name in file}
     return kind(**values)
 
 

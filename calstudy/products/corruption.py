@@ -251,7 +251,7 @@ def _cost_of_corruption(task: Task) -> Cost:
 def _cost_of_levels(task: Task) -> Cost:
     noise = task.settings["corruption"].noise
     beam = 10 if isinstance(noise, RadiometerNoise) and noise.effective_area is None else 0
-    return Cost(2 + beam, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e5)
+    return Cost(0.5 + beam, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e5)
 
 
 def _cost_of_gains(task: Task) -> Cost:

@@ -25,7 +25,7 @@ from calstudy.products.files import (
     write_visibilities,
 )
 from calstudy.products.graph import Memory, once, size_of
-from calstudy.products.spectra import BINNING, POWER
+from calstudy.products.spectra import NOT_OF_DELAY_SPECTRA, POWER, blocks_of
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
@@ -151,7 +151,20 @@ def calibrated(graph: ObservedGraph, parity: str) -> Task:
 def average(graph: ObservedGraph, what: str, parity: str) -> Task:
     """Return the task of one half, fringe-stopped and averaged; `what` is one of `WHAT`."""
     inputs = {"data": observed(graph, parity), "calibration": calibrated(graph, parity)}
-    return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, "centre": graph.halves.centre}, inputs)
+    return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, **averaging(graph)}, inputs)
+
+
+def averaging(graph: ObservedGraph) -> dict[str, Any]:
+    """Return as settings of a task how a half is averaged: the phase centre, or the number of blocks and their span.
+
+    The span is that of both halves if they are interleaved; otherwise each half has its own.
+    """
+    facts = graph.halves.facts["even"]
+    count = graph.power.n_blocks(facts.duration, facts.integration)
+    if count == 1:
+        return {"centre": graph.halves.centre}
+    span = [float(facts.times.min()), float(facts.times.max())] if graph.halves.interleaved else None
+    return {"blocks": count, "span": span}
 
 
 def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: PowerSettings | None = None) -> Task:
@@ -168,7 +181,7 @@ def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: Powe
     power
         In place of the study's own.
     """
-    settings = {**graph.beam_settings, "power": (power or graph.power).reset(*BINNING)}
+    settings = {**graph.beam_settings, "power": (power or graph.power).reset(*NOT_OF_DELAY_SPECTRA)}
     return Task(POWER, label, settings, {"even": even, "odd": odd})
 
 
@@ -290,7 +303,7 @@ def make_average(job: Job) -> Mapping[str, Any]:
 
     from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, to_cube
     from calstudy.measured.noise import noise_of_average
-    from calstudy.power.average import fringe_stop_and_average
+    from calstudy.power.average import average_in_blocks
 
     what, folder = job.settings["what"], job.inputs["calibration"]
     residual, data = read_visibilities(folder / RESIDUAL), read_visibilities(job.inputs["data"] / DATA)
@@ -306,14 +319,15 @@ def make_average(job: Job) -> Mapping[str, Any]:
     else:
         cube = to_cube(residual) + to_cube(read_visibilities(folder / MODEL))[:, crosses]
     found = from_cube(residual, np.where(flag_cube(residual), 0, cube))
-    averaged = fringe_stop_and_average(found, job.settings["centre"])
+    blocks = blocks_of(job, found)
+    averaged = average_in_blocks(found, blocks)
     write_visibilities(averaged, job.output / AVERAGE)
     variance = _variances(data, pairs)
     if variance is None:
         return {}
     if what != "data":
         variance = variance / _products(job, pairs)
-    sigma = noise_of_average(variance, found)
+    sigma = np.concatenate([noise_of_average(variance, found, block.times) for block in blocks])
     noise = averaged.copy()
     noise.data_array = np.nan_to_num(sigma).astype(complex)
     noise.flag_array = averaged.flag_array | ~np.isfinite(sigma)

@@ -26,11 +26,19 @@ from calstudy.products.files import (
     write_visibilities,
 )
 from calstudy.products.graph import once, required, size_of
-from calstudy.products.observed import ObservedGraph, average, calibrated, calibration_inputs, crossed, observed
+from calstudy.products.observed import (
+    ObservedGraph,
+    average,
+    averaging,
+    calibrated,
+    calibration_inputs,
+    crossed,
+    observed,
+)
 from calstudy.products.observed_quality import read_result
 from calstudy.products.observed_spectra import observed_spectra
 from calstudy.products.signal_loss import DIFFERENCE
-from calstudy.products.spectra import EXCISION, read_delay_spectra
+from calstudy.products.spectra import EXCISION, blocks_of, read_delay_spectra
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
 
@@ -91,7 +99,7 @@ def response(graph: ObservedGraph, parity: str) -> Task:
 def signal(graph: ObservedGraph, parity: str) -> Task:
     """Return the task of the averaged EoR of one half, as it is put in but for the gains."""
     inputs = {"eor": eor(graph, parity), "factor": factor(graph), "calibration": calibrated(graph, parity)}
-    return Task(AVERAGE_EOR, f"eor {parity}", {"centre": graph.halves.centre}, inputs)
+    return Task(AVERAGE_EOR, f"eor {parity}", averaging(graph), inputs)
 
 
 @once
@@ -206,7 +214,7 @@ def _signal(job: Job) -> UVData:
 def average_eor(job: Job) -> Mapping[str, Any]:
     """Write the average of the EoR to average.uvh5, with the baselines and flags of the residual."""
     from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
-    from calstudy.power.average import fringe_stop_and_average
+    from calstudy.power.average import average_in_blocks
 
     residual, sky = read_visibilities(job.inputs["calibration"] / RESIDUAL), _signal(job)
     pairs = antenna_pairs(residual)
@@ -215,8 +223,8 @@ def average_eor(job: Job) -> Mapping[str, Any]:
     residual = residual.select(blt_inds=rows, inplace=False, run_check=False)
     places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(sky).tolist())}
     cube = to_cube(sky)[:, [places[tuple(pair)] for pair in antenna_pairs(residual).tolist()]]
-    averaged = fringe_stop_and_average(from_cube(residual, cube), job.settings["centre"])
-    write_visibilities(averaged, job.output / AVERAGE)
+    signal = from_cube(residual, cube)
+    write_visibilities(average_in_blocks(signal, blocks_of(job, signal)), job.output / AVERAGE)
     return {}
 
 

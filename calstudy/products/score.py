@@ -171,7 +171,7 @@ def _solves(job: Job) -> dict[str, Any]:
 
 def _cost(task: Task) -> Cost:
     samples = size_of(task).samples
-    return Cost(4 + samples * 1e-6, LIBRARIES_MEMORY + 8 * samples * COMPLEX128, 1e6)
+    return Cost(0.5 + samples * 1.5e-7, LIBRARIES_MEMORY + 8 * samples * COMPLEX128, 1e6)
 
 
 SCORE = Stage(name="score", version=1, make=make_score, cost=_cost)

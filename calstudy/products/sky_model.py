@@ -138,7 +138,7 @@ def _cost_of_reading(task: Task) -> Cost:
 
 def _cost_of_error(task: Task) -> Cost:
     samples = size_of(task).samples
-    return Cost(2 + samples * 1e-7, LIBRARIES_MEMORY + 4 * samples * COMPLEX128, 1e3)
+    return Cost(0.3 + samples * 1e-7, LIBRARIES_MEMORY + 4 * samples * COMPLEX128, 1e3)
 
 
 READ = Stage(name="sky-model", version=1, make=read, cost=_cost_of_reading)

@@ -18,14 +18,17 @@ from calstudy.run.task import Job, Stage, Task
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pyuvdata import UVData
+
+    from calstudy.power.average import Block
     from calstudy.power.spectra import DelaySpectra
 
 # Inputs of the spectra besides the variants, whose names cannot hold a colon.
 EOR_REFERENCE, NOISE_REFERENCE = "reference:eor", "reference:noise"
 EXCISION = {"all-modes": False, "outside-wedge": True}
 """Names of the spherical averages, and whether each leaves the wedge out."""
-BINNING = ("bins", "wedge_buffer", "length_bin")
-"""Fields of the power section that apply to the spectra later, when they are averaged."""
+NOT_OF_DELAY_SPECTRA = ("coherent_time", "bins", "wedge_buffer", "length_bin")
+"""Fields of the power section that apply before delay spectra are made, or later, when they are averaged."""
 DELAY_SPECTRA = "delay-spectra.h5"
 
 
@@ -46,7 +49,10 @@ def average(graph: Graph, variant: Variant, parity: str) -> Task:
     source = make(graph, variant, parity)
     label = f"R of {source.label}" if variant.calibrate else source.label
     file = RESIDUAL if variant.calibrate else DATA
-    return Task(AVERAGE_STAGE, label, {"file": file}, {"data": source})
+    times = graph.experiment.instrument.times
+    count = graph.experiment.power.n_blocks(times.integration * times.count, times.integration)
+    settings = {"file": file} if count == 1 else {"file": file, "blocks": count}
+    return Task(AVERAGE_STAGE, label, settings, {"data": source})
 
 
 def power(graph: Graph, name: str) -> Task:
@@ -86,7 +92,7 @@ def crossed(graph: Graph, label: str, averages: Mapping[str, Task]) -> Task:
     settings = {
         "beam": instrument.beam,
         "channels": instrument.channels,
-        "power": graph.experiment.power.reset(*BINNING),
+        "power": graph.experiment.power.reset(*NOT_OF_DELAY_SPECTRA),
     }
     return Task(POWER, label, settings, averages)
 
@@ -108,12 +114,27 @@ def _reference(graph: Graph, component: Component) -> Task:
 
 
 def make_average(job: Job) -> Mapping[str, Any]:
-    """Write the fringe-stopped average of a data set to average.uvh5."""
-    from calstudy.power.average import fringe_stop_and_average
+    """Write the fringe-stopped average of a data set, or those of its blocks, to average.uvh5."""
+    from calstudy.power.average import average_in_blocks
 
     data = read_visibilities(job.inputs["data"] / job.settings["file"])
-    write_visibilities(fringe_stop_and_average(data), job.output / AVERAGE)
+    write_visibilities(average_in_blocks(data, blocks_of(job, data)), job.output / AVERAGE)
     return {}
+
+
+def blocks_of(job: Job, data: UVData) -> list[Block]:
+    """Return the blocks in which the settings of a task divide a data set.
+
+    So many as `blocks` within `span`, otherwise one, with the phase centre `centre`.
+    """
+    import numpy as np
+
+    from calstudy.power.average import Block, divide
+
+    times, settings = np.unique(data.time_array), job.settings
+    if "blocks" not in settings:
+        return [Block(np.arange(times.size), settings.get("centre"))]
+    return divide(times, float(data.integration_time[0]), settings["blocks"], settings.get("span"))
 
 
 def estimate(job: Job) -> Mapping[str, Any]:
@@ -181,15 +202,16 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
 
 
 def _cost_of_average(task: Task) -> Cost:
-    size = size_of(task)
-    disk = size.samples / size.times * COMPLEX128
-    return Cost(1 + size.samples * 5e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
+    size, blocks = size_of(task), task.settings.get("blocks", 1)
+    disk = blocks * size.samples / size.times * COMPLEX128
+    return Cost(1 + 0.15 * (blocks - 1) + size.samples * 5e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
 
 
 def _cost_of_power(task: Task) -> Cost:
-    size = size_of(task)
-    # The file of the estimator, the spectra, and what each unit owes to its antennas.
-    return Cost(6, 1.6e9, 4 * size.baselines * size.channels.count * COMPLEX128)
+    size, blocks = size_of(task), max(average.settings.get("blocks", 1) for average in task.inputs.values())
+    # Each block has a file of the estimator; spectra and what each unit owes to its antennas are of all.
+    disk = (3 + blocks) * size.baselines * size.channels.count * COMPLEX128
+    return Cost(6 + (blocks - 1) * (0.9 + 0.005 * size.baselines), 1.6e9, disk)
 
 
 AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)

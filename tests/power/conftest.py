@@ -55,12 +55,12 @@ def observe():
     from calstudy.instrument.settings import Channels, InstrumentSettings, Times
     from calstudy.instrument.telescope import make_template
 
-    def make(layout, n_channels=32, n_times=1, polarizations=("xx",), width=80e3):
+    def make(layout, n_channels=32, n_times=1, polarizations=("xx",), width=80e3, integration=2.0):
         return make_template(
             InstrumentSettings(
                 layout=layout,
                 channels=Channels(first="180 MHz", width=f"{width} Hz", count=n_channels),
-                times=Times(count=n_times),
+                times=Times(count=n_times, integration=f"{integration} s"),
                 polarizations=polarizations,
             )
         )
@@ -79,3 +79,28 @@ def white():
         return from_cube(template, sigma / np.sqrt(2) * noise)
 
     return fill
+
+
+@pytest.fixture(scope="session")
+def drifting_source():
+    """Return a function that fills an observation with a source of 1 Jy that drifts over it."""
+    from astropy import constants
+    from astropy.coordinates import AltAz
+    from astropy.time import Time
+
+    from calstudy.base.visibilities import baseline_vectors, from_cube
+
+    def visibilities(template, position):
+        """Visibilities exp(2 pi i nu b.s / c) of a source of 1 Jy at `position`, without a beam."""
+        vectors = baseline_vectors(template)
+        times = np.unique(template.time_array)
+        horizontal = position.transform_to(
+            AltAz(obstime=Time(times, format="jd"), location=template.telescope.location)
+        )
+        east = np.cos(horizontal.alt) * np.sin(horizontal.az)
+        north = np.cos(horizontal.alt) * np.cos(horizontal.az)
+        directions = np.stack([east, north, np.sin(horizontal.alt)], axis=1).value
+        delays = directions @ vectors.T / constants.c.value
+        return from_cube(template, np.exp(2j * np.pi * delays[..., None, None] * template.freq_array[:, None]))
+
+    return visibilities

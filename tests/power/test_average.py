@@ -2,26 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from astropy import constants
 from astropy import units as u
 from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
 
-from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
+from calstudy.base.visibilities import baseline_vectors, to_cube
 from calstudy.instrument.settings import GolombLayout, MwaLayout
 from calstudy.power.average import fringe_stop_and_average
-
-
-def drifting_source(template, position):
-    """Visibilities exp(2 pi i nu b.s / c) of a source of 1 Jy at `position`, without a beam."""
-    vectors = baseline_vectors(template)
-    times = np.unique(template.time_array)
-    horizontal = position.transform_to(AltAz(obstime=Time(times, format="jd"), location=template.telescope.location))
-    east = np.cos(horizontal.alt) * np.sin(horizontal.az)
-    north = np.cos(horizontal.alt) * np.cos(horizontal.az)
-    directions = np.stack([east, north, np.sin(horizontal.alt)], axis=1).value
-    delays = directions @ vectors.T / constants.c.value
-    return from_cube(template, np.exp(2j * np.pi * delays[..., None, None] * template.freq_array[:, None]))
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +22,13 @@ def zenith(template):
     return SkyCoord(alt=90 * u.deg, az=0 * u.deg, frame=AltAz(obstime=middle, location=location)).icrs
 
 
-def test_a_source_at_the_zenith_keeps_its_flux_and_has_no_phase(run):
+def test_a_source_at_the_zenith_keeps_its_flux_and_has_no_phase(run, drifting_source):
     averaged = fringe_stop_and_average(drifting_source(run, zenith(run)))
     assert averaged.Ntimes == 1
     np.testing.assert_allclose(averaged.data_array, 1.0, atol=2e-3)
 
 
-def test_a_long_drift_needs_the_fringe_stop(observe):
+def test_a_long_drift_needs_the_fringe_stop(observe, drifting_source):
     template = observe(GolombLayout(kind="golomb", count=8, spacing="60 m"), n_channels=8, n_times=40)
     uvd = drifting_source(template, zenith(template))
     longest = np.argmax(np.linalg.norm(baseline_vectors(template), axis=1))
