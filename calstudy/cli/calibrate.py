@@ -152,8 +152,6 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
     from calstudy.calibrate.settings import GainFit
     from calstudy.measured.selection import parse_selection
     from calstudy.observed.output import EXPECTED, describe, require_free, write_result
-    from calstudy.observed.pieces import Given, pieces_folder
-    from calstudy.products.files import quiet_libraries
 
     selection = parse_selection(request.selections)
     if isinstance(calibrator, GainFit) and calibrator.weights.kind == "autos":
@@ -161,6 +159,10 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
     require_free(request.output, request.extras, request.overwrite)
     if EXPECTED in request.extras and not isinstance(calibrator, GainFit):
         raise InputError(f"--expected-loss: is known for fits by least squares, and {calibrator.label} is none")
+    # These import pyuvdata: after what can be refused without it.
+    from calstudy.observed.pieces import Given, pieces_folder
+    from calstudy.products.files import quiet_libraries
+
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     started = time.perf_counter()
     with quiet_libraries():
