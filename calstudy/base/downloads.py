@@ -6,14 +6,13 @@ import hashlib
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import pooch
-import requests
-
 from calstudy.base.errors import InputError
 
 
 def default_directory() -> Path:
     """Return where downloads are kept on this machine."""
+    import pooch
+
     return Path(pooch.os_cache("calstudy"))
 
 
@@ -44,6 +43,9 @@ def download(url: str, path: Path, instead: str, known_hash: str | None = None, 
     InputError
         If the server cannot be reached or has no such file, the folder cannot be written, or the hash is another.
     """
+    import pooch
+    import requests
+
     host = urlsplit(url).hostname
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

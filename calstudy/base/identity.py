@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from calstudy.base.plugins import Plugin, digest_file
+from calstudy.base.schema import defaults
 
 
 def digest_json(value: Any) -> str:
@@ -51,13 +52,14 @@ def _identity_of_folder(folder: Path) -> dict[str, str]:
 
 def _identity_of_section(section: BaseModel) -> dict[str, Any]:
     found = {}
-    for name, field in type(section).model_fields.items():
-        value = getattr(section, name)
+    fields = type(section).model_fields
+    for name, default in defaults(type(section)).items():
+        value, extra = getattr(section, name), fields[name].json_schema_extra
         if isinstance(section, Plugin) and name == section.registry.tag:
             found[name] = section.registry.identity(value)
-        elif isinstance(field.json_schema_extra, dict) and field.json_schema_extra.get("keyed") is False:
+        elif isinstance(extra, dict) and extra.get("keyed") is False:
             continue
-        elif value != (default := field.get_default(call_default_factory=True)):
+        elif value != default:
             content = identity(value)
             # A block that differs in nothing that counts is left out as well.
             if not (type(value) is type(default) and isinstance(value, BaseModel) and content == identity(default)):

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.constants import speed_of_light
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.calibrate.settings import BasisSettings
 
@@ -85,17 +85,22 @@ def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarra
     It is ``max(horizon * length / c, min_delay) + buffer``, rounded up to a multiple of `delay_step`; autocorrelations
     have length zero.
     """
-    reach = np.maximum(settings.horizon * np.asarray(lengths, float) / speed_of_light, settings.min_delay)
+    reach = np.maximum(settings.horizon * np.asarray(lengths, float) / SPEED_OF_LIGHT, settings.min_delay)
     # Without the inner rounding, binary dust would push exact multiples up by a whole step.
     return np.ceil(np.round((reach + settings.buffer) / settings.delay_step, 6)) * settings.delay_step
+
+
+def _most_sequences(n_frequencies: int, half_bandwidth: float) -> int:
+    """Return how many sequences are asked for, of which those below the cutoff are left out."""
+    return min(n_frequencies, int(2 * half_bandwidth) + EXTRA_SEQUENCES)
 
 
 @lru_cache(maxsize=256)
 def _sequences(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the sequences of `dpss_vectors`, and their concentrations, (Nvec,)."""
-    n_asked = min(n_frequencies, int(2 * half_bandwidth) + EXTRA_SEQUENCES)
     from scipy.signal.windows import dpss
 
+    n_asked = _most_sequences(n_frequencies, half_bandwidth)
     vectors, concentrations = dpss(n_frequencies, half_bandwidth, Kmax=n_asked, return_ratios=True)
     # Concentrations fall monotonically until rounding; what follows the first below the cutoff is noise.
     below = concentrations < eigenvalue_cutoff
@@ -202,6 +207,25 @@ def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -
     return np.ascontiguousarray(left[:, singular**2 > eigenvalue_cutoff])
 
 
+def gain_vectors(frequencies: np.ndarray, delay: float, eigenvalue_cutoff: float) -> np.ndarray:
+    """Return orthonormal sequences that hold gains with delays up to `delay` s, shape (Nfreqs, Ngain).
+
+    Parameters
+    ----------
+    frequencies
+        Channel centres on an even grid, gaps allowed, Hz, shape (Nfreqs,).
+    delay
+        Half-width in s; the basis is all of the channels if they do not resolve it.
+    eigenvalue_cutoff
+        Sequences with a smaller spectral concentration are left out.
+    """
+    grid = channel_grid(frequencies)
+    if delay * grid.width >= 0.5:
+        return np.eye(len(frequencies))
+    vectors = dpss_vectors(grid.n_channels, grid.n_channels * grid.width * delay, eigenvalue_cutoff)
+    return restrict(vectors, grid, eigenvalue_cutoff)
+
+
 def make_basis(
     lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings, prior: bool = False
 ) -> ForegroundBasis:
@@ -249,3 +273,21 @@ def make_basis(
             )
         buckets.append(Bucket(float(half_width), np.flatnonzero(half_widths == half_width), vectors))
     return ForegroundBasis(tuple(buckets), len(half_widths), n_frequencies)
+
+
+def require_room(length: float, frequencies: np.ndarray, settings: BasisSettings) -> None:
+    """Raise InputError if a baseline of this length cannot have a foreground basis; see `make_basis`.
+
+    Parameters
+    ----------
+    length
+        m.
+    frequencies, settings
+        As for `make_basis`.
+    """
+    grid = channel_grid(np.asarray(frequencies, float))
+    product = delay_half_widths(np.array([length]), settings)[0] * grid.width
+    # A plan is faster where the sequences, and scipy.signal for them, are not needed to see that there is room.
+    if 0 < product < 0.5 and _most_sequences(grid.n_channels, grid.n_channels * product) < len(frequencies):
+        return
+    make_basis(np.array([length]), frequencies, settings)

@@ -10,26 +10,6 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.basis import channel_grid, dpss_vectors, restrict
-
-
-def gain_vectors(frequencies: np.ndarray, delay: float, eigenvalue_cutoff: float) -> np.ndarray:
-    """Return orthonormal sequences that hold gains with delays up to `delay` s, shape (Nfreqs, Ngain).
-
-    Parameters
-    ----------
-    frequencies
-        Channel centres on an even grid, gaps allowed, Hz, shape (Nfreqs,).
-    delay
-        Half-width in s; the basis is all of the channels if they do not resolve it.
-    eigenvalue_cutoff
-        Sequences with a smaller spectral concentration are left out.
-    """
-    grid = channel_grid(frequencies)
-    if delay * grid.width >= 0.5:
-        return np.eye(len(frequencies))
-    vectors = dpss_vectors(grid.n_channels, grid.n_channels * grid.width * delay, eigenvalue_cutoff)
-    return restrict(vectors, grid, eigenvalue_cutoff)
 
 
 class GainSpace:
@@ -38,7 +18,7 @@ class GainSpace:
     Parameters
     ----------
     vectors
-        Orthonormal, (Nfreqs, Ngain), or None for no restriction.
+        Orthonormal, (Nfreqs, Ngain), as from `calstudy.calibrate.basis.gain_vectors`, or None for no restriction.
     dtype
         Of all tensors that pass through.
     """

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calstudy.base.observation import Frame
-from calstudy.calibrate.basis import Bucket, ForegroundBasis, make_basis
-from calstudy.calibrate.gain_space import gain_vectors
+from calstudy.calibrate.basis import Bucket, ForegroundBasis, gain_vectors, make_basis
 from calstudy.calibrate.joint import PlacedGroup, other_baselines, place_groups, read_joint_groups
 from calstudy.calibrate.problem import FitStructure
 from calstudy.calibrate.settings import BasisSettings, ForegroundFit, GainFit

@@ -150,13 +150,8 @@ def _weights(text: str | None) -> Any:
 def _run(request: _Request, calibrator: Calibrator) -> int:
     from calstudy.base.quiet import load_tensorflow
     from calstudy.calibrate.settings import GainFit
-
-    if isinstance(calibrator, GainFit):
-        load_tensorflow()
     from calstudy.measured.selection import parse_selection
     from calstudy.observed.output import EXPECTED, describe, require_free, write_result
-    from calstudy.observed.pieces import Given, pieces_folder
-    from calstudy.products.files import quiet_libraries
 
     selection = parse_selection(request.selections)
     if isinstance(calibrator, GainFit) and calibrator.weights.kind == "autos":
@@ -164,6 +159,10 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
     require_free(request.output, request.extras, request.overwrite)
     if EXPECTED in request.extras and not isinstance(calibrator, GainFit):
         raise InputError(f"--expected-loss: is known for fits by least squares, and {calibrator.label} is none")
+    # These import pyuvdata: after what can be refused without it.
+    from calstudy.observed.pieces import Given, pieces_folder
+    from calstudy.products.files import quiet_libraries
+
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     started = time.perf_counter()
     with quiet_libraries():
@@ -175,6 +174,9 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
         console.print(plan, markup=False)
         if request.dry_run:
             return 0
+        # Seconds, after all that can be refused.
+        if isinstance(calibrator, GainFit):
+            load_tensorflow()
         context: dict[str, Any] = {
             "data": [str(path) for path in request.paths],
             "sky_model": None if request.sky_path is None else str(request.sky_path),

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.gains import inspected_calibration
@@ -21,6 +19,10 @@ from calstudy.products.files import DATA, MODEL, RESIDUAL
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, scatter_of_noise
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)

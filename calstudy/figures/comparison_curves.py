@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from calstudy.figures import CasesFigure
 from calstudy.figures.comparison_spectra import look
@@ -15,6 +14,9 @@ from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.run.task import Job
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LINEAR = 0.01
 """The axis of the bias is linear up to this, and logarithmic beyond."""
@@ -38,6 +40,8 @@ def draw_curves(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
+    from matplotlib.lines import Line2D
+
     worlds = list(cases)
     edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     figure = style.new_figure(style.TWO_COLUMNS, 4.2)

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 
 from calstudy.figures import CasesFigure
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.run.task import Job
 
-SHADES = LogNorm(1e-2, 1e2)
-COLOURS = colormaps["YlOrRd"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+
+LIMITS, COLOURS = (1e-2, 1e2), "YlOrRd"
+"""Of the bias, and the scale of colours between them."""
 DARK = 10.0
 """Above this bias the text is white."""
 ROW_HEIGHT, HEADING_HEIGHT = 0.3, 0.45
@@ -45,17 +46,21 @@ def draw_matrix(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+
     worlds = list(cases)
     edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     n_bands = edges.size - 1
     height = n_bands * (HEADING_HEIGHT + ROW_HEIGHT * len(calibrators)) + 0.4
     figure = style.new_figure(style.TWO_COLUMNS if len(worlds) > 2 else style.ONE_COLUMN + 1, height)
     panels = figure.subplots(n_bands, 1, squeeze=False, sharex=True)[:, 0]
+    shades = ScalarMappable(LogNorm(*LIMITS), COLOURS)
     for band, axes in enumerate(panels):
-        _draw_band(axes, cases, calibrators, band)
+        _draw_band(axes, cases, calibrators, band, shades)
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
     _name_worlds(panels[-1], worlds)
-    bar = figure.colorbar(ScalarMappable(SHADES, COLOURS), ax=panels, extend="both", aspect=40, pad=0.01)
+    bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$")
     style.note_stand_ins(figure, stand_ins)
     return figure
@@ -70,7 +75,13 @@ def _name_worlds(axes: Axes, worlds: Sequence[str]) -> None:
         axes.set_xticks(range(len(worlds)), worlds, rotation=30, ha="right", rotation_mode="anchor")
 
 
-def _draw_band(axes: Axes, cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], band: int) -> None:
+def _draw_band(
+    axes: Axes,
+    cases: Mapping[str, Mapping[str, Case]],
+    calibrators: Sequence[str],
+    band: int,
+    shades: ScalarMappable,
+) -> None:
     colours = np.full((len(calibrators), len(cases), 4), 1.0)
     for column, found in enumerate(cases.values()):
         for row, name in enumerate(calibrators):
@@ -81,7 +92,7 @@ def _draw_band(axes: Axes, cases: Mapping[str, Mapping[str, Case]], calibrators:
             bias, error = case.bands.bias[band], case.bands.bias_error[band]
             shown = max(abs(bias), SIGNIFICANT * error) if np.isfinite(error) else abs(bias)
             if np.isfinite(shown):
-                colours[row, column] = COLOURS(SHADES(shown))
+                colours[row, column] = shades.to_rgba(shown)
             axes.text(
                 column,
                 row,

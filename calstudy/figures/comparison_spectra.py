@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from calstudy.figures import CasesFigure
 from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.run.task import Job
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
@@ -52,6 +53,8 @@ def draw_spectra(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
+    from matplotlib.lines import Line2D
+
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(cases))
     grid = figure.subplots(len(cases), 2, squeeze=False, sharex=True)
     for (left, right), (world, found) in zip(grid, cases.items(), strict=True):

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from calstudy.base.errors import InputError
 from calstudy.figures import CasesFigure
@@ -17,6 +15,10 @@ from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import BAND, LIMIT, Fault, faults
 from calstudy.run.task import Job
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 ROW_HEIGHT = 1.7
 LINEAR = 0.01
@@ -47,6 +49,8 @@ def draw_tolerances(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
+    from matplotlib.lines import Line2D
+
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(found))
     grid = figure.subplots(len(found), 2, squeeze=False)
     for (left, right), fault in zip(grid, found, strict=True):

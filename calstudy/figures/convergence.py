@@ -6,12 +6,9 @@ import csv
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from calstudy.calibrate.bias import ratio_over_antennas
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
@@ -23,6 +20,10 @@ from calstudy.products.files import read_json
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
 BIAS = r"$|P^{R}|\,/\,P^{S}$, no EoR in the data"
@@ -80,6 +81,8 @@ def draw_convergence(
     ValueError
         If there is no path.
     """
+    from matplotlib.ticker import FuncFormatter
+
     if not paths:
         raise ValueError("a figure of convergence has no solver, expected at least one")
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)

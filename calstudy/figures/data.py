@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.gains import inspected, inspected_calibration
@@ -21,6 +19,9 @@ from calstudy.products.files import DATA, MODEL
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, rms_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @style.journal_style()

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.figures import Drawing, StudyFigure
@@ -21,6 +19,9 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half, power_over_samples, spread_of_scale, typical_error
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from calstudy.power.expected import ExpectedBins
     from calstudy.power.transfer import TransferFunction, TransferMap
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -19,6 +16,10 @@ from calstudy.products import calibration, corruption
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, departure_from_mean, rms_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 ANTENNA_COLOURS = ((style.BLUE, "#003A5C"), (style.ORANGE, "#7A5300"))
 """Colours of true and of recovered gains, for each antenna."""
@@ -104,6 +105,8 @@ def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: 
 
 
 def _add_legend(figure: Figure, antennas: tuple[int, int]) -> None:
+    from matplotlib.lines import Line2D
+
     handles = []
     for number, (bright, dark) in zip(antennas, ANTENNA_COLOURS, strict=True):
         looks: tuple[tuple[str, dict[str, Any]], ...] = (

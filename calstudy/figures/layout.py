@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from scipy.spatial.distance import pdist
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.instrument.settings import Layout as LayoutSettings
 from calstudy.plotting import style
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 NUMBERED_ANTENNAS = 64
 """Arrays of more antennas than this are drawn without their numbers."""
@@ -63,6 +64,8 @@ def draw_layouts(panels: Sequence[LayoutPanel], stand_ins: Sequence[str] = ()) -
 
 
 def _draw_array(axes: Axes, panel: LayoutPanel) -> None:
+    from scipy.spatial.distance import pdist
+
     numbers, east_north = np.asarray(panel.numbers), np.asarray(panel.enu, dtype=float)[:, :2]
     if numbers.shape != (len(east_north),):
         raise ValueError(f"layout '{panel.title}': {numbers.size} antenna numbers for {len(east_north)} positions")

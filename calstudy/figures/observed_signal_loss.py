@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from calstudy.figures import Drawing, ObservedFigure
 from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
@@ -21,6 +20,8 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from calstudy.power.expected import ExpectedBins
     from calstudy.power.transfer import TransferFunction, TransferMap
     from calstudy.products.observed import ObservedGraph

@@ -6,9 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from calstudy.figures import Drawing, ObservedFigure
 from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
@@ -19,6 +16,9 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from calstudy.power.spectra import SphericalSpectrum
     from calstudy.products.observed import ObservedGraph
 
@@ -47,6 +47,8 @@ def draw_observed(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
+    from matplotlib.ticker import LogLocator, StrMethodFormatter
+
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
     grid = figure.subplots(1, len(columns), sharex=True, sharey=True, squeeze=False)[0]
     for axes, (modes, series) in zip(grid, columns.items(), strict=True):

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from pydantic import Field
 
 from calstudy.base.units import Wavenumber
@@ -23,6 +21,9 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Arrays, Drawn, Fixed, Measured
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from calstudy.products.realization_results import RegionResults
 
 OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"

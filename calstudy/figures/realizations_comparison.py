@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from pydantic import Field
 
 from calstudy.base.errors import InputError
@@ -21,6 +20,8 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Measured
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from calstudy.power.realizations import Pooled, PooledRegion
 
 REGION = "outside-wedge"

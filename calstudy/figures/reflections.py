@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -15,6 +14,9 @@ from calstudy.plotting.panels import delay_panel
 from calstudy.products import corruption
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @style.journal_style()

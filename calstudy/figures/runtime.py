@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
-
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from typing import TYPE_CHECKING, Any, Literal
 
 from calstudy.bench.scaling import RuntimeSeries, summarize_runtime
 from calstudy.experiment.model import Experiment
@@ -17,6 +14,9 @@ from calstudy.products.graph import Graph
 from calstudy.products.run_times import CASE
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import MACHINE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA)
 MARKERS = ("o", "s", "D", "^")
@@ -61,6 +61,8 @@ def draw_runtime(
     ValueError
         If there are not one to eight series.
     """
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     if not 1 <= len(series) <= MOST:
         raise ValueError(f"a run-time figure has 1 to {MOST} series, not {len(series)}")
     figure = style.new_figure(style.ONE_COLUMN, 2.7 + 0.14 * len(series))

@@ -7,10 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.figures import Drawing, StudyFigure
@@ -30,6 +26,9 @@ from calstudy.verdicts.tolerances import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from calstudy.power.transfer import TransferFunction, TransferMap
 
 SIGMAS_95 = 1.96
@@ -152,6 +151,9 @@ def _limits(loss: SignalLoss) -> tuple[float, float]:
 
 def draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, max_delay: float | None) -> None:
     """Draw T per baseline length and delay, with its colour bar; parameters as for `draw_signal_loss`."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
     norm = Normalize(0.0, 1.0)
     x, y, values = cells(transfer, transfer.transfer)
     axes.set_facecolor(EMPTY)

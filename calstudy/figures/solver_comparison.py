@@ -6,11 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from calstudy.base.errors import InputError
 from calstudy.figures import ComparisonFigure, Drawing
@@ -20,6 +15,9 @@ from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from calstudy.power.spectra import SphericalSpectrum
 
 ROWS = {"residual": r"$|P^{R}|$", "residual_without_eor": r"$|P^{R}|$, no EoR"}
@@ -53,6 +51,8 @@ def draw_solver_comparison(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
+    from matplotlib.ticker import LogLocator, StrMethodFormatter
+
     figure = style.new_figure(style.TWO_COLUMNS, 5.6)
     figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
     grid = figure.subplots(2, len(arrays), sharex=True, sharey="row", squeeze=False)
@@ -98,6 +98,9 @@ def _limits(shown: Sequence[SphericalColumn], name: str, last_k: float) -> tuple
 
 
 def _add_legend(figure: Figure) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
     handles: list[Any] = []
     for marking in SOLVERS:
         shape: dict[str, Any] = {"marker": marking.marker, "color": marking.colour, "markersize": marking.size + 0.8}

@@ -8,11 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -23,6 +18,9 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from calstudy.power.spectra import SphericalSpectrum
 
 SIGMAS_95 = 1.96
@@ -103,6 +101,8 @@ def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stan
     ValueError
         If there are not one or two columns, a spectrum has no power at all, or a power has no error bar.
     """
+    from matplotlib.ticker import LogLocator, StrMethodFormatter
+
     if len(columns) not in (1, 2):
         raise ValueError(f"a spherical figure has 1 or 2 columns, not {len(columns)}")
     for column in columns:
@@ -229,6 +229,9 @@ def _k_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
 
 
 def _add_legend(figure: Figure, columns: Sequence[SphericalColumn]) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
     handles: list[Any] = []
     labels: list[str] = []
     for name in LEGEND_ORDER:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from calstudy.figures import ComparisonFigure, Drawing
 from calstudy.figures.spherical import SphericalColumn, draw_spherical, read_column
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def draw_spherical_comparison(

@@ -11,9 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from calstudy.experiment.files import short_names
 from calstudy.experiment.model import Experiment
@@ -26,6 +23,9 @@ from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from calstudy.power.transfer import TransferFunction
 
 SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
@@ -152,6 +152,8 @@ def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
 
 
 def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> None:
+    from matplotlib.lines import Line2D
+
     labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
     handles: list[Any] = [
         axes.errorbar([], [], yerr=[], fmt=marker, color=colour, elinewidth=0.7)

@@ -7,11 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, LogNorm
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -23,13 +18,15 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, cylindrical_error
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm
+    from matplotlib.figure import Figure
+
     from calstudy.power.spectra import CylindricalSpectrum
 
 # Yellow against blue: signs stay apart for every kind of colour vision, and both darken with |P|.
-POSITIVE = LinearSegmentedColormap.from_list(
-    "positive power", ["#fffbe0", "#fbd65c", "#ee8a1e", "#c23a2b", "#76134f", "#1d0b2e"]
-)
-NEGATIVE = LinearSegmentedColormap.from_list("negative power", ["#e3f1fb", "#7fbfe8", "#2b7bbd", "#0b3a75"])
+POSITIVE = ("#fffbe0", "#fbd65c", "#ee8a1e", "#c23a2b", "#76134f", "#1d0b2e")
+NEGATIVE = ("#e3f1fb", "#7fbfe8", "#2b7bbd", "#0b3a75")
 EMPTY = "0.8"
 
 
@@ -101,6 +98,8 @@ def draw_panels(
     stand_ins: Sequence[str] = (),
 ) -> Figure:
     """Draw the real parts of several cylindrical power spectra, by their names; for the rest see `draw_wedge`."""
+    from matplotlib.colors import LogNorm
+
     first = next(iter(spectra.values()))
     for name, spectrum in spectra.items():
         _check(name, spectrum, first.delay)
@@ -120,6 +119,13 @@ def draw_panels(
     _colour_bars(figure, grid, norms)
     style.note_stand_ins(figure, stand_ins)
     return figure
+
+
+def colour_map(colours: Sequence[str]) -> LinearSegmentedColormap:
+    """Return the scale from the first to the last of some colours: `POSITIVE` or `NEGATIVE` for power."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("power", list(colours))
 
 
 def _check(name: str, spectrum: CylindricalSpectrum, delay: np.ndarray) -> None:
@@ -153,17 +159,20 @@ def _draw_power(axes: Axes, spectrum: CylindricalSpectrum, floor: float, norms: 
         drawn = power >= 0 if sign > 0 else power < 0
         signed = np.ma.masked_where(~drawn, sign * power)
         # Fainter than the scale, exact zeros included, is not missing: it has the lowest colour.
-        axes.pcolormesh(x, y, np.ma.maximum(signed, floor), norm=norm, cmap=colours, rasterized=True)
+        axes.pcolormesh(x, y, np.ma.maximum(signed, floor), norm=norm, cmap=colour_map(colours), rasterized=True)
 
 
 def _colour_bars(figure: Figure, grid: np.ndarray, norms: tuple[LogNorm, LogNorm]) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.ticker import LogLocator
+
     columns = max(len(grid) - 2, 1)
     settings: dict[str, Any] = {"location": "bottom", "aspect": 30, "pad": 0.03, "fraction": 0.05}
     for norm, colours, shared, label in (
         (norms[0], POSITIVE, grid[:columns], rf"$P > 0$ ({style.POWER_UNIT})"),
         (norms[1], NEGATIVE, grid[columns:], rf"$-P$ where $P < 0$ ({style.POWER_UNIT})"),
     ):
-        bar = figure.colorbar(ScalarMappable(norm, colours), ax=list(shared), **settings)
+        bar = figure.colorbar(ScalarMappable(norm, colour_map(colours)), ax=list(shared), **settings)
         bar.ax.xaxis.set_major_locator(LogLocator(numticks=8))
         bar.ax.xaxis.set_minor_locator(LogLocator(numticks=99))
         bar.ax.tick_params(which="both", direction="out")

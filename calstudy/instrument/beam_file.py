@@ -43,11 +43,13 @@ def find_beam() -> Path:
     InputError
         If there is neither.
     """
-    places = (Path(str(files("mwa_pb") / "data" / FILE)), default_directory() / FILE)
-    found = next((path for path in places if path.is_file()), None)
-    if found is None:
+    packaged = Path(str(files("mwa_pb") / "data" / FILE))
+    if packaged.is_file():
+        return packaged
+    downloaded = default_directory() / FILE
+    if not downloaded.is_file():
         raise InputError(
             "instrument.beam: the mwa_pb package was installed without its beam file; download it with "
             "'calstudy data fetch beam', or set instrument.beam.path to a file"
         )
-    return found
+    return downloaded

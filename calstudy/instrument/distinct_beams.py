@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calstudy.base.plugins import Plugin
-from calstudy.instrument.as_built import Misalignment, dipole_amplitudes, misalignments
+from calstudy.instrument.as_built import BeamErrors, Misalignment, dipole_amplitudes, misalignments
 from calstudy.instrument.settings import InstrumentSettings
 
 
@@ -36,6 +36,14 @@ def nominal_beams(settings: InstrumentSettings) -> list[Plugin]:
         if group.beam not in distinct:
             distinct.append(group.beam)
     return distinct
+
+
+def beam_count(settings: InstrumentSettings, count: int) -> int:
+    """Return how many different beams `count` antennas have as built; parameters and errors as `assigned_beams`."""
+    built = settings.as_built
+    if not (settings.antenna_beams or built.dipoles.differ or built.beams != BeamErrors()):
+        return 1
+    return len(set(assigned_beams(settings, count)))
 
 
 def assigned_beams(settings: InstrumentSettings, count: int) -> list[AssignedBeam]:

@@ -8,16 +8,17 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.coordinates import EarthLocation
-from scipy.spatial.distance import pdist, squareform
 
 from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
 from calstudy.instrument.hera import SPACING, core_positions, outrigger_positions
-from calstudy.instrument.sites import SITES, earth_location, east_north_up
+from calstudy.instrument.sites import SITES, Place, east_north_up, place_of
+
+if TYPE_CHECKING:
+    from astropy.coordinates import EarthLocation
 
 
 def _tiles(receivers: Iterable[int]) -> tuple[str, ...]:
@@ -74,7 +75,7 @@ class Layout:
         Antenna names, unique.
     enu
         East, north, up in metres about the array centre, float64, shape (Nants, 3).
-    location
+    place
         Where the array is: its centre, for arrays at their own site.
     """
 
@@ -82,7 +83,12 @@ class Layout:
     numbers: np.ndarray
     names: tuple[str, ...]
     enu: np.ndarray
-    location: EarthLocation
+    place: Place
+
+    @property
+    def location(self) -> EarthLocation:
+        """Where the array is, as astropy has it."""
+        return self.place.location
 
 
 @dataclass(frozen=True)
@@ -137,7 +143,7 @@ def make_array(settings: section.InstrumentSettings) -> Layout:
     InputError
         If a CSV file is missing or does not hold antenna positions.
     """
-    return replace(make_layout(settings.layout), location=earth_location(settings.site))
+    return replace(make_layout(settings.layout), place=place_of(settings.site))
 
 
 def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
@@ -172,12 +178,12 @@ def _mwa(settings: section.MwaLayout) -> Layout:
         relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
     whole = next(tiles for tiles in MWA_CONFIGURATIONS if set(tiles) >= set(MWA_TILES[settings.kind]))
     tiles = MWA_TILES[settings.kind][: settings.count]
-    location = SITES["mwa"]
-    enu = east_north_up(np.array([relative[tile] for tile in whole]), location)
+    place = SITES["mwa"]
+    enu = east_north_up(np.array([relative[tile] for tile in whole]), place)
     # The table's heights are above the ellipsoid, not the array centre (+377.83 m in all of them).
     enu[:, 2] -= enu[:, 2].mean()
     numbers = np.array([whole.index(tile) for tile in tiles])
-    return Layout(settings.kind, numbers, tiles, enu[numbers], location)
+    return Layout(settings.kind, numbers, tiles, enu[numbers], place)
 
 
 def _synthetic(settings: section.ArrayLayout, positions: np.ndarray, prefix: str | None = None) -> Layout:
@@ -263,9 +269,9 @@ def _from_csv(path: Path) -> Layout:
         raise InputError(f"instrument.layout.path: antenna numbers (>= 0) and names in {path} must be unique")
     if not np.isfinite(enu).all():
         raise InputError(f"instrument.layout.path: positions in {path} must be finite")
-    distances = squareform(pdist(enu)) + np.diag(np.full(len(enu), np.inf))
-    first, second = np.unravel_index(distances.argmin(), distances.shape)
-    if distances[first, second] == 0:
+    same = np.triu((enu[:, None] == enu).all(axis=2), 1)
+    if same.any():
+        first, second = np.argwhere(same)[0]
         raise InputError(
             f"instrument.layout.path: antennas {names[first]!r} and {names[second]!r} in {path} are in the same place: "
             "a baseline of length zero"

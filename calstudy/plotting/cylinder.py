@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class Cylinder(Protocol):
@@ -112,6 +113,8 @@ def label_axes(axes: Axes, cylinder: Cylinder, max_delay: float | None) -> None:
     max_delay
         Upper end, s; all delays if None or larger than those.
     """
+    from matplotlib.ticker import MaxNLocator
+
     metres = ratio(cylinder.baseline_length, cylinder.k_perp)
     shortest, longest = cylinder.bin_edges[[0, -1], [0, 1]]
     top = delay_edges(cylinder.k_parallel)[-1]

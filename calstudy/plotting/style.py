@@ -6,11 +6,11 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from threading import RLock
+from typing import TYPE_CHECKING
 
-import matplotlib.style
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 ONE_COLUMN = 3.5
 """Width of a figure in one journal column, in inches."""
@@ -82,12 +82,17 @@ def journal_style() -> Iterator[None]:
     Matplotlib's settings are global to the process: they are as before on leaving, and a lock keeps two threads of a
     study from drawing at once.
     """
+    import matplotlib.style
+
     with _LOCK, matplotlib.style.context(["default", _PARAMETERS]):
         yield
 
 
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure of `width` × `height` inches that no pyplot state knows of."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from calstudy.plotting import style
 from calstudy.plotting.domains import TwoDomains, in_two_domains
 from calstudy.plotting.panels import delay_panel, frequency_and_delay, mark_horizon, name_baseline
 from calstudy.power.delay import horizon_delay
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)

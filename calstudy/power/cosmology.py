@@ -9,12 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from astropy import constants
-from astropy import units as u
-from scipy.integrate import quad
-from scipy.optimize import brentq
 
-from calstudy.base.constants import HYDROGEN_LINE
+from calstudy.base.constants import HYDROGEN_LINE, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     from astropy.cosmology import FLRW
@@ -39,12 +35,14 @@ def redshift(frequency: FloatOrArray) -> FloatOrArray:
 
 def transverse_scale(cosmology: FLRW, z: float) -> float:
     """Return X, the transverse comoving distance per angle at redshift `z`, in Mpc/rad."""
-    return float(cosmology.comoving_transverse_distance(z).to_value(u.Mpc))
+    return float(cosmology.comoving_transverse_distance(z).to_value("Mpc"))
 
 
 def radial_scale(cosmology: FLRW, z: float) -> float:
     """Return Y = c (1+z)^2 / (H(z) f21), the line-of-sight comoving distance per frequency at `z`, in Mpc/Hz."""
-    return float((constants.c / cosmology.H(z)).to_value(u.Mpc)) * (1.0 + z) ** 2 / HYDROGEN_LINE
+    from astropy import constants
+
+    return float((constants.c / cosmology.H(z)).to_value("Mpc")) * (1.0 + z) ** 2 / HYDROGEN_LINE
 
 
 def k_perpendicular(cosmology: FLRW, length: np.ndarray, frequency: float) -> np.ndarray:
@@ -59,7 +57,7 @@ def k_perpendicular(cosmology: FLRW, length: np.ndarray, frequency: float) -> np
     frequency
         Hz.
     """
-    wavelengths = np.asarray(length) * frequency / constants.c.value
+    wavelengths = np.asarray(length) * frequency / SPEED_OF_LIGHT
     return 2 * np.pi * wavelengths / transverse_scale(cosmology, redshift(frequency)) / cosmology.h
 
 
@@ -112,6 +110,9 @@ def hera_conversions(cosmology: FLRW, z: float) -> Cosmo_Conversions:
 
 def _effective_densities(cosmology: FLRW, z: float) -> tuple[float, float]:
     """Lambda and matter for which E^2 = Lambda + matter (1+z)^3 has astropy's H and comoving distance at `z`."""
+    from scipy.integrate import quad
+    from scipy.optimize import brentq
+
     expansion = float(cosmology.efunc(z)) ** 2
     distance = float((cosmology.comoving_distance(z) / cosmology.hubble_distance).decompose().value)
 

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.delay import horizon_delay
@@ -281,6 +279,9 @@ def _antenna_shares(
 
 def _units(uvp: UVPSpec, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the unit of each pair and the mean vector of each unit: units are baselines connected by `pairs`."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     baselines, positions = np.unique(pairs, return_inverse=True)
     first, second = positions.reshape(pairs.shape).T
     graph = coo_array((np.ones(first.size), (first, second)), shape=(baselines.size, baselines.size))

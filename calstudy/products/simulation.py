@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.instrument.distinct_beams import assigned_beams
+from calstudy.instrument.distinct_beams import beam_count
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, once
@@ -189,7 +189,7 @@ def _cost_of_chunk(task: Task) -> Cost:
     else:
         sources, spectral = _sources(task.settings), 0.0
         channels = frequencies
-    beams = len(set(assigned_beams(instrument, size.antennas)))
+    beams = beam_count(instrument, size.antennas)
     engine = simulation.engine.cost(SimulationSize(sources, times * channels / pieces, size.antennas, beams))
     disk = size.samples / size.channels.count * channels / pieces * COMPLEX128
     memory = engine.memory + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from calstudy.base.errors import InputError
 from calstudy.report.contents import Contents, read_contents
 from calstudy.report.pair import Pair, read_pair
@@ -27,6 +25,8 @@ def render_pair(pair: Pair) -> str:
 
 
 def _page(template: str, **values: Any) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     environment = Environment(
         loader=PackageLoader("calstudy.report", "."),
         autoescape=True,

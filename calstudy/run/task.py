@@ -93,7 +93,7 @@ class Task:
         """Inputs and pieces."""
         return {**self.inputs, **self.pieces}
 
-    @property
+    @cached_property
     def cost(self) -> Cost:
         """What making it takes."""
         return self.stage.cost(self)

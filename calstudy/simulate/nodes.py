@@ -9,12 +9,13 @@ the tolerance. It does not depend on the engine.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.constants import speed_of_light
 from scipy.special import jv
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.size import baseline_lengths
 
@@ -76,6 +77,7 @@ def _is_identity(matrix: np.ndarray) -> bool:
     return matrix.shape[0] == matrix.shape[1] and bool((matrix == np.eye(len(matrix))).all())
 
 
+@lru_cache(maxsize=256)
 def chebyshev_count(bandwidth: float, tolerance: float) -> int:
     """Return how many Chebyshev nodes interpolate every phasor of a bandwidth to a tolerance.
 
@@ -153,13 +155,13 @@ def time_bandwidth(template: UVData, beam_extent: float) -> float:
     pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
     length = np.linalg.norm(np.cross(baseline_vectors(template), pole), axis=1).max() + beam_extent
     rotation = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.ptp(times)
-    return float(np.pi * template.freq_array.max() / speed_of_light * length * rotation)
+    return float(np.pi * template.freq_array.max() / SPEED_OF_LIGHT * length * rotation)
 
 
 def frequency_bandwidth(template: UVData, beam_extent: float) -> float:
     """Return half the phase in radians through which the longest horizon delay turns across the band."""
     length = np.linalg.norm(baseline_vectors(template), axis=1).max() + beam_extent
-    return float(np.pi * length / speed_of_light * np.ptp(template.freq_array))
+    return float(np.pi * length / SPEED_OF_LIGHT * np.ptp(template.freq_array))
 
 
 def integration_times(template: UVData) -> np.ndarray:
@@ -191,8 +193,8 @@ def node_counts(instrument: InstrumentSettings, settings: Nodes) -> tuple[int, i
     length = baseline_lengths(instrument.layout)[0] + settings.beam_extent
     low, high = channels.band
     rotation = EARTH_ROTATION_RATE * times.integration * (times.count - 1)
-    in_time = chebyshev_count(np.pi * high / speed_of_light * length * rotation, settings.tolerance)
-    in_frequency = chebyshev_count(np.pi * length / speed_of_light * (high - low), settings.tolerance)
+    in_time = chebyshev_count(np.pi * high / SPEED_OF_LIGHT * length * rotation, settings.tolerance)
+    in_frequency = chebyshev_count(np.pi * length / SPEED_OF_LIGHT * (high - low), settings.tolerance)
     return min(in_time, times.count), min(in_frequency, channels.count)
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from calstudy.base import ranks
 from calstudy.base.errors import InputError
@@ -63,8 +66,8 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     # The parent process holds the libraries, too.
     memory -= LIBRARIES_MEMORY
     hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
-    cut = _stream(_cut(experiment, memory / hoped, targets), memory / hoped, targets)
-    needs = {task: task.cost.memory for task in _missing(targets(cut), cut.outputs.store)}
+    lean = _stream(_cut(_Work(experiment, targets), memory / hoped), memory / hoped)
+    cut, needs = lean.experiment, {task: task.cost.memory for task in lean.missing}
     if not needs:
         return cut, workers or hoped
     largest = max(needs, key=needs.__getitem__)
@@ -162,33 +165,49 @@ def _require_sharing(experiment: Experiment, workers: int | None, scheduler: str
         )
 
 
-def _cut(experiment: Experiment, share: float, targets: Targets) -> Experiment:
+@dataclass(frozen=True)
+class _Work:
+    """An experiment, and what a run would have to make for it."""
+
+    experiment: Experiment
+    targets: Targets
+
+    @cached_property
+    def missing(self) -> Sequence[Task]:
+        return _missing(self.targets(self.experiment), self.experiment.outputs.store)
+
+    def largest(self, stage: Stage) -> float:
+        """Return the memory that the largest product of a stage needs; zero if there is none to make."""
+        return max((task.cost.memory for task in self.missing if task.stage is stage), default=0.0)
+
+    def changed(self, **sections: Any) -> _Work:
+        return replace(self, experiment=self.experiment.model_copy(update=sections))
+
+
+def _cut(work: _Work, share: float) -> _Work:
     """Double the number of simulation chunks until each takes no more than its share, or they are single channels."""
-    cut = experiment
-    while cut.simulation.chunks < cut.instrument.channels.count and _largest(cut, targets, SIMULATE_CHUNK) > share:
-        chunks = min(2 * cut.simulation.chunks, cut.instrument.channels.count)
-        finer = cut.model_copy(update={"simulation": cut.simulation.model_copy(update={"chunks": chunks})})
-        if _largest(finer, targets, SIMULATE_CHUNK) > 0.95 * _largest(cut, targets, SIMULATE_CHUNK):
+    while (largest := work.largest(SIMULATE_CHUNK)) > share:
+        simulation, channels = work.experiment.simulation, work.experiment.instrument.channels.count
+        if simulation.chunks >= channels:
+            break
+        chunks = min(2 * simulation.chunks, channels)
+        finer = work.changed(simulation=simulation.model_copy(update={"chunks": chunks}))
+        if finer.largest(SIMULATE_CHUNK) > 0.95 * largest:
             break  # What is left is the sky itself.
-        cut = finer
-    return cut
+        work = finer
+    return work
 
 
-def _stream(experiment: Experiment, share: float, targets: Targets) -> Experiment:
+def _stream(work: _Work, share: float) -> _Work:
     """Let the calibrator use less memory until a solve takes no more than its share."""
-    fitted = experiment
-    while _largest(fitted, targets, CALIBRATE_CHUNK) > share:
-        with guarded(fitted.calibration):
-            leaner = fitted.calibration.leaner()
+    while work.largest(CALIBRATE_CHUNK) > share:
+        calibration = work.experiment.calibration
+        with guarded(calibration):
+            leaner = calibration.leaner()
         if leaner is None:
             break
-        fitted = fitted.model_copy(update={"calibration": leaner})
-    return fitted
-
-
-def _largest(experiment: Experiment, targets: Targets, stage: Stage) -> float:
-    missing = _missing(targets(experiment), experiment.outputs.store)
-    return max((task.cost.memory for task in missing if task.stage is stage), default=0.0)
+        work = work.changed(calibration=leaner)
+    return work
 
 
 def _missing(targets: Sequence[Task], folder: Path) -> Sequence[Task]:

@@ -63,8 +63,13 @@ class ExperimentStudy(Study):
         """Return the study with simulations and solves cut to the memory, and the number of workers."""
         require_data_fit(self.experiment, budget)
         require_possible(self.experiment)
-        experiment, count = fit(self.experiment, budget, targets_of)
-        return type(self)(experiment, self._folder), count
+        experiment, count = fit(self.experiment, budget, self._targets_of)
+        fitted = self if experiment is self.experiment else type(self)(experiment, self._folder)
+        return fitted, count
+
+    def _targets_of(self, experiment: Experiment) -> list[Task]:
+        """Return the products of the experiment, changed or not; the keys of those of the study are known."""
+        return self.targets if experiment is self.experiment else targets_of(experiment)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:

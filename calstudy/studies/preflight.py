@@ -113,7 +113,7 @@ def _require_same_antennas(true: Layout, assumed: Layout) -> None:
             f"{field}: has antenna {assumed.numbers[different][0]} where the data have {true.numbers[different][0]}; "
             "numbers and their order must be those of the data"
         )
-    if any(getattr(true.location, axis) != getattr(assumed.location, axis) for axis in "xyz"):
+    if true.place != assumed.place:
         raise InputError(f"{field}: is at another site than the data, where the sky is another at the same time")
 
 

@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
 from calstudy.corrupt.levels import rms, set_levels
 from calstudy.figures.spherical import SIGMAS_95
-from calstudy.figures.wedge import EMPTY, POSITIVE
+from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
 from calstudy.instrument.beams import make_beam
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, draw_horizon, label_axes
@@ -183,7 +183,7 @@ def _draw_wedge(figure: Figure, axes: Axes, components: SimulatedComponents) -> 
     norm = LogNorm(lowest, highest)
     axes.set_facecolor(EMPTY)
     filled = np.ma.maximum(np.ma.masked_invalid(power), lowest)
-    mesh = axes.pcolormesh(x, y, filled, norm=norm, cmap=POSITIVE, rasterized=True)
+    mesh = axes.pcolormesh(x, y, filled, norm=norm, cmap=colour_map(POSITIVE), rasterized=True)
     draw_horizon(axes, components.wedge, components.buffer)
     label_axes(axes, components.wedge, MAX_DELAY)
     axes.set_ylabel(style.K_PARALLEL)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -40,6 +41,19 @@ def command(monkeypatch, capsys, tmp_path):
         return end.value.code, capsys.readouterr().err
 
     return run
+
+
+def test_a_dry_run_says_what_would_be_solved_and_imports_no_tensorflow(data, tmp_path):
+    code = (
+        f"import sys\nsys.argv = ['calstudy', 'calibrate', '{data}', '--dry-run', '--set', 'basis.min_delay=50 ns']\n"
+        "from calstudy.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        "assert 'pyuvdata' in sys.modules\nassert 'tensorflow' not in sys.modules"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "2 solves" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["data.uvh5"]
 
 
 def test_the_expected_loss_is_written_and_how_far_the_fit_is_told(command, data, tmp_path):

@@ -11,8 +11,8 @@ from test_foreground_prior import dense_covariance, prior_structure, turned
 from test_joint_basis import joined
 from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
+from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.expected_loss import DelayModes, expected_transfer
-from calstudy.calibrate.gain_space import gain_vectors
 from calstudy.calibrate.problem import flag_weights, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import WarmStart, solve_warm

@@ -7,7 +7,8 @@ import pytest
 from scipy.constants import speed_of_light
 from toy import BASIS, FREQUENCIES
 
-from calstudy.calibrate.basis import delay_half_widths, make_basis
+from calstudy.base.errors import InputError
+from calstudy.calibrate.basis import delay_half_widths, make_basis, require_room
 from calstudy.calibrate.settings import BasisSettings
 
 
@@ -58,3 +59,24 @@ def test_autocorrelations_get_the_minimum_delay():
 def test_impossible_bases_are_refused(length, frequencies, settings, match):
     with pytest.raises(ValueError, match=match):
         make_basis(np.array([length]), frequencies, settings)
+    with pytest.raises(ValueError, match=match):
+        require_room(length, frequencies, settings)
+
+
+@pytest.mark.parametrize("used", [np.ones(64, bool), np.arange(64) % 8 > 1])
+def test_room_is_found_where_a_basis_can_be_made(used):
+    """The short cut, that fewer sequences than channels are asked for, agrees with making them."""
+
+    def refused(check, length):
+        try:
+            check(length)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    answers = []
+    for length in np.linspace(0, 400, 41):
+        made = refused(lambda length: make_basis(np.array([length]), FREQUENCIES[used], BASIS), length)
+        assert refused(lambda length: require_room(length, FREQUENCIES[used], BASIS), length) == made
+        answers.append(made)
+    assert answers[0] == "" != answers[-1]

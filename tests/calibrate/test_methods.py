@@ -11,8 +11,8 @@ from test_solvers import in_the_span, product_error
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.basis import dpss_vectors
-from calstudy.calibrate.gain_space import GainSpace, gain_vectors
+from calstudy.calibrate.basis import dpss_vectors, gain_vectors
+from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import flag_weights, gain_products
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer

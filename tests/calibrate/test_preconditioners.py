@@ -12,7 +12,8 @@ from test_joint_basis import block_diagonal
 from toy import FREQUENCIES, complex_normal
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.gain_space import GainSpace, gain_vectors
+from calstudy.calibrate.basis import gain_vectors
+from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import flag_weights
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers.preconditioners import (

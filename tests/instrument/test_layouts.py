@@ -57,9 +57,9 @@ def test_known_tile_positions():
 @pytest.mark.parametrize("site", SITES)
 def test_local_components_are_those_of_pyuvdata(site):
     place = SITES[site]
-    centre = np.array([axis.to_value("m") for axis in place.geocentric])
+    centre = np.array([axis.to_value("m") for axis in place.location.geocentric])
     vectors = np.random.default_rng(1).normal(scale=1e3, size=(20, 3))
-    expected = ENU_from_ECEF(centre + vectors, center_loc=place)
+    expected = ENU_from_ECEF(centre + vectors, center_loc=place.location)
     # Of coordinates of the order of the Earth's radius, which pyuvdata subtracts.
     assert east_north_up(vectors, place) == pytest.approx(expected, abs=1e-8)
 
@@ -185,7 +185,7 @@ def test_hera_is_where_it_was_surveyed():
     """
     with (files("pyuvdata") / "data" / "hera_ant_pos.csv").open() as table:
         rows = sorted(csv.DictReader(table), key=lambda row: int(row["number"]))
-    site = SITES["hera"]
+    site = SITES["hera"].location
     centre = np.array([axis.to_value("m") for axis in site.geocentric])
     surveyed = ENU_from_ECEF(centre + [[float(row[axis]) for axis in "xyz"] for row in rows], center_loc=site)
     surveyed, design = (

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Self
 
-import numpy as np
-
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import Cost
@@ -89,7 +87,7 @@ def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
 
     Or if joint groups cannot be read or do not fit the array; the longest baseline is that of the others then.
     """
-    from calstudy.calibrate.basis import make_basis
+    from calstudy.calibrate.basis import require_room
     from calstudy.calibrate.joint import other_baselines, place_groups, read_joint_groups
 
     lengths = frame.lengths
@@ -100,6 +98,6 @@ def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
             return
     longest = lengths.max()
     try:
-        make_basis(np.array([longest]), frame.frequencies, settings.basis)
+        require_room(longest, frame.frequencies, settings.basis)
     except InputError as error:
         raise InputError(f"{error} (the longest baseline has {longest:.0f} m)") from None
