@@ -64,10 +64,13 @@ class Block:
         Their indices, (n,).
     centre
         Julian date at which the phase centre is at the zenith; None for their middle.
+    number
+        Of the block among those of the run, from 0.
     """
 
     times: np.ndarray
     centre: float | None = None
+    number: int = 0
 
 
 def divide(times_jd: np.ndarray, integration: float, count: int, span: Sequence[float] | None = None) -> list[Block]:
@@ -94,7 +97,9 @@ def divide(times_jd: np.ndarray, integration: float, count: int, span: Sequence[
     edges = np.linspace(first - half, last + half, count + 1)
     place = np.searchsorted(edges[1:-1], times_jd)
     middles = (edges[:-1] + edges[1:]) / 2
-    return [Block(np.flatnonzero(place == number), float(middles[number])) for number in np.unique(place)]
+    return [
+        Block(np.flatnonzero(place == number), float(middles[number]), number) for number in np.unique(place).tolist()
+    ]
 
 
 def average_in_blocks(uvd: UVData, blocks: Sequence[Block]) -> UVData:

@@ -119,8 +119,8 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
         return [(even, odd)]
     if even.Ntimes != odd.Ntimes:
         raise InputError(
-            f"power.coherent_time: even and odd data have {even.Ntimes} and {odd.Ntimes} blocks with integrations; a "
-            "longer time may bridge gaps"
+            f"power.coherent_time: even and odd data have {even.Ntimes} and {odd.Ntimes} blocks with integrations, and "
+            "must have the same"
         )
     pairs = [
         (_integration(even, number), _integration(odd, number))
@@ -132,6 +132,10 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
     for pair in pairs:
         for uvd in pair:
             uvd.flag_array |= missing[:, None]
+    if missing.all() and len(pairs) > 1:
+        raise InputError(
+            "power.coherent_time: every baseline is flagged altogether in one of the blocks; a longer time may help"
+        )
     return pairs
 
 

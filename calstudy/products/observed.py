@@ -157,14 +157,40 @@ def average(graph: ObservedGraph, what: str, parity: str) -> Task:
 def averaging(graph: ObservedGraph) -> dict[str, Any]:
     """Return as settings of a task how a half is averaged: the phase centre, or the number of blocks and their span.
 
-    The span is that of both halves if they are interleaved; otherwise each half has its own.
+    The span is that of both halves if they are interleaved; otherwise each half has its own. Blocks that one half
+    lacks, because of gaps, are left out of both.
+
+    Raises
+    ------
+    InputError
+        If `power.coherent_time` makes blocks that the halves cannot have in common.
     """
-    facts = graph.halves.facts["even"]
+    from calstudy.power.average import divide
+
+    halves, facts = graph.halves, graph.halves.facts["even"]
     count = graph.power.n_blocks(facts.duration, facts.integration)
     if count == 1:
-        return {"centre": graph.halves.centre}
-    span = [float(facts.times.min()), float(facts.times.max())] if graph.halves.interleaved else None
-    return {"blocks": count, "span": span}
+        return {"centre": halves.centre}
+    if halves.interleaved and (graph.power.coherent_time or 0) < 2 * facts.integration:
+        raise InputError(
+            f"power.coherent_time = {graph.power.coherent_time:g} s: a block must hold two integrations, "
+            f"{2 * facts.integration:g} s, of which each half has one"
+        )
+    if abs(halves.facts["odd"].duration - facts.duration) > facts.integration:
+        raise InputError(
+            f"power.coherent_time: observed.odd lasts {halves.facts['odd'].duration:g} s and observed.data "
+            f"{facts.duration:g} s; only data of the same duration have blocks of the same sky"
+        )
+    span = [float(facts.times.min()), float(facts.times.max())] if halves.interleaved else None
+    found = [
+        {block.number for block in divide(halves.times(parity), halves.facts[parity].integration, count, span)}
+        for parity in PARITIES
+    ]
+    common = sorted(found[0] & found[1])
+    if not common:
+        raise InputError("power.coherent_time: gaps leave no block that both halves have; a longer time may help")
+    kept = {} if found[0] == found[1] else {"kept": common}
+    return {"blocks": count, "span": span, **kept}
 
 
 def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: PowerSettings | None = None) -> Task:

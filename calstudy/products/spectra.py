@@ -125,7 +125,7 @@ def make_average(job: Job) -> Mapping[str, Any]:
 def blocks_of(job: Job, data: UVData) -> list[Block]:
     """Return the blocks in which the settings of a task divide a data set.
 
-    So many as `blocks` within `span`, otherwise one, with the phase centre `centre`.
+    So many as `blocks` within `span`, of which `kept` are used; otherwise one, with the phase centre `centre`.
     """
     import numpy as np
 
@@ -134,7 +134,8 @@ def blocks_of(job: Job, data: UVData) -> list[Block]:
     times, settings = np.unique(data.time_array), job.settings
     if "blocks" not in settings:
         return [Block(np.arange(times.size), settings.get("centre"))]
-    return divide(times, float(data.integration_time[0]), settings["blocks"], settings.get("span"))
+    found = divide(times, float(data.integration_time[0]), settings["blocks"], settings.get("span"))
+    return [block for block in found if block.number in settings.get("kept", range(settings["blocks"]))]
 
 
 def estimate(job: Job) -> Mapping[str, Any]:

@@ -118,7 +118,8 @@ def read_signal(folder: Path) -> Signal | None:
     if not weights or sum(weights) == 0 or signal == 0:
         return None
     mean, spread = sum(products) / sum(weights), math.sqrt(sum(variances)) / sum(weights)
-    unit = signal * scale**2
+    # As in the score of a comparison: calibration multiplies powers by 1 / s^2.
+    unit = signal / scale**2
     return Signal(mean, spread, left / unit, error / abs(unit), scale)
 
 

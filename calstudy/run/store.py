@@ -98,7 +98,10 @@ class Store:
             If it cannot.
         """
         require_writable(self.root, f"outputs.store = {str(self.root)!r}")
-        self.root.mkdir(parents=True, exist_ok=True)
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"outputs.store = {str(self.root)!r}: cannot be made ({error.strerror})") from None
 
     def folder(self, stage: str, key: str) -> Path:
         """Return where the product with this stage and key is, or would be.

@@ -29,8 +29,8 @@ def tables(tmp_path):
     modes = np.where(K < 0.3, 10, 30)
     signal = np.where(K < 0.1, np.nan, 100.0)
     spectrum_csv(folder / "eor.outside-wedge.csv", signal, modes, np.zeros(K.size))
-    residual = np.where((K > 0.2) & (K < 0.5), 7 * SCALE**2, 1e6)
-    spectrum_csv(folder / "residual_without_eor.outside-wedge.csv", residual, modes, np.full(K.size, 2 * SCALE**2))
+    residual = np.where((K > 0.2) & (K < 0.5), 7 / SCALE**2, 1e6)
+    spectrum_csv(folder / "residual_without_eor.outside-wedge.csv", residual, modes, np.full(K.size, 2 / SCALE**2))
     with (folder / "transfer-bands.outside-wedge.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         names = ("transfer without flux scale", "transfer without flux scale error", "flux scale")
@@ -57,17 +57,17 @@ def test_the_headline_pools_modes_of_its_band_and_is_free_of_the_flux_scale(tabl
     [(7, None), (90, None), (3400, "34 times"), (-1e6, "10,000 times"), (1.2345e9, "12,000,000 times")],
 )
 def test_a_residual_with_more_power_than_the_eor_is_told(power, told, tables):
-    residual = np.where((K > 0.2) & (K < 0.5), power * SCALE**2, 0)
+    residual = np.where((K > 0.2) & (K < 0.5), power / SCALE**2, 0)
     modes = np.where(K < 0.3, 10, 30)
-    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", residual, modes, np.full(K.size, 2 * SCALE**2))
+    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", residual, modes, np.full(K.size, 2 / SCALE**2))
     warnings = read_excess(tables.parent)
     assert len(warnings) == (told is not None)
     assert all(f"0.5 h/Mpc, the residual without EoR has {told} the power of the EoR" in text for text in warnings)
 
 
 def test_noise_above_the_eor_is_no_excess(tables):
-    noisy, modes = np.full(K.size, 400 * SCALE**2), np.where(K < 0.3, 10, 30)
-    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", noisy, modes, np.full(K.size, 300 * SCALE**2))
+    noisy, modes = np.full(K.size, 400 / SCALE**2), np.where(K < 0.3, 10, 30)
+    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", noisy, modes, np.full(K.size, 300 / SCALE**2))
     assert read_excess(tables.parent) == []
 
 

@@ -15,7 +15,6 @@ from pydantic import ValidationError
 from pyradiosky import SkyModel
 from scipy.integrate import quad
 
-from calstudy.base import downloads
 from calstudy.base.errors import InputError
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
@@ -242,7 +241,7 @@ def test_fetched_gleam_is_proved_and_then_held_to_its_hash(tmp_path, monkeypatch
         assert "VIII/100" in url
         return str(write_gleam(Path(path) / fname))
 
-    monkeypatch.setattr(downloads.pooch, "retrieve", download)
+    monkeypatch.setattr("pooch.retrieve", download)
     with pytest.raises(InputError, match="6 sources, GLEAM has 307455"):
         gleam.fetch_gleam(tmp_path, progress=False)
     assert not (tmp_path / gleam.FILE).exists()
@@ -260,7 +259,7 @@ def test_failed_download_is_one_sentence(tmp_path, monkeypatch):
     def download(*args, **kwargs):
         raise requests.ConnectionError("no route to host")
 
-    monkeypatch.setattr(downloads.pooch, "retrieve", download)
+    monkeypatch.setattr("pooch.retrieve", download)
     with pytest.raises(InputError, match=r"no connection to vizier.*sky\.foregrounds\.path"):
         gleam.fetch_gleam(tmp_path)
 
