@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -18,6 +20,7 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra
 from calstudy.power.spherical import modes_in_bins, spherical_average
 from calstudy.power.tables import load_spectrum, save_spectrum
+from calstudy.products.observed import Halves, averaging
 
 SETTINGS = PowerSettings(pairs="same-baseline")
 DAY = 86400.0
@@ -148,3 +151,46 @@ def test_from_cube_of_blocks_keeps_their_order(hour, rng):
     cube = np.arange(180)[:, None, None, None] * np.ones((180, hour.Nbls, hour.Nfreqs, 1), complex)
     averaged = average_in_blocks(from_cube(hour, cube), blocks_of(hour, 600.0))
     assert (np.diff(averaged.time_array.reshape(6, -1)[:, 0]) > 0).all()
+
+
+def graph_of(times, coherent_time, odd=None):
+    """What `averaging` reads of a study of measured data: interleaved halves, or two data sets."""
+
+    def facts(found):
+        found = np.asarray(found) * 10 / DAY + 2459000.0
+        return SimpleNamespace(times=found, integration=10.0, duration=np.ptp(found) * DAY + 10)
+
+    even = facts(times)
+    halves = Halves({"even": even, "odd": even if odd is None else facts(odd)})
+    return SimpleNamespace(halves=halves, power=PowerSettings(coherent_time=f"{coherent_time} s"))
+
+
+def test_halves_of_measured_data_have_the_blocks_that_both_have():
+    whole = averaging(graph_of(np.arange(24), 60.0))
+    assert whole["blocks"] == 4
+    assert "kept" not in whole
+    # Of the block of integrations 6 to 11 only number 6 is there, which is in the even half.
+    gap = averaging(graph_of([*range(7), *range(12, 24)], 60.0))
+    assert (gap["blocks"], gap["kept"]) == (4, [0, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("times", "coherent_time", "odd", "told"),
+    [
+        (np.arange(7), 15.0, None, "must hold two integrations, 20 s"),
+        (np.arange(60), 100.0, np.arange(30), r"observed\.odd lasts 300 s and observed\.data 600 s"),
+        ([0, 20], 30.0, None, "gaps leave no block"),
+    ],
+)
+def test_blocks_that_halves_cannot_share_are_refused_by_the_plan(times, coherent_time, odd, told):
+    with pytest.raises(InputError, match=rf"power\.coherent_time.*{told}"):
+        averaging(graph_of(times, coherent_time, odd))
+
+
+def test_baselines_that_are_flagged_in_turn_are_refused(observe, white, beam, rng):
+    template = observe(GolombLayout(kind="golomb", count=3), n_times=3, integration=600.0)
+    even = white(template, rng)
+    for block in range(3):
+        even.flag_array[block * even.Nbls + block] = True
+    with pytest.raises(InputError, match="every baseline is flagged altogether in one of the blocks"):
+        estimate_spectra(even, white(template, rng), beam, SETTINGS)
