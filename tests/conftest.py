@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import base64
 import os
+from collections.abc import Iterator
+from typing import IO, Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # One core for each of pytest's processes: threads of several would wait for one another.
+    for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TF_NUM_INTRAOP_THREADS", "TF_NUM_INTEROP_THREADS"):
+        os.environ.setdefault(library, "1")
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from observations import small_instrument
 from pyuvdata import UVData
 
@@ -22,6 +31,32 @@ settings.load_profile("any-machine")
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add where notebooks are left as they ran, from where the documentation takes their outputs."""
     parser.addoption("--notebook-outputs", metavar="FOLDER", help="write notebooks that were run to this folder")
+
+
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR4nGP4z8DwHwAFAAH/iZk9HQAAAABJRU5ErkJggg=="
+)
+
+
+def save_blank(figure: Figure, stream: IO[bytes], **settings: Any) -> None:
+    """Write a picture of one pixel."""
+    stream.write(PNG)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def blank_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Save figures as pictures of one pixel, but for tests/figures and modules that say `DRAWN = True`.
+
+    Laying out and saving figures is most of what a small study takes. They are still made, from the same arrays.
+    """
+    if "figures" in request.path.parts or getattr(request.module, "DRAWN", False):
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", save_blank)
+        # Before it is saved.
+        patch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
+        yield
 
 
 @pytest.fixture

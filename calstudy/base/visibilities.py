@@ -6,12 +6,30 @@ integration, then of the second, and so on). The functions here check that and r
 
 from __future__ import annotations
 
+from contextlib import suppress
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
+
+
+@cache
+def keep_compiled_pyuvdata() -> None:
+    """Keep on disk what pyuvdata compiles for the numbers of baselines: 3 s in every process, for 20 ms of work.
+
+    Numba keeps it beside the package, or in the user's cache folder if that cannot be written.
+    """
+    from pyuvdata.utils import bls
+
+    for name in ("_max_ant", "_min_ant", "_antnums_to_baseline", "_baseline_to_antnums"):
+        enable = getattr(getattr(bls, name, None), "enable_caching", None)
+        if enable is not None:
+            # No folder can be written: it is compiled as before.
+            with suppress(RuntimeError):
+                enable()
 
 
 def require_rectangular(uvd: UVData) -> None:

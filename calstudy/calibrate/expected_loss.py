@@ -251,7 +251,7 @@ class GainResponse:
             inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
         damping = kernels.scalar(kernels.dampings.least)
         self._equations = NormalEquations(projection, reduced.gains, damping, inverse)
-        self._compiled = tf.function(self._solve)
+        self._compiled = tf.function(self._solve, autograph=False)
 
     def solve(self, change: np.ndarray) -> np.ndarray:
         """Return the relative change eta of the gains, complex, (Nants, Nfreqs), for a change y of the whitened data.

@@ -140,7 +140,7 @@ class Projector:
             make_piece(batch, common, tensors.owner(batch) if needed else None, self._two_levels, dtype)
             for batch in tensors.batches
         ]
-        self.project = tf.function(self._project)
+        self.project = tf.function(self._project, autograph=False)
 
     def _factor(self, normal: tf.Tensor, filled: np.ndarray) -> tuple[tf.Tensor, tf.Tensor]:
         """Return the Cholesky factors of N, and a root R of the kernel, N^-1 ~ R^T R; all (N, Nvec, Nvec).
@@ -361,7 +361,7 @@ class FrozenForegrounds:
 
     def __init__(self, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
         self.tensors, self.dtype = tensors, dtype
-        self.project = tf.function(self._project)
+        self.project = tf.function(self._project, autograph=False)
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
         products = self.tensors.gain_products(gains)

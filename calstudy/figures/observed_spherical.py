@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.figures import Drawing, ObservedFigure
-from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
+from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points, label_wavenumbers
 from calstudy.plotting import style
 from calstudy.products.files import spectrum_file
 from calstudy.products.observed_spectra import observed_spectra
@@ -47,8 +47,6 @@ def draw_observed(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
-    from matplotlib.ticker import LogLocator, StrMethodFormatter
-
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
     grid = figure.subplots(1, len(columns), sharex=True, sharey=True, squeeze=False)[0]
     for axes, (modes, series) in zip(grid, columns.items(), strict=True):
@@ -57,8 +55,7 @@ def draw_observed(
         _draw_noise(axes, series["residual"])
         axes.set_title(COLUMNS[modes].format(1e9 * buffer))
         axes.set(xlabel=style.WAVENUMBER, xscale="log", yscale="log", ylim=_limits(columns))
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        label_wavenumbers(axes)
     grid[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
     handles = [
         axes.plot([], [], linestyle="none", marker=mark.marker, color=mark.colour, label=mark.label)[0]

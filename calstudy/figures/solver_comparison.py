@@ -9,7 +9,15 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.figures import ComparisonFigure, Drawing
-from calstudy.figures.spherical import SIGMAS_95, Marking, SphericalColumn, draw_band, draw_points, read_column
+from calstudy.figures.spherical import (
+    SIGMAS_95,
+    Marking,
+    SphericalColumn,
+    draw_band,
+    draw_points,
+    label_wavenumbers,
+    read_column,
+)
 from calstudy.plotting import style
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
@@ -51,8 +59,6 @@ def draw_solver_comparison(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     """
-    from matplotlib.ticker import LogLocator, StrMethodFormatter
-
     figure = style.new_figure(style.TWO_COLUMNS, 5.6)
     figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
     grid = figure.subplots(2, len(arrays), sharex=True, sharey="row", squeeze=False)
@@ -66,8 +72,7 @@ def draw_solver_comparison(
     for row, name in zip(grid, ROWS, strict=True):
         row[0].set(xscale="log", yscale="log", xlim=(0.9 * first, last_k), ylim=_limits(shown, name, last_k))
         row[0].set_ylabel(rf"{ROWS[name]} ({style.POWER_UNIT})")
-        row[0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        row[0].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        label_wavenumbers(row[0])
     _add_legend(figure)
     style.note_stand_ins(figure, stand_ins)
     return figure

@@ -55,7 +55,9 @@ def place_of(site: Site | Coordinates) -> Place:
     """
     if isinstance(site, Site):
         return SITES[site.kind]
-    return Place(site.latitude, site.longitude, site.height)
+    # The same place, whether its longitude counts to 180 or to 360 degrees.
+    longitude = site.longitude - 360 if site.longitude > 180 else site.longitude
+    return Place(site.latitude, longitude, site.height)
 
 
 def east_north_up(vectors: np.ndarray, place: Place) -> np.ndarray:

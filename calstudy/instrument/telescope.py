@@ -11,6 +11,7 @@ from astropy.utils import iers
 from pyuvdata import Telescope, UVData
 from pyuvdata import utils as uvutils
 
+from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.instrument.as_built import position_offsets
 from calstudy.instrument.layouts import Layout, make_array
 from calstudy.instrument.settings import InstrumentSettings
@@ -57,6 +58,7 @@ def make_template(settings: InstrumentSettings, autos: bool = False, as_built: b
     InputError
         If the layout's file cannot be used.
     """
+    keep_compiled_pyuvdata()
     layout = make_array(settings)
     if as_built:
         offsets = position_offsets(settings.as_built.positions, len(layout.numbers))

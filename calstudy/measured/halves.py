@@ -12,8 +12,10 @@ from calstudy.base.observation import Frame
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
 from calstudy.measured.selection import Selection, parse_values, select
+from calstudy.power.settings import PowerSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from pyuvdata import UVData
@@ -84,6 +86,81 @@ class Facts:
             longest=float(lengths.max()),
             mean=float(lengths.mean()),
         )
+
+
+@dataclass(frozen=True)
+class Halves:
+    """What is known of the two halves before they are read.
+
+    Attributes
+    ----------
+    facts
+        Of the files of each, by parity.
+    """
+
+    facts: Mapping[str, Facts]
+
+    @property
+    def interleaved(self) -> bool:
+        """Whether both are in the same files."""
+        return self.facts["even"] is self.facts["odd"]
+
+    def times(self, parity: str) -> np.ndarray:
+        """Return the Julian dates of the integrations of a half."""
+        times = self.facts[parity].times
+        return times[PARITIES.index(parity) :: 2] if self.interleaved else times
+
+    @property
+    def centre(self) -> float | None:
+        """Julian date at which the phase centre of both is at the zenith; None for that of each one's own middle."""
+        if not self.interleaved:
+            return None
+        times = self.facts["even"].times
+        return float((times.min() + times.max()) / 2)
+
+    def averaging(self, power: PowerSettings) -> dict[str, Any]:
+        """Return how a half is averaged: the phase centre, or the number of blocks, their span and those that are kept.
+
+        The span is that of both halves if they are interleaved; otherwise each half has its own. Blocks that one half
+        lacks, because of gaps, are left out of both.
+
+        Parameters
+        ----------
+        power
+            Whose `coherent_time` is the duration of a block.
+
+        Raises
+        ------
+        InputError
+            If it makes blocks that the halves cannot have in common.
+        """
+        # Reading metadata does not need what averages data, which takes long to import.
+        from calstudy.power.average import divide
+
+        even, odd = (self.facts[parity] for parity in PARITIES)
+        count = power.n_blocks(even.duration, even.integration)
+        if count == 1:
+            return {"centre": self.centre}
+        if self.interleaved and (power.coherent_time or 0) < 2 * even.integration:
+            raise InputError(
+                f"power.coherent_time = {power.coherent_time:g} s: a block must hold two integrations, "
+                f"{2 * even.integration:g} s, of which each half has one"
+            )
+        if abs(odd.duration - even.duration) > even.integration:
+            raise InputError(
+                f"power.coherent_time: observed.odd lasts {odd.duration:g} s and observed.data "
+                f"{even.duration:g} s; only data of the same duration have blocks of the same sky"
+            )
+        span = [float(even.times.min()), float(even.times.max())] if self.interleaved else None
+        found = [
+            {block.number for block in divide(self.times(parity), self.facts[parity].integration, count, span)}
+            for parity in PARITIES
+        ]
+        common = sorted(found[0] & found[1])
+        if not common:
+            raise InputError("power.coherent_time: gaps leave no block that both halves have; a longer time may help")
+        kept = {} if found[0] == found[1] else {"kept": common}
+        return {"blocks": count, "span": span, **kept}
 
 
 def read_facts(

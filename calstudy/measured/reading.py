@@ -18,6 +18,7 @@ from pyuvdata import UVData
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import CASACORE
+from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.calibrate.standard_formats import PARALLEL_HANDS
 from calstudy.measured.selection import Selection, select
 
@@ -40,6 +41,7 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
     """
     _require_readable(paths)
     names = [str(path) for path in paths]
+    keep_compiled_pyuvdata()
     try:
         data = UVData.from_file(names[0] if len(names) == 1 else names)
     # Readers of eight formats raise whatever their libraries do; a file that cannot be read is the user's to mend.
@@ -58,6 +60,7 @@ def read_metadata(paths: Sequence[Path]) -> UVData:
     _require_readable(paths)
     names = [str(path) for path in paths]
     data = UVData()
+    keep_compiled_pyuvdata()
     try:
         data.read(names[0] if len(names) == 1 else names, read_data=False)
     # As above; what cannot be read in parts may be readable as a whole.

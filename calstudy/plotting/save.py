@@ -114,6 +114,10 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
     }
     paths = [folder / f"{name}.{ending}" for ending in writers]
     with journal_style():
+        # Matplotlib lays a figure out anew for each file, and draws it once more to do so.
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)
+            figure.set_layout_engine(None)
         for path, write in zip(paths, writers.values(), strict=True):
             with _replacing(path) as stream:
                 write(stream)

@@ -122,12 +122,8 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
             f"power.coherent_time: even and odd data have {even.Ntimes} and {odd.Ntimes} blocks with integrations, and "
             "must have the same"
         )
-    pairs = [
-        (_integration(even, number), _integration(odd, number))
-        for number in range(even.Ntimes)
-        if not any(_integration(uvd, number).flag_array.all() for uvd in (even, odd))
-    ]
-    pairs = pairs or [(_integration(even, 0), _integration(odd, 0))]
+    every = [(_integration(even, number), _integration(odd, number)) for number in range(even.Ntimes)]
+    pairs = [pair for pair in every if not any(uvd.flag_array.all() for uvd in pair)] or every[:1]
     missing = np.any([uvd.flag_array.all(axis=1) for pair in pairs for uvd in pair], axis=0)
     for pair in pairs:
         for uvd in pair:

@@ -42,7 +42,7 @@ def expected_loss(graph: Graph) -> Task:
         inputs["levels"] = corruption.levels(graph)
     settings = {
         "calibration": graph.experiment.calibration.reset("assumed"),
-        "power": graph.experiment.power.reset("pairs", "redundancy_tolerance"),
+        "power": graph.experiment.power.reset("pairs", "redundancy_tolerance", "coherent_time"),
         "integration": graph.experiment.instrument.times.count // 2,
         "probes": PROBES,
     }

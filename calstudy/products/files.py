@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.visibilities import keep_compiled_pyuvdata
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -48,6 +50,7 @@ def read_visibilities(path: Path) -> UVData:
     """Read a UVH5 product as it was written."""
     from pyuvdata import UVData
 
+    keep_compiled_pyuvdata()
     return UVData.from_file(path, file_type="uvh5", run_check=False)
 
 

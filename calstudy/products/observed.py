@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
     from pyuvdata import UVData
 
-    from calstudy.measured.halves import Facts
+    from calstudy.measured.halves import Halves
 
 NOISE = "noise.uvh5"
 """Of an average: sigma by the autocorrelations."""
@@ -40,37 +39,6 @@ WHAT = ("data", "calibrated", "residual")
 """What has power spectra: the data as given, V / (g g*), and V / (g g*) - F."""
 SOURCES = ("difference", "autos")
 """From what the noise is known: the difference of the halves, the autocorrelations."""
-
-
-@dataclass(frozen=True)
-class Halves:
-    """What is known of the two halves before they are read.
-
-    Attributes
-    ----------
-    facts
-        Of the files of each, by parity.
-    """
-
-    facts: Mapping[str, Facts]
-
-    @property
-    def interleaved(self) -> bool:
-        """Whether both are in the same files."""
-        return self.facts["even"] is self.facts["odd"]
-
-    def times(self, parity: str) -> np.ndarray:
-        """Return the Julian dates of the integrations of a half."""
-        times = self.facts[parity].times
-        return times[PARITIES.index(parity) :: 2] if self.interleaved else times
-
-    @property
-    def centre(self) -> float | None:
-        """Julian date at which the phase centre of both is at the zenith; None for that of each one's own middle."""
-        if not self.interleaved:
-            return None
-        times = self.facts["even"].times
-        return float((times.min() + times.max()) / 2)
 
 
 class ObservedGraph(Memory):
@@ -151,46 +119,7 @@ def calibrated(graph: ObservedGraph, parity: str) -> Task:
 def average(graph: ObservedGraph, what: str, parity: str) -> Task:
     """Return the task of one half, fringe-stopped and averaged; `what` is one of `WHAT`."""
     inputs = {"data": observed(graph, parity), "calibration": calibrated(graph, parity)}
-    return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, **averaging(graph)}, inputs)
-
-
-def averaging(graph: ObservedGraph) -> dict[str, Any]:
-    """Return as settings of a task how a half is averaged: the phase centre, or the number of blocks and their span.
-
-    The span is that of both halves if they are interleaved; otherwise each half has its own. Blocks that one half
-    lacks, because of gaps, are left out of both.
-
-    Raises
-    ------
-    InputError
-        If `power.coherent_time` makes blocks that the halves cannot have in common.
-    """
-    from calstudy.power.average import divide
-
-    halves, facts = graph.halves, graph.halves.facts["even"]
-    count = graph.power.n_blocks(facts.duration, facts.integration)
-    if count == 1:
-        return {"centre": halves.centre}
-    if halves.interleaved and (graph.power.coherent_time or 0) < 2 * facts.integration:
-        raise InputError(
-            f"power.coherent_time = {graph.power.coherent_time:g} s: a block must hold two integrations, "
-            f"{2 * facts.integration:g} s, of which each half has one"
-        )
-    if abs(halves.facts["odd"].duration - facts.duration) > facts.integration:
-        raise InputError(
-            f"power.coherent_time: observed.odd lasts {halves.facts['odd'].duration:g} s and observed.data "
-            f"{facts.duration:g} s; only data of the same duration have blocks of the same sky"
-        )
-    span = [float(facts.times.min()), float(facts.times.max())] if halves.interleaved else None
-    found = [
-        {block.number for block in divide(halves.times(parity), halves.facts[parity].integration, count, span)}
-        for parity in PARITIES
-    ]
-    common = sorted(found[0] & found[1])
-    if not common:
-        raise InputError("power.coherent_time: gaps leave no block that both halves have; a longer time may help")
-    kept = {} if found[0] == found[1] else {"kept": common}
-    return {"blocks": count, "span": span, **kept}
+    return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, **graph.halves.averaging(graph.power)}, inputs)
 
 
 def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: PowerSettings | None = None) -> Task:

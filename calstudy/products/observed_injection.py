@@ -29,7 +29,6 @@ from calstudy.products.graph import once, required, size_of
 from calstudy.products.observed import (
     ObservedGraph,
     average,
-    averaging,
     calibrated,
     calibration_inputs,
     crossed,
@@ -99,7 +98,7 @@ def response(graph: ObservedGraph, parity: str) -> Task:
 def signal(graph: ObservedGraph, parity: str) -> Task:
     """Return the task of the averaged EoR of one half, as it is put in but for the gains."""
     inputs = {"eor": eor(graph, parity), "factor": factor(graph), "calibration": calibrated(graph, parity)}
-    return Task(AVERAGE_EOR, f"eor {parity}", averaging(graph), inputs)
+    return Task(AVERAGE_EOR, f"eor {parity}", graph.halves.averaging(graph.power), inputs)
 
 
 @once
@@ -125,7 +124,7 @@ def expected(graph: ObservedGraph) -> Task | None:
     inputs = {"data": observed(graph, "even"), "calibration": calibrated(graph, "even")}
     settings = {
         "calibration": graph.calibration.reset("assumed"),
-        "power": graph.power.reset("pairs", "redundancy_tolerance"),
+        "power": graph.power.reset("pairs", "redundancy_tolerance", "coherent_time"),
         "sky_model": graph.observed.sky_model is not None,
         "probes": PROBES,
     }

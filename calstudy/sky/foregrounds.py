@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 
@@ -127,16 +128,9 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
     that the counts stay as measured. As in GLEAM itself, the brightest few radio sources (Cygnus A, Cassiopeia
     A, Centaurus A, ...) and the Galaxy are missing.
     """
-    real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))
-    synthetic = _population(settings)
-    covered = _in_g4jy_area(synthetic)
-    synthetic = synthetic.select(~covered | (synthetic.flux < COMPLETE_FLUX))
-    covered = np.flatnonzero(_in_g4jy_area(synthetic))
-    replaced = covered[_nearest(synthetic.flux[covered], real.flux[real.flux < COMPLETE_FLUX])]
-    synthetic = synthetic.select(np.setdiff1d(np.arange(len(synthetic)), replaced))
-    both = concatenate(real, synthetic)
+    both, n_components = _components(min(settings.flux_limit, FAINTEST_DRAWN), settings.seed, settings.index_scatter)
     chosen = brightest(both.flux, settings)
-    n_real = int((chosen < len(real)).sum())
+    n_real = int((chosen < n_components).sum())
     stand_in = (
         f"foregrounds: {n_real} real G4Jy components and {len(chosen) - n_real} synthetic sources drawn from the "
         "counts of Franzen et al. (2019); GLEAM was not used"
@@ -145,15 +139,27 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
     return Foregrounds(to_sky_model(both.select(chosen), settings), stand_in)
 
 
-def _population(settings: section.SyntheticSources) -> Catalogue:
-    right_ascension, declination, flux = draw_population(
-        min(settings.flux_limit, FAINTEST_DRAWN), BRIGHTEST_NOW, settings.seed
-    )
+# Every piece of a simulation needs them, and making them takes longer than a small piece.
+@lru_cache(maxsize=2)
+def _components(faintest: float, seed: int, index_scatter: float) -> tuple[Catalogue, int]:
+    """Return G4Jy components and then synthetic sources, down to a flux in Jy, and the number of the former."""
+    real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))
+    synthetic = _population(faintest, seed, index_scatter)
+    covered = _in_g4jy_area(synthetic)
+    synthetic = synthetic.select(~covered | (synthetic.flux < COMPLETE_FLUX))
+    covered = np.flatnonzero(_in_g4jy_area(synthetic))
+    replaced = covered[_nearest(synthetic.flux[covered], real.flux[real.flux < COMPLETE_FLUX])]
+    synthetic = synthetic.select(np.setdiff1d(np.arange(len(synthetic)), replaced))
+    return concatenate(real, synthetic), len(real)
+
+
+def _population(faintest: float, seed: int, index_scatter: float) -> Catalogue:
+    right_ascension, declination, flux = draw_population(faintest, BRIGHTEST_NOW, seed)
     order = np.argsort(-flux, kind="stable")
     names = np.char.add("synthetic", np.arange(len(flux)).astype(str))
-    generator = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(INDEX_STREAM,)))
+    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(INDEX_STREAM,)))
     # Brightest first, so that the index of a source does not depend on the flux limit.
-    index = SPECTRAL_INDEX + settings.index_scatter * generator.standard_normal(len(flux))
+    index = SPECTRAL_INDEX + index_scatter * generator.standard_normal(len(flux))
     return Catalogue(names, right_ascension[order], declination[order], flux[order], index)
 
 

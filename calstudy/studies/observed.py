@@ -24,11 +24,11 @@ from calstudy.experiment.model import FIGURES, StudyName
 from calstudy.figures import ObservedFigure, observed_task
 from calstudy.instrument.interface import model_of
 from calstudy.measured.defaults import with_defaults
-from calstudy.measured.halves import PARITIES, modelled, read_facts, require_same_sky
+from calstudy.measured.halves import PARITIES, Halves, modelled, read_facts, require_same_sky
 from calstudy.measured.interference import require_surroundings
 from calstudy.measured.settings import InjectionSettings, ObservedSettings
 from calstudy.power.settings import PowerSettings
-from calstudy.products.observed import Halves, ObservedGraph
+from calstudy.products.observed import ObservedGraph
 from calstudy.products.observed_injection import injection_tables
 from calstudy.products.observed_quality import quality
 from calstudy.products.observed_spectra import observed_spectra

@@ -25,7 +25,7 @@ from calstudy.products.calibration import calibration
 from calstudy.products.graph import Graph
 from calstudy.products.spectra import power
 from calstudy.studies.load import load_study
-from calstudy.studies.study import run_study
+from calstudy.studies.study import Budget, run_study
 
 
 @pytest.fixture(params=["path", "entry point"])
@@ -122,7 +122,7 @@ def test_a_plan_has_its_cost_and_its_refusal(reference, tmp_path, capsys):
 
 def test_a_run_uses_it_and_tells_its_status(reference, tmp_path):
     settings = {"calibrator": reference, "factor": 2.0, "status": "max-steps"}
-    run = run_study(load_study(experiment(tmp_path, settings)))
+    run = run_study(load_study(experiment(tmp_path, settings)), Budget(workers=1))
     told = [text for text in run.warnings if text.startswith("calibrate (")]
     assert len(told) == 4
     assert "2 of 2 solves did not converge (2 max-steps)" in told[0]

@@ -11,7 +11,7 @@ from tiny import tiny
 
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import plugin_reference
-from calstudy.studies.study import run_study
+from calstudy.studies.study import Budget, run_study
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", flags=re.MULTILINE | re.DOTALL)
@@ -54,7 +54,9 @@ def test_an_example_is_short_and_runs(title, tmp_path):
     (tmp_path / name[1]).write_text(blocks["python"])
     assert name[1] in plugin_reference(tmp_path / name[1])
     path = tmp_path / "experiment.yaml"
-    path.write_text(yaml.safe_dump(merged(tiny(tmp_path), yaml.safe_load(blocks["yaml"]))))
-    run = run_study(load_study(path))
+    experiment = merged(tiny(tmp_path), {"simulation": {"chunks": 1}, "calibration": {"chunks": 1}})
+    experiment["outputs"]["figures"] = ["layout", "spherical"]
+    path.write_text(yaml.safe_dump(merged(experiment, yaml.safe_load(blocks["yaml"]))))
+    run = run_study(load_study(path), Budget(workers=1))
     assert (run.folder / "report.html").is_file()
     assert run.warnings == []

@@ -23,7 +23,7 @@ from calstudy.run.store import Store
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import CodeSources
 from calstudy.studies.load import load_study
-from calstudy.studies.study import run_study
+from calstudy.studies.study import Budget, run_study
 
 OWN_CODE = Path(__file__).parents[2] / "notebooks" / "own_code.py"
 
@@ -90,7 +90,7 @@ def test_a_study_of_own_code_runs_and_plays_no_part_of_the_paper(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(yaml.safe_dump(content))
     study = load_study(path)
-    result = run_study(study)
+    result = run_study(study, Budget(workers=1))
     assert '"PASS"' not in (result.folder / "claims.json").read_text()
     manifest = json.loads((result.folder / "manifest.json").read_text())
     assert any("own_code.py, not GLEAM" in text for text in manifest["stand_ins"])

@@ -13,6 +13,7 @@ from astropy.time import Time
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.instrument.settings import GolombLayout
+from calstudy.measured.halves import Halves
 from calstudy.power.average import average_in_blocks, divide, fringe_stop_and_average
 from calstudy.power.errors import independent_times, noise_level, sample_modes
 from calstudy.power.interface import estimate_spectra
@@ -20,7 +21,6 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra
 from calstudy.power.spherical import modes_in_bins, spherical_average
 from calstudy.power.tables import load_spectrum, save_spectrum
-from calstudy.products.observed import Halves, averaging
 
 SETTINGS = PowerSettings(pairs="same-baseline")
 DAY = 86400.0
@@ -153,8 +153,8 @@ def test_from_cube_of_blocks_keeps_their_order(hour, rng):
     assert (np.diff(averaged.time_array.reshape(6, -1)[:, 0]) > 0).all()
 
 
-def graph_of(times, coherent_time, odd=None):
-    """What `averaging` reads of a study of measured data: interleaved halves, or two data sets."""
+def averaging(times, coherent_time, odd=None):
+    """How halves are averaged, interleaved or two data sets, of integrations of 10 s with these numbers."""
 
     def facts(found):
         found = np.asarray(found) * 10 / DAY + 2459000.0
@@ -162,15 +162,15 @@ def graph_of(times, coherent_time, odd=None):
 
     even = facts(times)
     halves = Halves({"even": even, "odd": even if odd is None else facts(odd)})
-    return SimpleNamespace(halves=halves, power=PowerSettings(coherent_time=f"{coherent_time} s"))
+    return halves.averaging(PowerSettings(coherent_time=f"{coherent_time} s"))
 
 
 def test_halves_of_measured_data_have_the_blocks_that_both_have():
-    whole = averaging(graph_of(np.arange(24), 60.0))
+    whole = averaging(np.arange(24), 60.0)
     assert whole["blocks"] == 4
     assert "kept" not in whole
     # Of the block of integrations 6 to 11 only number 6 is there, which is in the even half.
-    gap = averaging(graph_of([*range(7), *range(12, 24)], 60.0))
+    gap = averaging([*range(7), *range(12, 24)], 60.0)
     assert (gap["blocks"], gap["kept"]) == (4, [0, 2, 3])
 
 
@@ -184,7 +184,7 @@ def test_halves_of_measured_data_have_the_blocks_that_both_have():
 )
 def test_blocks_that_halves_cannot_share_are_refused_by_the_plan(times, coherent_time, odd, told):
     with pytest.raises(InputError, match=rf"power\.coherent_time.*{told}"):
-        averaging(graph_of(times, coherent_time, odd))
+        averaging(times, coherent_time, odd)
 
 
 def test_baselines_that_are_flagged_in_turn_are_refused(observe, white, beam, rng):

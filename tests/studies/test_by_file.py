@@ -29,7 +29,7 @@ from calstudy.products.score import score
 from calstudy.studies.export import CARRIER, Contents
 from calstudy.studies.load import load_study
 from calstudy.studies.scores import Row, Scores, leaderboard, read_scores
-from calstudy.studies.study import run_study
+from calstudy.studies.study import Budget, run_study
 from calstudy.studies.worlds import load_worlds
 
 ROOT = Path(__file__).parents[2]
@@ -314,7 +314,7 @@ def test_a_folder_takes_part_in_a_comparison_beside_the_built_in_ones(skycal, ho
     path.write_text(yaml.safe_dump(data, sort_keys=False))
     study = load_study(path)
     assert [bool(case.refusal) for case in study.cases] == [False, False, False, True]
-    run = run_study(study)
+    run = run_study(study, Budget(workers=1))
     found = json.loads((run.folder / "tables" / "comparison.json").read_text())
     assert_same_bands(found["first"]["mine"], found["first"]["built in"])
     text = (run.folder / "tables" / "comparison.md").read_text()

@@ -19,7 +19,7 @@ from calstudy.products.signal_loss import transfer
 from calstudy.regression.comparison import compare_figures
 from calstudy.regression.reference import accept, read_reference, read_run
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Run, run_study
+from calstudy.studies.study import Budget, Run, run_study
 
 CALIBRATORS = {
     "sky-based": "sky-based",
@@ -51,7 +51,7 @@ def comparison_file(folder, **fields):
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory) -> Run:
-    return run_study(load_study(comparison_file(tmp_path_factory.mktemp("comparison"))))
+    return run_study(load_study(comparison_file(tmp_path_factory.mktemp("comparison"))), Budget(workers=1))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_scores_are_those_of_the_experiments_own_products(compared):
     assert score(graph).key in keys
     product = compared.made.products[score(graph).key]
     found = load_spectrum(product.path / "score-bins.h5", Score)
-    full = run_study(load_study(compared.folder / "cases" / "002.yaml"))
+    full = run_study(load_study(compared.folder / "cases" / "002.yaml"), Budget(workers=1))
     folder = full.made.products[transfer(graph).key].path
     own = load_spectrum(folder / "transfer.outside-wedge.h5", TransferFunction)
     known = np.isfinite(own.scale_free_transfer)

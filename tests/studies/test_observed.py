@@ -61,7 +61,7 @@ def simulated(folder) -> Run:
         calibration=CALIBRATION,
         sky__eor={"nside": 32},
     )
-    return run_study(ExperimentStudy(validate({**data, "variants": VARIANTS}, folder)))
+    return run_study(ExperimentStudy(validate({**data, "variants": VARIANTS}, folder)), Budget(workers=1))
 
 
 def product(run: Run, stage: str, label: str) -> Path:
@@ -131,7 +131,7 @@ def two_files(simulated, folder) -> Run:
         paths[parity] = folder / f"{parity}.uvh5"
         measurement(simulated, parity).write_uvh5(paths[parity])
     observed = {"data": str(paths["even"]), "odd": str(paths["odd"])}
-    return run_study(load_study(observed_file(folder, "two-files", observed)))
+    return run_study(load_study(observed_file(folder, "two-files", observed)), Budget(workers=1))
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def one_file(simulated, folder) -> Run:
     with_autos(simulated, measurement(simulated, "even", "foregrounds+noise")).write_uvh5(path)
     observed = {"data": str(path)}
     injection = {"eor": {"nside": 32}, "level": "-30 dB", "simulation": {"chunks": 1}}
-    return run_study(load_study(observed_file(folder, "one-file", observed, injection=injection)))
+    return run_study(load_study(observed_file(folder, "one-file", observed, injection=injection)), Budget(workers=1))
 
 
 @pytest.mark.parametrize("modes", ["all-modes", "outside-wedge"])
@@ -374,7 +374,7 @@ def test_antennas_get_their_positions(simulated, folder):
 
 
 def test_a_second_run_computes_nothing(one_file, folder):
-    assert run_study(load_study(folder / "one-file.yaml")).made.tasks == ()
+    assert run_study(load_study(folder / "one-file.yaml"), Budget(workers=1)).made.tasks == ()
 
 
 def test_the_report_has_figures_and_numbers(one_file):

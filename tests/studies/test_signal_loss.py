@@ -16,7 +16,7 @@ from calstudy.power.transfer import TransferFunction, TransferMap, pool
 from calstudy.products.signal_loss import transfer
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Run, run_study
+from calstudy.studies.study import Budget, Run, run_study
 from calstudy.studies.sweep import Sweep, expand
 
 ANTENNAS = 7
@@ -51,7 +51,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def swept(folder) -> Run:
-    return run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)))
+    return run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)), Budget(workers=1))
 
 
 def table(result: Run, point: int, name: str, kind: type = TransferFunction):
@@ -149,7 +149,7 @@ def test_the_figure_pools_skies_and_keeps_the_rest_apart(swept):
 
 
 def test_a_second_sweep_makes_nothing(swept, folder):
-    again = run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)))
+    again = run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)), Budget(workers=1))
     assert again.made.tasks == ()
     assert again.folder == swept.folder
 
@@ -219,7 +219,7 @@ def test_all_faults_of_a_sweep_are_told_at_once(folder):
 def test_what_the_calibrator_refuses_is_told_with_the_point_before_anything_is_made(folder):
     sweep = expand(validate({**small(folder), "sweep": {"calibration.basis.buffer": ["50 ns", "9 us"]}}, folder))
     with pytest.raises(InputError, match=r"^02-buffer=9us: calibration\.basis: a delay half-width of \d+ ns fills"):
-        run_study(sweep)
+        run_study(sweep, Budget(workers=1))
     assert not sweep.folder.exists()
 
 

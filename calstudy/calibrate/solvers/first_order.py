@@ -162,7 +162,7 @@ class JointKernels:
         self.space = GainSpace(structure.gain_vectors, self.dtype)
         self.bases = [tf.constant(np.moveaxis(basis, -1, 0), self.dtype) for basis in self.tensors.bases]
         self._optimizer, self._with_prior = optimizer, prior == "sum"
-        self.descend = tf.function(self._descend, jit_compile=True)
+        self.descend = tf.function(self._descend, jit_compile=True, autograph=False)
 
     def load(self, problem: CalibrationProblem, gains: np.ndarray) -> tuple[Parameters, FitData, float]:
         """Return gains with the foregrounds that fit best, in weighted least squares, the data, and their unit."""

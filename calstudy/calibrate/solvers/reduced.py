@@ -134,12 +134,12 @@ class ReducedKernels:
         self.space = GainSpace(structure.gain_vectors, dtype)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
         self.project = self.projector.project
-        self.channel_step = tf.function(self._channel_step)
-        self.antenna_step = tf.function(self._antenna_step)
-        self.blocks = tf.function(self._blocks)
-        self.inverse = tf.function(self._inverse)
-        self.accelerate = tf.function(self._accelerate)
-        self.predicted_decrease = tf.function(self._predicted_decrease)
+        self.channel_step = tf.function(self._channel_step, autograph=False)
+        self.antenna_step = tf.function(self._antenna_step, autograph=False)
+        self.blocks = tf.function(self._blocks, autograph=False)
+        self.inverse = tf.function(self._inverse, autograph=False)
+        self.accelerate = tf.function(self._accelerate, autograph=False)
+        self.predicted_decrease = tf.function(self._predicted_decrease, autograph=False)
 
     def in_double(self) -> ReducedKernels:
         """Return the kernels of the same fit whose inner products are float64."""
