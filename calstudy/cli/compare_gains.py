@@ -59,7 +59,7 @@ def _numbers(found: GainDifference) -> dict[str, float | int | str]:
 
     worst = int(np.nanargmax(found.of_antenna))
     return {
-        "antennas": len(found.pair.antennas),
+        "antennas": int(np.isfinite(found.of_antenna).sum()),
         "channels": len(found.pair.frequency),
         "difference": together(found),
         "difference as given": found.as_given,

@@ -347,7 +347,7 @@ def _cost_of_reading(task: Task) -> Cost:
 
 def _cost_of_average(task: Task) -> Cost:
     size = size_of(task)
-    disk = 2 * size.samples / size.times * COMPLEX128
+    disk = 2 * task.settings.get("blocks", 1) * size.samples / size.times * COMPLEX128
     return Cost(2 + size.samples * 5e-7, LIBRARIES_MEMORY + 10 * size.samples * COMPLEX128, disk)
 
 

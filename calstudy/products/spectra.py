@@ -209,11 +209,18 @@ def _cost_of_average(task: Task) -> Cost:
 
 
 def _cost_of_power(task: Task) -> Cost:
-    size, blocks = size_of(task), max(average.settings.get("blocks", 1) for average in task.inputs.values())
+    size, blocks = size_of(task), _count_blocks(task)
     # Each block has a file of the estimator; spectra and what each unit owes to its antennas are of all.
     spectra = size.baselines * size.channels.count
     seconds = 2 + 1e-5 * spectra + (blocks - 1) * (0.9 + 0.005 * size.baselines)
     return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
+
+
+def _count_blocks(power: Task) -> int:
+    """Return the number of blocks of averages, or of what differences or noise are made of."""
+    found = [*power.inputs.values()]
+    found += [behind for task in power.inputs.values() for behind in task.inputs.values()]
+    return max(task.settings.get("blocks", 1) for task in found)
 
 
 AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)

@@ -136,13 +136,17 @@ def test_files_that_have_nothing_in_common_are_refused(template, gains):
 @pytest.mark.filterwarnings("ignore")
 def test_the_command_writes_numbers_and_a_figure(template, gains, tmp_path, capsys):
     changed = gains * (1 + 0.01 * complex_normal(np.random.default_rng(4), gains.shape))
-    for name, values in (("a", changed), ("b", gains)):
-        make_uvcal(template, values).write_calh5(tmp_path / f"{name}.calh5")
+    # The last antenna has gains in one of the files only.
+    flags = np.zeros(gains.shape, bool)
+    flags[-1] = True
+    make_uvcal(template, changed, flags).write_calh5(tmp_path / "a.calh5")
+    make_uvcal(template, gains).write_calh5(tmp_path / "b.calh5")
     out = tmp_path / "out"
     status, told = run_command(capsys, "compare-gains", tmp_path / "a.calh5", tmp_path / "b.calh5", "--output", out)
     assert status == 0, told
     numbers = json.loads((out / "gain-comparison.json").read_text())
-    # Of nine antennas, the phase of each channel takes a ninth of the imaginary parts.
+    assert numbers["antennas"] == N_ANTENNAS - 1
+    # Of few antennas, the phase of each channel takes a part of the imaginary parts: an eighth of eight.
     assert numbers["difference"] == pytest.approx(0.01, rel=0.1)
     assert {path.suffix for path in out.iterdir()} == {".json", ".npz", ".pdf", ".png"}
     status, told = run_command(capsys, "compare-gains", tmp_path / "a.calh5", tmp_path / "c.calh5")
