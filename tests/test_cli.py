@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_line import run_command
 from tiny import tiny
 
 from calstudy.experiment.files import override, validate
@@ -116,6 +117,16 @@ def test_all_faults_of_a_file_are_told_on_standard_error(tmp_path):
 def test_a_mistake_is_one_clear_sentence(tmp_path, arguments, told):
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
     assert told in refused(calstudy(*arguments, cwd=tmp_path))
+
+
+def test_an_interrupted_command_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("calstudy.studies.load.load_study", interrupted)
+    status, told = run_command(capsys, "run", tmp_path / "tiny.yaml")
+    assert status == 130
+    assert told.strip() == "calstudy: interrupted; finished products are kept, the same command resumes"
 
 
 def test_a_plan_computes_and_writes_nothing(tmp_path):

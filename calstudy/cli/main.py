@@ -52,6 +52,7 @@ app.add_typer(bench_app, name="bench")
 app.add_typer(check_app, name="check")
 
 EXIT_INPUT = 2
+EXIT_INTERRUPTED = 130
 
 File = Annotated[
     Path,
@@ -235,6 +236,8 @@ def main() -> None:
             raise
         typer.echo(f"calstudy: {error.filename}: cannot be read or written ({reason})", err=True)
         sys.exit(EXIT_INPUT)
-    except KeyboardInterrupt:
-        typer.echo("calstudy: interrupted; finished products are kept, the same command resumes", err=True)
-        sys.exit(130)
+    except SystemExit as end:
+        # Typer ends an interrupted command with this status, and says nothing.
+        if end.code == EXIT_INTERRUPTED:
+            typer.echo("calstudy: interrupted; finished products are kept, the same command resumes", err=True)
+        raise
