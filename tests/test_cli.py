@@ -126,7 +126,7 @@ def test_an_interrupted_command_says_how_to_go_on(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr("calstudy.studies.load.load_study", interrupted)
     status, told = run_command(capsys, "run", tmp_path / "tiny.yaml")
     assert status == 130
-    assert told.strip() == "calstudy: interrupted; finished products are kept, the same command resumes"
+    assert told.strip() == "calstudy: interrupted; what is in the store is kept, and a run goes on from there"
 
 
 def test_a_plan_computes_and_writes_nothing(tmp_path):

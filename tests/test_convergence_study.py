@@ -12,6 +12,8 @@ from calstudy.experiment.files import override, validate
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.study import Budget, run_study
 
+DRAWN = True
+
 VARIANTS = {
     "residual": {"components": ["foregrounds", "eor", "noise"], "effects": True, "calibrate": True},
     "residual_without_eor": {"components": ["foregrounds", "noise"], "effects": True, "calibrate": True},

@@ -60,7 +60,7 @@ def _numbers(found: GainDifference) -> dict[str, float | int | str]:
     worst = int(np.nanargmax(found.of_antenna))
     return {
         "antennas": int(np.isfinite(found.of_antenna).sum()),
-        "channels": len(found.pair.frequency),
+        "channels": int(np.isfinite(found.of_channel).sum()),
         "difference": together(found),
         "difference as given": found.as_given,
         "median over antennas": float(np.nanmedian(found.of_antenna)),

@@ -236,8 +236,9 @@ def main() -> None:
             raise
         typer.echo(f"calstudy: {error.filename}: cannot be read or written ({reason})", err=True)
         sys.exit(EXIT_INPUT)
-    except SystemExit as end:
+    except (KeyboardInterrupt, SystemExit) as end:
         # Typer ends an interrupted command with this status, and says nothing.
-        if end.code == EXIT_INTERRUPTED:
-            typer.echo("calstudy: interrupted; finished products are kept, the same command resumes", err=True)
-        raise
+        if isinstance(end, SystemExit) and end.code != EXIT_INTERRUPTED:
+            raise
+        typer.echo("calstudy: interrupted; what is in the store is kept, and a run goes on from there", err=True)
+        sys.exit(EXIT_INTERRUPTED)

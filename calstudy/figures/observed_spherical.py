@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.figures import Drawing, ObservedFigure
-from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points, label_wavenumbers
+from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
 from calstudy.plotting import style
 from calstudy.products.files import spectrum_file
 from calstudy.products.observed_spectra import observed_spectra
@@ -55,7 +55,7 @@ def draw_observed(
         _draw_noise(axes, series["residual"])
         axes.set_title(COLUMNS[modes].format(1e9 * buffer))
         axes.set(xlabel=style.WAVENUMBER, xscale="log", yscale="log", ylim=_limits(columns))
-        label_wavenumbers(axes)
+        style.label_one_two_five(axes.xaxis)
     grid[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
     handles = [
         axes.plot([], [], linestyle="none", marker=mark.marker, color=mark.colour, label=mark.label)[0]

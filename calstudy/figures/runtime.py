@@ -61,8 +61,6 @@ def draw_runtime(
     ValueError
         If there are not one to eight series.
     """
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
     if not 1 <= len(series) <= MOST:
         raise ValueError(f"a run-time figure has 1 to {MOST} series, not {len(series)}")
     figure = style.new_figure(style.ONE_COLUMN, 2.7 + 0.14 * len(series))
@@ -74,9 +72,7 @@ def draw_runtime(
         axes.plot(item.size, item.median, marker, color=colour, markersize=4, markerfacecolor=colour if filled else "w")
         axes.plot(item.size, item.fit.at(item.size), color=colour, linewidth=0.8, linestyle="-" if filled else "--")
     axes.set(xscale="log", yscale="log", xlabel=size_label, ylabel=time_label)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    style.label_one_two_five(axes.xaxis)
     _add_legend(figure, series, symbol)
     style.note_stand_ins(figure, stand_ins)
     return figure

@@ -15,7 +15,6 @@ from calstudy.figures.spherical import (
     SphericalColumn,
     draw_band,
     draw_points,
-    label_wavenumbers,
     read_column,
 )
 from calstudy.plotting import style
@@ -72,7 +71,7 @@ def draw_solver_comparison(
     for row, name in zip(grid, ROWS, strict=True):
         row[0].set(xscale="log", yscale="log", xlim=(0.9 * first, last_k), ylim=_limits(shown, name, last_k))
         row[0].set_ylabel(rf"{ROWS[name]} ({style.POWER_UNIT})")
-        label_wavenumbers(row[0])
+        style.label_one_two_five(row[0].xaxis)
     _add_legend(figure)
     style.note_stand_ins(figure, stand_ins)
     return figure

@@ -119,7 +119,7 @@ def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stan
     for row, ylim, end in zip(grid, (_full_limits(columns), _zoom_limits(columns)), (last, zoomed_last), strict=True):
         row[0].set(xscale="log", yscale="log", ylim=ylim, xlim=(first, end))
         row[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
-        label_wavenumbers(row[0])
+        style.label_one_two_five(row[0].xaxis)
     _add_legend(figure, columns)
     style.note_stand_ins(figure, stand_ins)
     return figure
@@ -143,16 +143,6 @@ def _draw_column(axes: Axes, column: SphericalColumn, names: Sequence[str]) -> N
         spectrum = getattr(column, name)
         if spectrum is not None:
             draw_points(axes, spectrum, MARKINGS[name], name, 2 + list(MARKINGS).index(name))
-
-
-def label_wavenumbers(axes: Axes) -> None:
-    """Label 1, 2 and 5 of each decade of a logarithmic k axis, and nothing between them."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    # Matplotlib labels minor ticks as well where few major ones are in view.
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def draw_band(axes: Axes, eor: SphericalSpectrum) -> None:

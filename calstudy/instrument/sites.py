@@ -56,7 +56,7 @@ def place_of(site: Site | Coordinates) -> Place:
     if isinstance(site, Site):
         return SITES[site.kind]
     # The same place, whether its longitude counts to 180 or to 360 degrees.
-    longitude = site.longitude - 360 if site.longitude > 180 else site.longitude
+    longitude = round(site.longitude - 360, 9) if site.longitude >= 180 else site.longitude
     return Place(site.latitude, longitude, site.height)
 
 
@@ -75,5 +75,4 @@ def describe(site: Site | Coordinates) -> str:
     """Return in words where a site is: its name if it has one, latitude, longitude and height."""
     place = place_of(site)
     name = "" if isinstance(site, Coordinates) else f"{site.kind}, "
-    longitude = (place.longitude + 180) % 360 - 180
-    return f"{name}latitude {place.latitude:.4f} deg, longitude {longitude:.4f} deg, {place.height:.0f} m"
+    return f"{name}latitude {place.latitude:.4f} deg, longitude {place.longitude:.4f} deg, {place.height:.0f} m"

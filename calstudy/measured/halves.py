@@ -12,13 +12,14 @@ from calstudy.base.observation import Frame
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
 from calstudy.measured.selection import Selection, parse_values, select
-from calstudy.power.settings import PowerSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
     from pyuvdata import UVData
+
+    from calstudy.power.settings import PowerSettings
 
 PARITIES = ("even", "odd")
 FEED_TOLERANCE = np.radians(1)
@@ -128,6 +129,11 @@ class Halves:
         ----------
         power
             Whose `coherent_time` is the duration of a block.
+
+        Returns
+        -------
+        ``centre``, a Julian date or None; or ``blocks``, ``span`` (two Julian dates or None) and, if some blocks are
+        left out, the numbers of those that are ``kept``.
 
         Raises
         ------

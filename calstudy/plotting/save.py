@@ -113,15 +113,26 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
         "png": partial(figure.savefig, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}),
     }
     paths = [folder / f"{name}.{ending}" for ending in writers]
-    with journal_style():
-        # Matplotlib lays a figure out anew for each file, and draws it once more to do so.
-        if (layout := figure.get_layout_engine()) is not None:
-            layout.execute(figure)
-            figure.set_layout_engine(None)
+    with journal_style(), _laid_out(figure):
         for path, write in zip(paths, writers.values(), strict=True):
             with _replacing(path) as stream:
                 write(stream)
     return paths
+
+
+@contextmanager
+def _laid_out(figure: Figure) -> Iterator[None]:
+    """Lay a figure out once; matplotlib does so for each file, and draws it once more to do so."""
+    layout = figure.get_layout_engine()
+    if layout is None or not figure.axes:
+        yield
+        return
+    layout.execute(figure)
+    figure.set_layout_engine(None)
+    try:
+        yield
+    finally:
+        figure.set_layout_engine(layout)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from threading import RLock
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
     from matplotlib.text import Text
 
@@ -96,6 +97,16 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def label_one_two_five(axis: Axis) -> None:
+    """Label 1, 2 and 5 of each decade of a logarithmic axis, and nothing between them."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    # Matplotlib labels minor ticks as well where few major ones are in view.
+    axis.set_minor_formatter(NullFormatter())
 
 
 def note_stand_ins(figure: Figure, stand_ins: Sequence[str]) -> Text | None:

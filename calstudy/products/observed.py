@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
-from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import GainFit
 from calstudy.measured.settings import Factor, FromAutocorrelations, InjectionSettings, ObservedSettings
@@ -24,7 +24,7 @@ from calstudy.products.files import (
     write_visibilities,
 )
 from calstudy.products.graph import Memory, once, size_of
-from calstudy.products.spectra import NOT_OF_DELAY_SPECTRA, POWER, blocks_of
+from calstudy.products.spectra import NOT_OF_DELAY_SPECTRA, POWER, blocks_in, blocks_of
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
@@ -353,7 +353,9 @@ def _cost_of_average(task: Task) -> Cost:
 
 def _cost_of_noise(task: Task) -> Cost:
     size = size_of(task)
-    return Cost(2, LIBRARIES_MEMORY, size.samples / size.times * COMPLEX64)
+    averages = list(task.inputs.values())
+    disk = blocks_in(averages) * size.samples / size.times * COMPLEX128
+    return Cost(2, LIBRARIES_MEMORY, disk)
 
 
 OBSERVE = Stage(name="observe", version=1, make=observe, cost=_cost_of_reading)

@@ -290,7 +290,8 @@ def _cost_of_data(task: Task) -> Cost:
 
 def _cost_of_average(task: Task) -> Cost:
     size = size_of(task)
-    return Cost(2, LIBRARIES_MEMORY + 8 * size.samples * COMPLEX128, size.samples / size.times * COMPLEX128)
+    disk = task.settings.get("blocks", 1) * size.samples / size.times * COMPLEX128
+    return Cost(2, LIBRARIES_MEMORY + 8 * size.samples * COMPLEX128, disk)
 
 
 def _cost_of_expectation(task: Task) -> Cost:

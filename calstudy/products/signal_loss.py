@@ -12,6 +12,7 @@ from calstudy.products import calibration, corruption, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import AVERAGE, read_json, read_visibilities, spectrum_file, write_json, write_visibilities
 from calstudy.products.graph import Graph, once, size_of
+from calstudy.products.spectra import blocks_in
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
@@ -190,7 +191,8 @@ def write_corrected(folder: Path, residual: SphericalSpectrum, signal: Spherical
 
 
 def _cost_of_difference(task: Task) -> Cost:
-    return Cost(0.3, disk=size_of(task).baselines * 1e4)
+    blocks = blocks_in(task.inputs.values())
+    return Cost(0.3 * blocks, disk=blocks * size_of(task).baselines * 1e4)
 
 
 def _cost_of_flux_scale(task: Task) -> Cost:

@@ -16,7 +16,7 @@ from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
 from calstudy.simulate.nodes import node_counts
 from calstudy.sky.counts import FAINTEST, expected_sources
-from calstudy.sky.settings import Eor, NoSources, PointSources
+from calstudy.sky.settings import Eor, Foregrounds, NoSources, PointSources, SyntheticSources
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -32,6 +32,8 @@ TOLERATED = 100
 """Interpolation errors up to this times the tolerance, which bounds a typical one, go without a warning."""
 
 SOURCES = 546_000
+DRAWN_SOURCE = 152
+"""Bytes that are kept of every source that was drawn."""
 TABLE_MEMORY = 1.3e6
 """Bytes of the table of a beam for one polarization and frequency."""
 DIPOLE_SECONDS, DIPOLE_MEMORY, WORKERS = 20.0, 0.6e9, 4
@@ -185,14 +187,14 @@ def _cost_of_chunk(task: Task) -> Cost:
     pieces = min(simulation.chunks, channels)
     times, frequencies = node_counts(instrument, simulation.nodes)
     if isinstance(sky, Eor):
-        sources, spectral = 12 * sky.nside**2, channels / simulation.chunks
+        sources, spectral, kept = 12 * sky.nside**2, channels / simulation.chunks, 0.0
     else:
-        sources, spectral = _sources(task.settings), 0.0
+        sources, spectral, kept = _sources(task.settings), 0.0, DRAWN_SOURCE * _drawn(task.settings["sky"])
         channels = frequencies
     beams = beam_count(instrument, size.antennas)
     engine = simulation.engine.cost(SimulationSize(sources, times * channels / pieces, size.antennas, beams))
     disk = size.samples / size.channels.count * channels / pieces * COMPLEX128
-    memory = engine.memory + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
+    memory = engine.memory + kept + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
     seconds = 6 + engine.seconds
     if beams > 1:
         # Tables of the beams at the nodes: twice, for sources that stay up and for those that rise or set.
@@ -202,6 +204,11 @@ def _cost_of_chunk(task: Task) -> Cost:
         seconds += DIPOLE_SECONDS * min(1, WORKERS / pieces)
         memory += DIPOLE_MEMORY
     return Cost(seconds, memory, disk)
+
+
+def _drawn(sky: Foregrounds) -> float:
+    """Estimate how many sources are drawn, of which the brightest are used."""
+    return expected_sources(max(sky.flux_limit, FAINTEST)) if isinstance(sky, SyntheticSources) else 0.0
 
 
 def _sources(settings: Mapping[str, Any]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -202,6 +202,11 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
     return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
 
 
+def blocks_in(averages: Iterable[Task]) -> int:
+    """Return the number of blocks of averages, the largest of any."""
+    return max(task.settings.get("blocks", 1) for task in averages)
+
+
 def _cost_of_average(task: Task) -> Cost:
     size, blocks = size_of(task), task.settings.get("blocks", 1)
     disk = blocks * size.samples / size.times * COMPLEX128
@@ -209,18 +214,13 @@ def _cost_of_average(task: Task) -> Cost:
 
 
 def _cost_of_power(task: Task) -> Cost:
-    size, blocks = size_of(task), _count_blocks(task)
+    # Differences and noise are made of averages.
+    behind = [average for source in task.inputs.values() for average in source.inputs.values()]
+    size, blocks = size_of(task), blocks_in([*task.inputs.values(), *behind])
     # Each block has a file of the estimator; spectra and what each unit owes to its antennas are of all.
     spectra = size.baselines * size.channels.count
     seconds = 2 + 1e-5 * spectra + (blocks - 1) * (0.9 + 0.005 * size.baselines)
     return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
-
-
-def _count_blocks(power: Task) -> int:
-    """Return the number of blocks of averages, or of what differences or noise are made of."""
-    found = [*power.inputs.values()]
-    found += [behind for task in power.inputs.values() for behind in task.inputs.values()]
-    return max(task.settings.get("blocks", 1) for task in found)
 
 
 AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)

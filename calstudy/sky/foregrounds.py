@@ -140,7 +140,7 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
 
 
 # Every piece of a simulation needs them, and making them takes longer than a small piece.
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
 def _components(faintest: float, seed: int, index_scatter: float) -> tuple[Catalogue, int]:
     """Return G4Jy components and then synthetic sources, down to a flux in Jy, and the number of the former."""
     real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
 from calstudy.corrupt.levels import rms, set_levels
@@ -202,9 +201,7 @@ def _draw_power(axes: Axes, components: SimulatedComponents) -> None:
     axes.errorbar(spectrum.k[finite], ratio, half, fmt="o", color=style.BLUE, markersize=2.2, elinewidth=0.7)
     reach = 1.05 * float(np.max(np.abs(ratio - 1) + half))
     axes.set(xscale="log", xlabel=style.WAVENUMBER, ylabel=r"$P^S$ over its input", ylim=(1 - reach, 1 + reach))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    style.label_one_two_five(axes.xaxis)
     axes.set_title("bars: 95 % of the sample variance", fontsize=style.SMALL_SIZE)
 
 

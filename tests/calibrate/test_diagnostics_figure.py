@@ -7,6 +7,8 @@ import pytest
 
 from calstudy.observed.diagnostics_figure import Diagnostics, draw_diagnostics
 
+DRAWN = True
+
 CHANNELS, BASELINES, ANTENNAS = 61, 45, 10
 
 

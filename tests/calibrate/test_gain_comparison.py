@@ -15,6 +15,8 @@ from calstudy.base.gains import make_uvcal
 from calstudy.calibrate.gain_comparison import GainPair, compare_gains, pair_gains
 from calstudy.observed.gain_comparison_figure import together
 
+DRAWN = True
+
 N_ANTENNAS = 9
 
 

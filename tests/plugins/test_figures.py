@@ -23,6 +23,8 @@ from calstudy.report.contents import read_contents
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
+DRAWN = True
+
 NAME = "retained_power"
 CODE = sections()["A figure"]["python"]
 CAPTION = "Power of the residual over that of the EoR, outside the wedge, with 95 % bars."

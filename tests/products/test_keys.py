@@ -7,7 +7,7 @@ from tiny import tiny
 
 from calstudy.base.identity import identity
 from calstudy.experiment.files import override, validate
-from calstudy.products import calibration, corruption, simulation, spectra
+from calstudy.products import calibration, corruption, signal_loss, simulation, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.studies.experiment import ExperimentStudy
@@ -211,3 +211,17 @@ def test_a_calibration_is_one_task_however_many_products_need_it():
     found = calibration.calibration(graph, residual, "even")
     assert calibration.calibration(graph, residual, "even") is found
     assert spectra.average(graph, residual, "even").inputs["data"] is found
+
+
+def test_a_plan_counts_the_blocks_of_averages_differences_and_spectra():
+    """Two blocks have twice the averages and differences, and another pass of the estimator."""
+    study = override(BASE, "instrument.times", {"integration": "60 s", "count": 4})
+    found = []
+    for power in ({}, {"coherent_time": "2 min"}):
+        transfer = signal_loss.transfer(Graph(validate({**study, "power": power}, Path())))
+        assert transfer is not None
+        response = transfer.inputs["response"]
+        found.append((response.inputs["even"].cost.disk, transfer.inputs["signal"].inputs["even"].cost.disk))
+        found[-1] += (response.cost.seconds,)
+    assert found[1][:2] == (2 * found[0][0], 2 * found[0][1])
+    assert found[1][2] > found[0][2]

@@ -15,7 +15,8 @@ from simulation_cases import point_sky
 from calstudy.base.errors import ExperimentError
 from calstudy.experiment.files import dump, validate
 from calstudy.instrument.beams import make_beam
-from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.settings import Coordinates, InstrumentSettings
+from calstudy.instrument.sites import place_of
 from calstudy.instrument.telescope import make_template
 from calstudy.products import simulation
 from calstudy.products.graph import Graph
@@ -23,6 +24,14 @@ from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.studies.show import sites
 
 KAROO = {"latitude": "-30.7215 deg", "longitude": "21.4283 deg", "height": "1051.69 m"}
+
+
+def test_longitudes_count_to_180_or_to_360_degrees():
+    def place(longitude):
+        return place_of(Coordinates(kind="coordinates", latitude="52.9 deg", longitude=f"{longitude} deg"))
+
+    assert place(350.1) == place(-9.9)
+    assert place(180) == place(-180)
 
 
 @pytest.mark.parametrize(

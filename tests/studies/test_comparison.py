@@ -21,6 +21,8 @@ from calstudy.regression.reference import accept, read_reference, read_run
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
+DRAWN = True
+
 CALIBRATORS = {
     "sky-based": "sky-based",
     "trusting": {"calibrator": "delay-weighted", "foreground_prior": {"deviation": 0.03}},

@@ -34,6 +34,8 @@ from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
+DRAWN = True
+
 ANTENNAS, TIMES, CHANNELS = 12, 4, 48
 CALIBRATION = {"prior": "gains", "solver": {"name": "gauss-newton", "max_steps": 500}, "chunks": 1}
 EVERYTHING = ["foregrounds", "eor", "noise"]

@@ -30,6 +30,8 @@ from calstudy.studies.realizations import Realizations
 from calstudy.studies.show import describe_plan, show_plan, show_run
 from calstudy.studies.study import Budget, Run, run_study
 
+DRAWN = True
+
 EVERYTHING = {"draw": ["eor", "gains", "noise"], "count": 3}
 TWO_BLOCKS = [{"draw": ["gains", "noise"], "count": 4}, {"draw": ["eor"], "count": 3}]
 

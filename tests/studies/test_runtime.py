@@ -21,6 +21,8 @@ from calstudy.studies.runtime import RuntimeStudy
 from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Budget, run_study
 
+DRAWN = True
+
 FILE = Path(__file__).parents[2] / "experiments" / "runtime.yaml"
 POWERS = {"paper-step": 2.1, "paper-sum": 2.1, "adamax-step": 1.9, "default-step": 1.5, "default-solve": 1.6}
 
@@ -86,7 +88,7 @@ def test_known_powers_come_back_in_figures_tables_and_claims(study):
         assert claims[name].verdict == verdict, name
     assert "not within 1 % of the minimum after 9000" in claims["thousands-of-steps-to-one-percent"].reason
     assert "needs run times on a gpu" in claims["gpu-thirty-times-faster"].reason
-    assert (run.folder / "report.html").is_file()
+    assert (run.folder / "report.html").stat().st_size > 1e5
 
 
 def test_times_are_measured_once_on_a_machine_and_again_on_another(study, monkeypatch):

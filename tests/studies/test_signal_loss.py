@@ -19,6 +19,8 @@ from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 from calstudy.studies.sweep import Sweep, expand
 
+DRAWN = True
+
 ANTENNAS = 7
 VARIANTS = {
     "residual": {"components": ["foregrounds", "eor", "noise"], "effects": True, "calibrate": True},

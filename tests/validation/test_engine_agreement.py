@@ -20,6 +20,8 @@ from calstudy.products.graph import Graph
 from calstudy.run.store import Store
 from calstudy.validation.engine_agreement import compare_simulations, draw_engine_agreement
 
+DRAWN = True
+
 INSTRUMENT = {
     "layout": {"kind": "mwa-compact-minredundant", "count": 6},
     "beam": {"kind": "gaussian"},

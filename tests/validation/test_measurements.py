@@ -16,6 +16,8 @@ from calstudy.validation.product import measurement_task
 from calstudy.validation.steps import SCALES, load_ladder, load_step
 from calstudy.verdicts.criterion import Finding
 
+DRAWN = True
+
 
 def spectra(power: np.ndarray, taper: str = "blackman-harris") -> DelaySpectra:
     n_units, n_delays = power.shape

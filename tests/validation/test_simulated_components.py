@@ -23,6 +23,8 @@ from calstudy.sky.settings import Eor
 from calstudy.studies.components import make_component
 from calstudy.validation.simulated_components import draw_components, measure_components
 
+DRAWN = True
+
 SETTINGS = {
     "name": "look",
     "instrument": {
