@@ -24,17 +24,19 @@ def keep_compiled_pyuvdata() -> None:
     """
     from pyuvdata.utils import antnums_to_baseline, baseline_to_antnums, bls
 
-    for name in ("_max_ant", "_min_ant", "_antnums_to_baseline", "_baseline_to_antnums"):
+    names = ("_max_ant", "_min_ant", "_antnums_to_baseline", "_baseline_to_antnums")
+    for name in names:
         enable = getattr(getattr(bls, name, None), "enable_caching", None)
         if enable is not None:
             # No folder can be written: it is compiled in every process.
             with suppress(RuntimeError):
                 enable()
-    # A full disk stops numba once; what it has compiled serves this process.
-    for _ in range(3):
+    # A full disk stops numba once for each function, which then serves this process.
+    for _ in names:
         with suppress(OSError):
             numbers = antnums_to_baseline(np.zeros(1, int), np.ones(1, int), Nants_telescope=2)
             baseline_to_antnums(numbers, Nants_telescope=2)
+            return
 
 
 def require_rectangular(uvd: UVData) -> None:

@@ -9,14 +9,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.figures import ComparisonFigure, Drawing
-from calstudy.figures.spherical import (
-    SIGMAS_95,
-    Marking,
-    SphericalColumn,
-    draw_band,
-    draw_points,
-    read_column,
-)
+from calstudy.figures.spherical import SIGMAS_95, Marking, SphericalColumn, draw_band, draw_points, read_column
 from calstudy.plotting import style
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES

@@ -353,8 +353,7 @@ def _cost_of_average(task: Task) -> Cost:
 
 def _cost_of_noise(task: Task) -> Cost:
     size = size_of(task)
-    averages = list(task.inputs.values())
-    disk = blocks_in(averages) * size.samples / size.times * COMPLEX128
+    disk = blocks_in(task.inputs.values()) * size.samples / size.times * COMPLEX128
     return Cost(2, LIBRARIES_MEMORY, disk)
 
 

@@ -221,7 +221,8 @@ def test_a_plan_counts_the_blocks_of_averages_differences_and_spectra():
         transfer = signal_loss.transfer(Graph(validate({**study, "power": power}, Path())))
         assert transfer is not None
         response = transfer.inputs["response"]
-        found.append((response.inputs["even"].cost.disk, transfer.inputs["signal"].inputs["even"].cost.disk))
-        found[-1] += (response.cost.seconds,)
-    assert found[1][:2] == (2 * found[0][0], 2 * found[0][1])
-    assert found[1][2] > found[0][2]
+        difference, average = response.inputs["even"], transfer.inputs["signal"].inputs["even"]
+        found.append((difference.cost.disk, average.cost.disk, response.cost.seconds))
+    whole, halves = found
+    assert halves[:2] == (2 * whole[0], 2 * whole[1])
+    assert halves[2] > whole[2]
