@@ -31,12 +31,14 @@ def read_gains(path: Path, where: str) -> UVCal:
     Raises
     ------
     InputError
-        If it is none of them, or a CASA table without the package that reads it; `where` says who asked for it.
+        If it does not exist, is none of them, or a CASA table without the package that reads it; `where` says who asked for it.
     """
     from pyuvdata import UVCal
 
     if path.is_dir() and find_spec("casacore") is None:
         raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
+    if not path.exists():
+        raise InputError(f"{where} = {str(path)!r}: no such file or folder")
     try:
         return UVCal.from_file(str(path))
     # The readers raise whatever their libraries do; a file that cannot be read is the user's to mend.

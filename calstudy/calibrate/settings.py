@@ -12,6 +12,10 @@ from calstudy.base.units import Delay, FluxDensity, Length
 from calstudy.calibrate.interface import Calibrator
 
 MODELS_AT_ONCE = 512
+NOISE_UNKNOWN = (
+    "foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; give the "
+    "standard deviation of a sample, such as '1 Jy', or use `weights: autos`"
+)
 
 
 class BasisSettings(Section):

@@ -9,7 +9,7 @@ from pyuvdata import UVFlag
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
-from calstudy.calibrate.settings import FileWeights, ForegroundFit, Weights
+from calstudy.calibrate.settings import NOISE_UNKNOWN, FileWeights, ForegroundFit, Weights
 
 # Times of weights and data agree within this, in days.
 TIME_TOLERANCE = 1e-6
@@ -84,10 +84,7 @@ def inverse_variance(data: Observation, fitted: np.ndarray, settings: Foreground
     elif sigma:
         precision = np.sum(data.nsamples[:, fitted] * used, axis=(1, 2), keepdims=True) / sigma**2
     else:
-        raise InputError(
-            "foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; "
-            "give the standard deviation of a sample, such as '1 Jy', or use `weights: autos`"
-        )
+        raise InputError(NOISE_UNKNOWN)
     return precision / np.where(count > 0, count, 1) * (used.shape[1] * used.shape[2])
 
 

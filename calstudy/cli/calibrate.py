@@ -149,9 +149,12 @@ def _weights(text: str | None) -> Any:
 
 def _run(request: _Request, calibrator: Calibrator) -> int:
     from calstudy.base.quiet import load_tensorflow
-    from calstudy.calibrate.settings import GainFit
+    from calstudy.calibrate.settings import NOISE_UNKNOWN, ForegroundFit, GainFit
     from calstudy.measured.selection import parse_selection
     from calstudy.observed.output import EXPECTED, describe, require_free, write_result
+
+    if isinstance(calibrator, ForegroundFit) and calibrator.needs_noise:
+        raise InputError(NOISE_UNKNOWN)
 
     selection = parse_selection(request.selections)
     if isinstance(calibrator, GainFit) and calibrator.weights.kind == "autos":

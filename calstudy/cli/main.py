@@ -5,8 +5,10 @@ Only light modules are imported here, so that ``calstudy --help`` answers at onc
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import logging
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -217,6 +219,8 @@ def fetch(
 def main() -> None:
     """Run the command line; a user's mistake ends with sentences on standard error and exit status 2."""
     logging.getLogger().addHandler(logging.NullHandler())
+    # Where a crash of a library was, on the terminal: a run writes standard error itself to a file.
+    faulthandler.enable(os.dup(2), all_threads=False)
     if ranks.is_helper():
         ranks.serve()
         return

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+BEGUN = "begun"
+"""Topic under which workers report to the scheduler what they begin to make."""
 QUIET_TENSORFLOW = {"TF_CPP_MIN_LOG_LEVEL": "3", "TF_ENABLE_ONEDNN_OPTS": "0"}
 
 
@@ -170,6 +172,21 @@ def _client(workers: Workers) -> Iterator[Client]:
         yield client
 
 
+def _announce_and_perform(order: WorkOrder) -> Product:
+    """Tell the scheduler, which outlives this process, what this worker begins to make; and make it."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    worker.log_event(BEGUN, {"worker": worker.address, "product": f"{order.stage.name} ({order.label})"})
+    return perform(order)
+
+
+def _last_begun(client: Client, worker: str) -> str | None:
+    """Return what a worker that died was making, if word of it had reached the scheduler."""
+    begun = [event["product"] for _, event in client.get_events(BEGUN) or () if event["worker"] == worker]
+    return begun[-1] if begun else None
+
+
 class _Queue:
     """Hands tasks to the workers, each once all that it needs is made.
 
@@ -205,7 +222,7 @@ class _Queue:
 
     def _future(self, task: Task) -> Future:
         return self._client.submit(
-            perform,
+            _announce_and_perform,
             WorkOrder.of(task, self._store),
             key=f"{task.stage.name}-{task.key}-{digest_json(str(self._store.root))[:8]}",
             priority=self._priority[task.key],
@@ -257,11 +274,12 @@ def execute(
             task = futures.pop(future)
             try:
                 product = future.result()
-            except KilledWorker:
+            except KilledWorker as error:
+                # The error may come from a task that only waited for the worker.
+                begun = _last_begun(client, error.last_worker.address) or f"{task.stage.name} ({task.label})"
                 raise InputError(
-                    f"{task.stage.name} ({task.label}): its worker process died repeatedly, for want of memory or by a "
-                    "crash of code that it runs; use fewer --workers, or smaller chunks, and run again: finished "
-                    "products are kept"
+                    f"{begun}: its worker process died repeatedly, for want of memory or by a crash of code that it "
+                    "runs; use fewer --workers, or smaller chunks, and run again: finished products are kept"
                 ) from None
             # The client would have a result that it holds computed again if its worker dies.
             future.release()

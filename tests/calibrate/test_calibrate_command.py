@@ -128,6 +128,7 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
         (["data.uvh5", "--solver", "newton"], "solver: 'newton' is not a choice"),
         (["data.uvh5", "--buffer", "50"], "basis.buffer: '50' has no unit"),
         (["data.uvh5", "--set", "bufer=3"], "bufer: unknown key"),
+        (["data.uvh5", "--set", "calibrator=delay-weighted"], "foreground_prior.noise: a finite deviation is weighed"),
         (["data.uvh5", "--redundant", "--gains-only"], "--redundant and --gains-only: choose one"),
         (["data.uvh5", "--gains-only"], "calibration.calibrator = 'sky-based': needs a sky model"),
         (["data.uvh5", "--gains-only", *OPTIONS], "calibration.basis: unknown key"),

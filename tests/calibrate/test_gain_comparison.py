@@ -154,3 +154,4 @@ def test_the_command_writes_numbers_and_a_figure(template, gains, tmp_path, caps
     status, told = run_command(capsys, "compare-gains", tmp_path / "a.calh5", tmp_path / "c.calh5")
     assert status == 2
     assert "the second file" in told
+    assert "no such file" in told

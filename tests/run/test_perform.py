@@ -278,6 +278,41 @@ def test_what_a_dead_worker_had_made_is_not_made_again(tmp_path):
     assert (tmp_path / "made").read_text().split() == ["data", "result", "last", "last"]
 
 
+KILLING = """
+import os, signal, time
+from pathlib import Path
+from calstudy.base.errors import InputError
+from calstudy.run.execution import Workers, execute
+from calstudy.run.store import Store
+from calstudy.run.task import Stage, Task
+
+def make(job):
+    time.sleep(0.2)
+    if job.settings["name"] == "guilty":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {}
+
+def task(name):
+    return Task(Stage(name=name, version=1, make=make), "label", {"name": name})
+
+if __name__ == "__main__":
+    store = Store(Path("store"))
+    store.prepare()
+    names = ["first", "second", "third", "guilty"]
+    try:
+        execute([task(name) for name in names], store, Workers(2, Path("run.log")))
+    except InputError as error:
+        print(error)
+"""
+
+
+def test_the_product_that_kills_its_worker_is_named_and_not_what_the_worker_made_before(tmp_path):
+    (tmp_path / "program.py").write_text(KILLING)
+    command = [sys.executable, "program.py"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, timeout=120)
+    assert result.stdout.startswith("guilty (label): its worker process died repeatedly"), result.stderr
+
+
 @pytest.mark.parametrize("make", ["write_much", "write_hdf5"])
 def test_a_product_that_cannot_be_written_is_told_in_a_sentence(tmp_path, make):
     result = program(tmp_path, make, before="limit()")
