@@ -31,7 +31,8 @@ def read_gains(path: Path, where: str) -> UVCal:
     Raises
     ------
     InputError
-        If it does not exist, is none of them, or a CASA table without the package that reads it; `where` says who asked for it.
+        If it does not exist, is none of them, or a CASA table without the package that reads it; `where` says who
+        asked for it.
     """
     from pyuvdata import UVCal
 
