@@ -33,6 +33,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--notebook-outputs", metavar="FOLDER", help="write notebooks that were run to this folder")
 
 
+LONGEST = {"test_ladder.py"}
+"""Files that take minutes: begun last, they would run alone, on one core, when all others are done."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first; the processes of pytest-xdist take files in the order of collection."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR4nGP4z8DwHwAFAAH/iZk9HQAAAABJRU5ErkJggg=="
 )

@@ -219,8 +219,9 @@ def fetch(
 def main() -> None:
     """Run the command line; a user's mistake ends with sentences on standard error and exit status 2."""
     logging.getLogger().addHandler(logging.NullHandler())
-    # Where a crash of a library was, on the terminal: a run writes standard error itself to a file.
-    faulthandler.enable(os.dup(2), all_threads=False)
+    if not faulthandler.is_enabled():
+        # Where a crash of a library was, on the terminal: a run writes standard error itself to a file.
+        faulthandler.enable(os.dup(2), all_threads=False)
     if ranks.is_helper():
         ranks.serve()
         return

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from command_line import run_command
+from command_line import run_command, time_limit
 from pyuvdata import UVData
 from test_calamity import make_uvdata
 
 REFUSED, UNCONVERGED = 2, 3
 OPTIONS = ["--buffer", "50 ns", "--set", "basis.min_delay=50 ns", "--overwrite"]
+
+
+@pytest.fixture(autouse=True)
+def no_hang() -> Iterator[None]:
+    """Fail what does not end in five minutes: what is not refused takes seconds to calibrate."""
+    with time_limit(300):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 import yaml
 from broken import Broken, all_broken, bad_beams, bad_layouts, bad_texts, implausible, missing_files
-from command_line import run_command
+from command_line import run_command, time_limit
 from tiny import tiny
 
 from calstudy.cli import main as cli
 
 REFUSED = 2
+LIMIT = 60
+"""Seconds for one file: refusing takes a fraction of one, and a plan of a valid file a few."""
 HARMLESS = 40
 """Generated changes that are no mistakes, at most: the description may be anything."""
 
@@ -36,7 +38,8 @@ def test_every_broken_file_is_refused_with_sentences_that_name_the_field(tmp_pat
     answers = []
     for item in items:
         Path("file.yaml").write_bytes(item.text)
-        answers.append((item, *run_command(capsys, "plan", "file.yaml")))
+        with time_limit(LIMIT):
+            answers.append((item, *run_command(capsys, "plan", "file.yaml")))
     assert [fault for fault in (faulty(*answer) for answer in answers) if fault] == []
     refused = [item for item, status, _ in answers if status == REFUSED]
     assert len(refused) >= 280
@@ -50,7 +53,8 @@ def test_none_of_the_hand_written_ones_is_taken_for_good(make, tmp_path, capsys,
     monkeypatch.chdir(tmp_path)
     for item in make(tmp_path):
         Path("file.yaml").write_bytes(item.text)
-        assert run_command(capsys, "plan", "file.yaml")[0] == REFUSED, item.name
+        with time_limit(LIMIT):
+            assert run_command(capsys, "plan", "file.yaml")[0] == REFUSED, item.name
 
 
 @pytest.mark.parametrize(
