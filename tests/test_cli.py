@@ -129,6 +129,27 @@ def test_an_interrupted_command_says_how_to_go_on(tmp_path, monkeypatch, capsys)
     assert told.strip() == "calstudy: interrupted; what is in the store is kept, and a run goes on from there"
 
 
+CRASH = """
+import ctypes, os
+from calstudy.cli import main as cli
+
+def crash():
+    # As a run does: standard error goes to a file.
+    os.dup2(os.open("run.log", os.O_WRONLY | os.O_CREAT), 2)
+    ctypes.string_at(0)
+
+cli.app = crash
+cli.main()
+"""
+
+
+def test_a_crash_of_a_library_shows_on_the_terminal_where_it_was(tmp_path):
+    result = subprocess.run([sys.executable, "-c", CRASH], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode < 0
+    assert "Segmentation fault" in result.stderr
+    assert "in crash" in result.stderr
+
+
 def test_a_plan_computes_and_writes_nothing(tmp_path):
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
     result = calstudy("plan", "tiny.yaml", cwd=tmp_path)

@@ -275,7 +275,7 @@ def execute(
             try:
                 product = future.result()
             except KilledWorker as error:
-                # The error may come from a task that only waited for the worker.
+                # All tasks that were assigned to the worker fail, not only the one that it was making.
                 begun = _last_begun(client, error.last_worker.address) or f"{task.stage.name} ({task.label})"
                 raise InputError(
                     f"{begun}: its worker process died repeatedly, for want of memory or by a crash of code that it "

@@ -12,6 +12,7 @@ import pytest
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import UserCodeError
 from calstudy.base.resources import Cost
+from calstudy.run import execution
 from calstudy.run.execution import Lifetimes, Workers, drop, execute, largest_disk, schedule
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Store
@@ -241,6 +242,7 @@ def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, workers):
 DYING = """
 import os, signal, time
 from pathlib import Path
+from calstudy.run import execution
 from calstudy.run.execution import Lifetimes, Workers, drop, execute, schedule
 from calstudy.run.store import Store
 from calstudy.run.task import Stage, Task
@@ -306,11 +308,21 @@ if __name__ == "__main__":
 """
 
 
-def test_the_product_that_kills_its_worker_is_named_and_not_what_the_worker_made_before(tmp_path):
+def test_the_product_that_kills_its_worker_is_named(tmp_path):
     (tmp_path / "program.py").write_text(KILLING)
     command = [sys.executable, "program.py"]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, timeout=120)
     assert result.stdout.startswith("guilty (label): its worker process died repeatedly"), result.stderr
+
+
+def test_what_a_worker_began_last_is_known_by_its_address(store):
+    with execution._local_client(1, store.root / "run.log") as client:
+        for name in ("first", "last"):
+            order = WorkOrder.of(Task(NUMBER, name, {"number": len(name)}), store)
+            client.submit(execution._announce_and_perform, order).result()
+        (address,) = client.scheduler_info()["workers"]
+        assert execution._last_begun(client, address) == "number (last)"
+        assert execution._last_begun(client, "tcp://elsewhere:1") is None
 
 
 @pytest.mark.parametrize("make", ["write_much", "write_hdf5"])
