@@ -203,7 +203,9 @@ def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
         _make_logarithmic(axes, values)
     shown = np.unique(np.linspace(0, antennas.size - 1, min(antennas.size, MAX_NAMES)).astype(int))
     panels[0].set_xticks(shown, found.chi2_antennas[shown], rotation=90, fontsize=style.SMALL_SIZE - 1)
-    panels[2].xaxis.set_major_locator(MaxNLocator(integer=True))
+    # A single integration would have an axis of fractions.
+    panels[2].xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    panels[2].set_xlim(-0.5, len(integrations) - 0.5)
 
 
 def _draw_convergence(axes: Axes, found: Diagnostics) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,3 +56,10 @@ def test_an_axis_of_less_than_two_decades_has_labels_between_powers_of_ten():
     figure.canvas.draw()
     losses = next(axes for axes in figure.axes if axes.get_ylabel() == "loss / first loss")
     assert {"0.2", "0.3", "0.5"} <= {label.get_text() for label in losses.get_yminorticklabels()}
+
+
+def test_integrations_are_counted_in_whole_numbers_even_if_there_is_only_one():
+    one = replace(diagnostics(0.15, 0.5, 20.0), chi2_by_integration=np.array([0.56]))
+    figure = draw_diagnostics(one)
+    axes = next(axes for axes in figure.axes if axes.get_xlabel() == "integration")
+    assert [tick for tick in axes.get_xticks() if axes.get_xlim()[0] <= tick <= axes.get_xlim()[1]] == [0]
