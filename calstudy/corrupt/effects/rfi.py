@@ -9,7 +9,7 @@ from pydantic import Field
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import Cost
-from calstudy.base.units import FluxDensity
+from calstudy.base.units import FluxDensity, Fraction
 from calstudy.corrupt.interface import Effect, Truth
 
 if TYPE_CHECKING:
@@ -25,10 +25,10 @@ class Rfi(Effect):
     part that the flagging misses.
     """
 
-    channels: float = Field(0.03, ge=0, le=1, description="Chance of a channel to be affected.")
-    duty_cycle: float = Field(0.5, ge=0, le=1, description="Part of the integrations in which it then is occupied.")
-    broadband: float = Field(0.0, ge=0, le=1, description="Chance of an integration to be occupied in all channels.")
-    missed: float = Field(0.0, ge=0, le=1, description="Part of the occupied samples that is not flagged.")
+    channels: Fraction = Field(0.03, ge=0, le=1, description="Chance of a channel to be affected.")
+    duty_cycle: Fraction = Field(0.5, ge=0, le=1, description="Part of the integrations in which it then is occupied.")
+    broadband: Fraction = Field(0.0, ge=0, le=1, description="Chance of an integration to be occupied in all channels.")
+    missed: Fraction = Field(0.0, ge=0, le=1, description="Part of the occupied samples that is not flagged.")
     flux: FluxDensity = Field(
         100.0, ge=0, description="Mean of the flux density times the beam, in a visibility, where a sample is occupied."
     )
