@@ -12,7 +12,7 @@ from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.distinct_beams import AssignedBeam, assigned_beams, nominal_beams
 from calstudy.instrument.interface import AntennaBeam, Beam, model_of
-from calstudy.instrument.misaligned import MisalignedBeam
+from calstudy.instrument.misaligned import MisalignedBeam, NominalBeam
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -82,8 +82,9 @@ def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[An
                 tile_beams = model_of(section).make_tiles(settings.channels, np.array(tiles))
             made |= {(model, amplitudes): beam for amplitudes, beam in zip(tiles, tile_beams, strict=True)}
     nominal = Misalignment()
-    found = [(made[beam.model, beam.amplitudes], beam.misalignment) for beam in distinct]
-    return [beam if error == nominal else MisalignedBeam(beam, error) for beam, error in found]
+    shared = {key: NominalBeam(beam) for key, beam in made.items()}
+    found = [((beam.model, beam.amplitudes), beam.misalignment) for beam in distinct]
+    return [made[key] if error == nominal else MisalignedBeam(shared[key], error) for key, error in found]
 
 
 def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source | AntennaBeam, ...], np.ndarray]:

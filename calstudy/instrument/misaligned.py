@@ -21,6 +21,42 @@ from calstudy.instrument.tabulated import tabulate
 MARGIN = 12
 
 
+class NominalBeam:
+    """The nominal beam of antennas that are misaligned, each in its own way (`AntennaBeam`).
+
+    It keeps what the antennas have in common: the splines of the table at the frequencies that were asked for last.
+
+    Parameters
+    ----------
+    beam
+        As designed.
+    """
+
+    def __init__(self, beam: AntennaBeam) -> None:
+        self.name, self.stand_in = beam.name, beam.stand_in
+        self._beam = beam
+        self._kept: tuple[np.ndarray, UVBeam, np.ndarray] | None = None
+
+    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
+        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,))."""
+        return self._beam.at(frequencies)
+
+    def splined(self, frequencies: np.ndarray) -> tuple[UVBeam | AnalyticBeam, np.ndarray]:
+        """Return the efield beam, and of a tabulated one the coefficients of `_spline_table`, otherwise none.
+
+        Raises
+        ------
+        InputError
+            If a table does not go all around.
+        """
+        if self._kept is None or not np.array_equal(self._kept[0], frequencies):
+            beam = self.at(frequencies)
+            if not isinstance(beam, UVBeam):
+                return beam, np.empty(0)
+            self._kept = np.array(frequencies), beam, _splines_of(beam)
+        return self._kept[1:]
+
+
 class MisalignedBeam:
     """The beam of an antenna whose orientation, width or feeds are not as designed (`AntennaBeam`).
 
@@ -30,14 +66,15 @@ class MisalignedBeam:
     Parameters
     ----------
     beam
-        As designed.
+        As designed; a `NominalBeam` where several antennas have it.
     misalignment
         What differs.
     """
 
     def __init__(self, beam: AntennaBeam, misalignment: Misalignment) -> None:
         self.name, self.stand_in = beam.name, beam.stand_in
-        self._beam, self._misalignment = beam, misalignment
+        self._beam = beam if isinstance(beam, NominalBeam) else NominalBeam(beam)
+        self._misalignment = misalignment
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
         """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)).
@@ -47,11 +84,11 @@ class MisalignedBeam:
         InputError
             If feeds are exchanged and there is only one, or a table does not go all around.
         """
-        beam = self._beam.at(frequencies)
+        beam, splines = self._beam.splined(frequencies)
         if self._misalignment.swapped and list(beam.feed_array) != ["x", "y"]:
             raise InputError(f"instrument.as_built.beams.swapped: the beam {self.name} does not have feeds x and y")
         if isinstance(beam, UVBeam):
-            return tabulate(beam, _turned_table(beam, self._misalignment), frequencies)
+            return tabulate(beam, _turned_table(beam, splines, self._misalignment), frequencies)
         # A formula may have settings of its own for its feeds; they are those of what it describes.
         return TurnedBeam(
             nominal=beam, misalignment=self._misalignment, feed_array=beam.feed_array, feed_angle=beam.feed_angle
@@ -128,20 +165,25 @@ def _basis(azimuth: np.ndarray, zenith_angle: np.ndarray) -> tuple[np.ndarray, n
     return along_azimuth, along_zenith_angle
 
 
-def _turned_table(beam: UVBeam, misalignment: Misalignment) -> np.ndarray:
+def _splines_of(beam: UVBeam) -> np.ndarray:
+    """Return the coefficients (`_spline_table`) of the components of a table along two fixed directions."""
+    azimuth, zenith_angle = beam.axis1_array, beam.axis2_array
+    around = np.isclose(len(azimuth) * (azimuth[1] - azimuth[0]), 2 * np.pi) and len(azimuth) % 2 == 0
+    if not around or zenith_angle[0] != 0:
+        raise InputError("instrument.as_built.beams: the table of the beam must go all around, from the zenith")
+    # Components in azimuth and zenith angle jump at the zenith; along two fixed directions they are smooth there.
+    return _spline_table(fixed_components(beam.data_array, azimuth))
+
+
+def _turned_table(beam: UVBeam, splines: np.ndarray, misalignment: Misalignment) -> np.ndarray:
     """Return J of a misaligned antenna on the grid of the nominal one, (2, Nfeeds, Nfreqs, Nza, Naz)."""
     azimuth, zenith_angle = beam.axis1_array, beam.axis2_array
     step = azimuth[1] - azimuth[0]
-    around = np.isclose(len(azimuth) * step, 2 * np.pi) and len(azimuth) % 2 == 0
-    if not around or zenith_angle[0] != 0:
-        raise InputError("instrument.as_built.beams: the table of the beam must go all around, from the zenith")
     frame = AntennaFrame(misalignment, *(axis.ravel() for axis in np.meshgrid(azimuth, zenith_angle)))
-    # Components in azimuth and zenith angle jump at the zenith; along two fixed directions they are smooth there.
-    table = _spline_table(fixed_components(beam.data_array, azimuth))
     rows = cells(frame.nominal_zenith_angle, np.concatenate([-zenith_angle[MARGIN:0:-1], zenith_angle]))
     columns = cells((frame.azimuth - azimuth[0]) % (2 * np.pi), step * np.arange(len(azimuth) + 1))
-    values = np.empty((len(frame.azimuth), table.shape[2]))
-    spline_fields(table, *rows, *columns, values)
+    values = np.empty((len(frame.azimuth), splines.shape[2]))
+    spline_fields(splines, *rows, *columns, values)
     shape = (len(frame.azimuth), *beam.data_array.shape[:3])
     fixed = np.moveaxis(values.view(np.complex128).reshape(shape), 0, -1)
     jones = frame.to_ground(polar_components(fixed, frame.azimuth)).reshape(beam.data_array.shape)

@@ -138,9 +138,10 @@ def _sum_fields(
     sums = np.zeros((len(frequencies), patterns[0].n_feeds, n_ants, n_ants))
     for start in range(0, len(sources.components), size):
         block = slice(start, start + size)
-        fields = [pattern.fields(azimuth[block], zenith_angle[block]) for pattern in patterns]
-        # Shape (Nfreqs, Nfeeds, Nbeams, 4, N): sources of one part of one component lie together.
-        table = np.ascontiguousarray(np.stack(fields).transpose(3, 2, 0, 4, 1))
+        # Sources of one part of one component lie together.
+        table = np.empty((len(frequencies), patterns[0].n_feeds, len(patterns), 4, len(azimuth[block])))
+        for place, pattern in enumerate(patterns):
+            table[:, :, place] = pattern.fields(azimuth[block], zenith_angle[block]).transpose(2, 1, 3, 0)
         fluxes = 0.5 * sources.flux[:, sources.components[block]]
         _add_field_products(delays @ vectors[:, block], (table, index), fluxes, frequencies, sums, dtype)
     return sums
