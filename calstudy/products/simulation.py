@@ -36,6 +36,8 @@ DRAWN_SOURCE = 152
 """Bytes that are kept of every source that was drawn."""
 TABLE_MEMORY = 1.3e6
 """Bytes of the table of a beam for one polarization and frequency."""
+TABLE_SECONDS = 0.03
+"""To make one."""
 DIPOLE_SECONDS, DIPOLE_MEMORY, WORKERS = 20.0, 0.6e9, 4
 """For the fields of the single dipoles of a tile, which each of some workers makes for the first of its chunks."""
 
@@ -197,8 +199,9 @@ def _cost_of_chunk(task: Task) -> Cost:
     memory = engine.memory + kept + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
     seconds = 6 + engine.seconds
     if beams > 1:
-        # Tables of the beams at the nodes: twice, for sources that stay up and for those that rise or set.
-        seconds += beams * (0.3 + 0.1 * channels / pieces)
+        # Tables of the beams at the nodes; where times are interpolated, sources that rise or set have their own.
+        sets = 1 if times == instrument.times.count else 2
+        seconds += sets * beams * TABLE_SECONDS * size.polarizations * channels / pieces
         memory += beams * (TABLE_MEMORY * size.polarizations * channels / pieces + 2e7)
     if instrument.as_built.dipoles.differ:
         seconds += DIPOLE_SECONDS * min(1, WORKERS / pieces)

@@ -162,8 +162,7 @@ def _add_field_products(
     left = np.empty((n_ants, 4 * n_sources), dtype=dtype)
     right = np.empty((n_ants, 4 * n_sources), dtype=dtype)
     for channel, frequency in enumerate(frequencies):
-        for antenna in range(n_ants):
-            _fringes(delays[antenna], frequency, fringes[0, antenna], fringes[1, antenna])
+        _all_fringes(delays, frequency, fringes)
         for feed in range(table.shape[1]):
             _field_factors(fringes, table[channel, feed], index, fluxes[channel], left, right)
             sums[channel, feed] += left @ right.T
@@ -219,6 +218,13 @@ def _fringes(delays: np.ndarray, frequency: float, cosine: np.ndarray, sine: np.
         s = half * _polynomial(SINE, square)
         cosine[source] = 1.0 - 2.0 * s * s
         sine[source] = 2.0 * s * c
+
+
+@numba.njit(cache=True, nogil=True)
+def _all_fringes(delays: np.ndarray, frequency: float, fringes: np.ndarray) -> None:
+    """Fill `fringes` (2, Nants, N) with the cosines and sines of all antennas with delays (Nants, N)."""
+    for antenna in range(len(delays)):
+        _fringes(delays[antenna], frequency, fringes[0, antenna], fringes[1, antenna])
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
