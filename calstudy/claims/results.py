@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from calstudy.calibrate.agreement import Statistic, from_json
+from calstudy.experiment.assumed import assumed_changes
 from calstudy.experiment.model import Experiment
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction
+from calstudy.products import sky_model
 from calstudy.products.agreement import AGREEMENT
 from calstudy.products.files import spectrum_file
 from calstudy.products.signal_loss import TRANSFER
@@ -30,7 +32,8 @@ class RunResults:
     experiment
         What was run.
     folders
-        Where tables are looked for: spectra as ``<variant>.<kind>.h5``, ``transfer.<region>.h5`` and agreement.json.
+        Where tables are looked for: spectra as ``<variant>.<kind>.h5``, ``transfer.<region>.h5``, agreement.json
+        and sky-model.json.
     """
 
     experiment: Experiment
@@ -48,6 +51,17 @@ class RunResults:
             return float(self.agreement["redundant_fraction"])
         except Unevaluated:
             return None
+
+    @property
+    def sky_model_error(self) -> float:
+        """Rms of truth less sky model of the calibrator over that of the foregrounds; zero if it is the truth."""
+        experiment = self.experiment
+        if not assumed_changes(experiment.calibration.assumed) and experiment.instrument.as_built.note is None:
+            return 0.0
+        path = self._find(sky_model.ERROR)
+        if path is None:
+            raise Unevaluated("the run does not say how far its sky model is from the truth")
+        return float(json.loads(path.read_text(encoding="utf-8"))["relative_error"])
 
     def spherical(self, variant: str, modes: str) -> SphericalSpectrum:
         """Return the spherical spectrum of a variant, over "all-modes" or "outside-wedge"."""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, not_as_nominal, other_calibrator, other_sky_model
+from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
-from calstudy.verdicts.statement import Source, Statement
+from calstudy.verdicts.statement import Source, Statement, Unevaluated
 
 if TYPE_CHECKING:
     from calstudy.claims.results import RunResults
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 WINDOW = (0.2, 0.5)
 """h/Mpc, beyond the wedge and its leakage by the taper."""
+REALISTIC = 0.2
+"""Part of the rms of the foregrounds that a catalogue of realistic completeness lacks at most; one of all sources above
+0.1 Jy lacks 0.07."""
 MISSING = Source("Abstract", ("incomplete_sky_model",))
 
 
@@ -31,6 +34,11 @@ MISSING = Source("Abstract", ("incomplete_sky_model",))
     "the EoR cannot be measured below a bias of its own size",
 )
 def incomplete_model_contaminates_window(run: RunResults) -> Finding:
+    if run.sky_model_error > REALISTIC:
+        raise Unevaluated(
+            f"the sky model lacks {100 * run.sky_model_error:.0f} % of the foregrounds, which is no realistic "
+            f"completeness ({100 * REALISTIC:.0f} % at most)"
+        )
     return bias(run, *WINDOW)
 
 
@@ -69,6 +77,6 @@ class Barry2016(Paper):
         """Return what of an experiment is not that of the role, or None."""
         return first_refusal(
             other_calibrator(experiment, ("sky-based", "skycal")),
-            not_as_nominal(experiment),
+            other_faults(experiment),
             other_sky_model(experiment, incomplete=role == "incomplete_sky_model"),
         )

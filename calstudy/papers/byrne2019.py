@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, not_as_nominal, other_calibrator, other_sky_model
+from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
 
@@ -67,8 +67,10 @@ class Byrne2019(Paper):
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return what of an experiment is not that of the role, or None."""
+        steps = getattr(experiment.calibration, "steps", ())
         return first_refusal(
             other_calibrator(experiment, ("redcal",)),
-            not_as_nominal(experiment),
+            None if "omnical" in steps else "calibration.steps has no omnical",
+            other_faults(experiment),
             other_sky_model(experiment, incomplete=role == "redundant_incomplete"),
         )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias, ratio
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, not_as_nominal, other_calibrator, other_sky_model
+from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model, require_same_world
 from calstudy.verdicts.criterion import AtLeast, Finding, Within
 from calstudy.verdicts.statement import Source, Statement, Unevaluated
 
@@ -30,6 +30,7 @@ BOTH = Source("Abstract", ("sky_based", "delay_weighted"))
     "substantially: by half at least",
 )
 def error_of_calibration_is_reduced(sky_based: RunResults, delay_weighted: RunResults) -> Finding:
+    require_same_world(sky_based, delay_weighted)
     first, second = (run.measured("product_over_data") for run in (sky_based, delay_weighted))
     return ratio(Finding(first.value, first.scatter), Finding(second.value, second.scatter))
 
@@ -42,6 +43,7 @@ def error_of_calibration_is_reduced(sky_based: RunResults, delay_weighted: RunRe
     "a hundred, to half an order of magnitude",
 )
 def sensitivity_improves_hundredfold(sky_based: RunResults, delay_weighted: RunResults) -> Finding:
+    require_same_world(sky_based, delay_weighted)
     first, second = (bias(run, *WINDOW) for run in (sky_based, delay_weighted))
     if first.value <= 2 * first.uncertainty:
         raise Unevaluated("the bias of sky-based calibration is not above the noise")
@@ -74,6 +76,6 @@ class Byrne2023(Paper):
         allowed = ("delay-weighted",) if role == "delay_weighted" else ("sky-based", "skycal")
         return first_refusal(
             other_calibrator(experiment, allowed),
-            not_as_nominal(experiment),
+            other_faults(experiment),
             other_sky_model(experiment, incomplete=True),
         )

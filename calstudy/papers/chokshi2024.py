@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, other_calibrator, other_sky_model
+from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
 from calstudy.experiment.assumed import assumed_changes
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 MODES = (0.1, 1.0)
 """h/Mpc."""
-AMPLITUDES = "instrument.as_built.dipoles"
+SCATTER = "dipoles.amplitude_scatter"
+AMPLITUDES = f"instrument.as_built.{SCATTER}"
+LEAST = 0.05
+"""Of the amplitudes: less is not the deformation of tiles in the field."""
 DEFORMED = Source("Abstract", ("one_beam",))
 
 
@@ -67,12 +70,14 @@ class Chokshi2024(Paper):
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return what of an experiment is not that of the role, or None."""
-        found = experiment.instrument.as_built.dipoles
-        equal = None if found.amplitude_scatter > 0 else f"{AMPLITUDES}.amplitude_scatter is 0"
-        refusal = first_refusal(other_calibrator(experiment, ("sky-based", "skycal")), equal)
+        found = experiment.instrument.as_built.dipoles.amplitude_scatter
+        refusal = first_refusal(
+            other_calibrator(experiment, ("sky-based", "skycal")),
+            None if found >= LEAST else f"{AMPLITUDES} is {found:g}, not {LEAST:g} or more",
+            other_faults(experiment, SCATTER),
+        )
         if refusal is not None or role == "one_beam":
             return first_refusal(refusal, other_sky_model(experiment, incomplete=False))
-        changes = assumed_changes(experiment.calibration.assumed)
-        if not changes or any(not path.startswith(AMPLITUDES) for path in changes):
+        if list(assumed_changes(experiment.calibration.assumed)) != [AMPLITUDES]:
             return f"calibration.assumed does not have {AMPLITUDES} alone"
         return None

@@ -13,7 +13,7 @@ import numpy as np
 
 from calstudy.claims.bins import used_bins
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, other_calibrator, other_sky_model
+from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
 from calstudy.verdicts.criterion import AtLeast, Finding, Within
 from calstudy.verdicts.statement import Source, Statement
 
@@ -84,5 +84,8 @@ class Joseph2020(Paper):
             else f"instrument.as_built.dipoles.dead_tiles is {dead:g}, not 0.15 to 0.4"
         )
         return first_refusal(
-            other_calibrator(experiment, ("sky-based", "skycal")), few, other_sky_model(experiment, incomplete=False)
+            other_calibrator(experiment, ("sky-based", "skycal")),
+            few,
+            other_faults(experiment, "dipoles.dead_tiles"),
+            other_sky_model(experiment, incomplete=False),
         )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calstudy.claims.bins import bias
+from calstudy.experiment.files import load
 from calstudy.experiment.model import PAPERS
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.studies.load import load_study
@@ -36,7 +37,7 @@ def spectrum(power, error=0.0):
     return SphericalSpectrum(k, edges, values, modes, modes, modes, modes, errors, np.zeros(k.shape), True)
 
 
-def run(fraction=0.0, error=0.0, product=1e-3, name="run"):
+def run(fraction=0.0, error=0.0, product=1e-3, name="run", experiment=None, sky_model_error=0.1):
     """A run whose residual has a fraction of the EoR's power, with noise that is another fraction."""
     spectra = {
         "eor": spectrum(SIGNAL),
@@ -44,6 +45,8 @@ def run(fraction=0.0, error=0.0, product=1e-3, name="run"):
     }
     return SimpleNamespace(
         name=name,
+        experiment=experiment or load(EXPERIMENTS / "hexagon.yaml"),
+        sky_model_error=sky_model_error,
         spherical=lambda variant, modes: spectra[variant],
         transfer=lambda region: SimpleNamespace(flux_scale=SCALE),
         measured=lambda quantity: SimpleNamespace(value=product, scatter=0.1 * product),
@@ -91,6 +94,60 @@ def test_every_statement_has_the_runs_that_it_needs(members):
 )
 def test_another_run_is_refused(members, name, role, member, reason):
     assert reason in paper(name).refusal(role, members[member])
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "member", "fault", "reason"),
+    [
+        ("barry2016", "complete_sky_model", "sky-based", "corruption.effects=[{kind: mutual-coupling}]", "coupling"),
+        (
+            "byrne2019",
+            "redundant_complete",
+            "redcal",
+            "instrument.as_built.positions.scatter=2 cm",
+            "positions.scatter",
+        ),
+        ("byrne2023", "sky_based", "sky-based-incomplete", "instrument.as_built.dipoles.dead_tiles=0.3", "dead_tiles"),
+        (
+            "joseph2020",
+            "dead_dipoles",
+            "dead-dipoles",
+            "instrument.as_built.positions.scatter=2 cm",
+            "positions.scatter",
+        ),
+        ("chokshi2024", "one_beam", "deformed-beams", "instrument.as_built.dipoles.dead_tiles=0.3", "dead_tiles"),
+        ("chokshi2024", "one_beam", "deformed-beams", "instrument.as_built.dipoles.amplitude_scatter=1 %", "0.01, not"),
+        ("chokshi2024", "all_beams", "deformed-beams-known", "corruption.effects=[{kind: rfi}]", "rfi"),
+    ],
+)
+def test_a_run_with_another_fault_is_refused(members, name, role, member, fault, reason):
+    thing = paper(name)
+    assert thing.refusal(role, members[member]) is None
+    worse = load_study(EXPERIMENTS / "sky-errors.yaml", overrides=[fault]).members[member]
+    assert reason in thing.refusal(role, worse)
+
+
+def test_redundant_calibration_without_omnical_is_refused():
+    calibration = "calibration={calibrator: redcal, steps: [firstcal, logcal, abscal]}"
+    biased = load(EXPERIMENTS / "hexagon.yaml", overrides=[calibration])
+    assert "no omnical" in paper("byrne2019").refusal("redundant_complete", biased)
+
+
+def test_gains_of_any_kind_are_no_other_fault(members):
+    changed = load_study(EXPERIMENTS / "sky-errors.yaml", overrides=["corruption.effects=[{kind: bandpass}]"]).members
+    assert paper("barry2016").refusal("complete_sky_model", changed["sky-based"]) is None
+
+
+def test_an_unrealistic_catalogue_decides_nothing():
+    poor = run(50, sky_model_error=0.39)
+    assert verdicts("barry2016", incomplete_sky_model=poor, complete_sky_model=run(0.01)) == ["not evaluated", "PASS"]
+
+
+def test_delay_weighting_is_compared_with_the_same_sky_model(members):
+    first, second = members["sky-based-incomplete"], members["delay-weighted-incomplete"]
+    runs = {"sky_based": run(90, product=1e-3, experiment=first), "delay_weighted": run(1, 0.1, 1e-4)}
+    assert verdicts("byrne2023", **runs | {"delay_weighted": run(1, product=1e-4, experiment=second)})[0] == "PASS"
+    assert verdicts("byrne2023", **runs) == ["not evaluated", "not evaluated"]
 
 
 def test_verdicts_follow_the_numbers():
