@@ -219,6 +219,17 @@ class Experiment(Section):
                 raise fault(f"variants.{name}", "is not a usable name: use letters, digits, '_', '-'; not 'transfer'")
         return self
 
+    @model_validator(mode="after")
+    def _antennas_and_effects_are_independent(self) -> Experiment:
+        # Both are drawn by NumPy's default generator from the seed alone: equal seeds draw the same numbers.
+        effects = enumerate(self.corruption.effects)
+        seeds = {f"corruption.effects.{place}.seed": getattr(effect, "seed", None) for place, effect in effects}
+        for name, seed in self.instrument.as_built.drawn_seeds.items():
+            for path, other in seeds.items():
+                if seed == other:
+                    raise fault(path, f"is {other}, as that of instrument.as_built.{name}: give one of them another")
+        return self
+
     @property
     def measures_signal_loss(self) -> bool:
         """Whether data are calibrated with the EoR and without, all else equal, so that its loss can be measured."""

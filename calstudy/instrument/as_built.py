@@ -106,6 +106,16 @@ class AsBuilt(Section):
     beams: BeamErrors = BeamErrors()
 
     @property
+    def drawn_seeds(self) -> dict[str, int]:
+        """The seeds from which numbers are drawn, by block; dipoles have generators that are spawned, independent."""
+        beams = self.beams
+        drawn = {
+            "positions": self.positions.scatter > 0,
+            "beams": max(beams.pointing_scatter, beams.rotation_scatter, beams.width_scatter) > 0,
+        }
+        return {name: getattr(self, name).seed for name, is_drawn in drawn.items() if is_drawn}
+
+    @property
     def note(self) -> str | None:
         """What differs from the nominal instrument, in words, or None."""
         dipoles, beams = self.dipoles, self.beams

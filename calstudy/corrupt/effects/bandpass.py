@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -62,9 +62,11 @@ Shape = Annotated[Polynomial | Delays, Field(discriminator="kind"), choice("kind
 class Bandpass(GainEffect):
     """g = 1 + sigma (x + i y), with x and y smooth in frequency, of unit variance, independent for every antenna."""
 
+    version: ClassVar[int] = 2
+
     sigma: float = Field(0.1, ge=0, le=1, description="rms over the band of x and of y alike.")
     shape: Shape = Polynomial(kind="polynomial")
-    seed: int = Field(7, ge=0)
+    seed: int = Field(11, ge=0)
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1, Npols), with an independent draw for every polarization."""
