@@ -122,8 +122,9 @@ class ComparisonFigure(StudyFigure):
     Attributes
     ----------
     titles
-        The roles that are compared, from left to right, and how each is headed. Its `draw` finds the product ``name``
-        of a member's `inputs` under ``name:role`` in ``job.inputs``, and its layout in ``job.settings["layouts"]``.
+        The roles that are compared, from left to right, and how each is headed; empty: all members, by their names in
+        place of roles. Its `draw` finds the product ``name`` of a member's `inputs` under ``name:role`` in
+        ``job.inputs``, and its layout in ``job.settings["layouts"]``.
     """
 
     titles: ClassVar[Mapping[str, str]] = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
@@ -254,19 +255,19 @@ def comparison_task(graphs: Mapping[str, Graph], figure: ComparisonFigure, stand
     Parameters
     ----------
     graphs
-        Of the members, by the role that they play.
+        Of the members, by the role that they play; by name, for a figure of all members.
     figure
         Which.
     stand_ins
         To be printed on it, if it shows the sky.
     """
-    settings: dict[str, Any] = {"layouts": {role: graphs[role].experiment.instrument.layout for role in figure.titles}}
+    settings: dict[str, Any] = {"layouts": {role: graph.experiment.instrument.layout for role, graph in graphs.items()}}
     with guarded(figure):
-        members = {role: figure.member_settings(graphs[role]) for role in figure.titles}
+        members = {role: figure.member_settings(graph) for role, graph in graphs.items()}
         if any(members.values()):
             settings["members"] = members
         inputs = {
-            f"{name}:{role}": task for role in figure.titles for name, task in figure.inputs(graphs[role]).items()
+            f"{name}:{role}": task for role, graph in graphs.items() for name, task in figure.inputs(graph).items()
         }
     return _task(figure, stand_ins, settings, inputs)
 

@@ -124,7 +124,7 @@ class Collection(Study):
         return [self._figure(figure) for figure in _comparisons(self.file)]
 
     def _figure(self, figure: ComparisonFigure) -> Task:
-        compared = {role: self.parts[self.roles[role]] for role in figure.titles}
+        compared = {role: self.parts[self.roles[role]] for role in figure.titles} or dict(self.parts)
         notes = unique_notes(note for part in compared.values() for note in part.stand_ins)
         return comparison_task({role: part.graph for role, part in compared.items()}, figure, notes)
 

@@ -1,0 +1,38 @@
+"""The bias of the members of a collection: what is drawn as measured, and what as an upper limit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calstudy.figures.member_bias import MemberBias, draw_member_bias
+from calstudy.figures.signal_loss import SIGMAS_95
+from calstudy.studies.load import load_study
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+
+
+def test_what_is_not_above_the_noise_is_an_open_upper_limit():
+    member = MemberBias(np.array([0.1, 0.2, 0.3]), np.array([50.0, 0.5, -3.0]), np.array([1.0, 1.0, 0.1]))
+    [axes] = draw_member_bias({"one": member}).axes
+    open_points = [line for line in axes.lines if line.get_markerfacecolor() == "white"]
+    assert [line.get_ydata().tolist() for line in open_points] == [[pytest.approx(0.5 + SIGMAS_95)]]
+    [measured] = axes.containers
+    # A negative bias is as large as a positive one: both come from errors of the gains.
+    assert measured.lines[0].get_ydata().tolist() == [50.0, 3.0]
+
+
+def test_members_with_the_same_values_do_not_hide_each_other():
+    member = MemberBias(np.array([0.1, 0.2]), np.array([5.0, 5.0]), np.array([1.0, 1.0]))
+    [axes] = draw_member_bias({"one": member, "two": member}).axes
+    first, second = (container.lines[0].get_xdata() for container in axes.containers)
+    assert np.all(np.abs(first - second) > 0.01)
+    assert np.all(np.abs(first - member.k) < 0.05)
+
+
+def test_a_figure_without_roles_has_all_members():
+    study = load_study(EXPERIMENTS / "sky-errors.yaml")
+    [figure] = study.figures
+    assert {name.split(":")[1] for name in figure.inputs} == set(study.members)
