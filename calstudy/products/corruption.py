@@ -7,9 +7,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.corrupt.interface import GainEffect
+from calstudy.corrupt.interface import Effect, GainEffect
 from calstudy.corrupt.settings import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Variant
+from calstudy.instrument.as_built import AsBuilt
+from calstudy.instrument.settings import InstrumentSettings
 from calstudy.products import simulation
 from calstudy.products.files import (
     DATA,
@@ -40,10 +42,17 @@ def truths(graph: Graph) -> list[Task]:
 
 @once
 def _truth(graph: Graph, place: int) -> Task:
-    experiment = graph.experiment
-    effect = experiment.corruption.effects[place]
-    settings = {"instrument": experiment.instrument.without_beams(), "effect": effect}
-    return Task(DRAW_EFFECT, effect.label, settings)
+    effect = graph.experiment.corruption.effects[place]
+    return Task(DRAW_EFFECT, effect.label, {"instrument": _antennas(graph, [effect]), "effect": effect})
+
+
+def _antennas(graph: Graph, effects: Sequence[Effect]) -> InstrumentSettings:
+    """Return the instrument that effects happen in: without beams, but with the true positions, which gains ignore."""
+    instrument = graph.experiment.instrument
+    nominal = instrument.without_beams()
+    if all(isinstance(effect, GainEffect) for effect in effects):
+        return nominal
+    return nominal.model_copy(update={"as_built": AsBuilt(positions=instrument.as_built.positions)})
 
 
 @once
@@ -88,10 +97,8 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         "even" or "odd".
     """
     experiment = graph.experiment
-    settings: dict[str, Any] = {
-        "components": sorted(variant.components),
-        "instrument": experiment.instrument.without_beams(),
-    }
+    effects = experiment.corruption.effects if variant.effects else ()
+    settings: dict[str, Any] = {"components": sorted(variant.components), "instrument": _antennas(graph, effects)}
     inputs = {"levels": levels(graph)}
     label = "+".join(variant.components)
     if "noise" in variant.components:
@@ -104,8 +111,8 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         inputs["foregrounds"] = foregrounds
     if "eor" in variant.components:
         inputs["eor"] = simulation.eor(graph)
-    if variant.effects and experiment.corruption.effects:
-        settings["effects"] = list(experiment.corruption.effects)
+    if effects:
+        settings["effects"] = list(effects)
         inputs |= _numbered(truths(graph))
         label = f"effects on ({label})"
     elif flagging := [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]:
@@ -123,7 +130,7 @@ def draw_effect(job: Job) -> Mapping[str, Any]:
     from calstudy.corrupt.interface import draw_flags, draw_truth
     from calstudy.instrument.telescope import make_template
 
-    effect, observation = job.settings["effect"], Observation(make_template(job.settings["instrument"]))
+    effect, observation = job.settings["effect"], Observation(make_template(job.settings["instrument"], as_built=True))
     truth = draw_truth(effect, observation)
     with h5py.File(job.output / TRUTH, "w") as file:
         for name, array in truth.items():
@@ -223,7 +230,7 @@ def corrupt(job: Job) -> Mapping[str, Any]:
             cube += factor * to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))
     if "noise" in components:
         cube += thermal_noise(cube.shape, found.noise, job.settings["noise_seed"])
-    observation = Observation(template)
+    observation = Observation(make_template(job.settings["instrument"], as_built=True))
     flags = np.zeros(cube.shape, dtype=bool)
     for place, effect in enumerate(job.settings.get("effects", job.settings.get("flagged_by", ()))):
         truth = read_truth(job.inputs[f"truth{place:03d}"])

@@ -20,6 +20,9 @@ from calstudy.products.graph import Graph
 from calstudy.sky.counts import expected_sources
 from calstudy.sky.settings import Foregrounds, SyntheticSources
 
+LONG_AVERAGE = 15.0
+"""Minutes; the sky moves by a sixth of the beam of an MWA tile."""
+
 
 def require_possible(experiment: Experiment) -> None:
     """Raise InputError if a beam cannot be made, or the calibrator refuses antennas, baselines and channels."""
@@ -36,16 +39,31 @@ def require_beams(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, and hardly meant."""
+    return tuple(note for note in (_needless_limit(experiment), _long_average(experiment)) if note)
+
+
+def _needless_limit(experiment: Experiment) -> str:
     assumed = assumed_changes(experiment.calibration.assumed)
     limit = "sky.foregrounds.flux_limit"
     if limit not in assumed:
-        return ()
+        return ""
     kept = [_catalogue_depth(sky.foregrounds) for sky in (experiment.sky, assumed_world(experiment).sky)]
     if None in kept or kept[0] != kept[1]:
-        return ()
+        return ""
     return (
         f"{FIELD}.{limit} = {str(assumed[limit])!r}: the same {kept[0]} brightest sources are kept as with the true "
-        "limit, for sky.foregrounds.count is reached before either; the sky model misses none of them",
+        "limit, for sky.foregrounds.count is reached before either; the sky model misses none of them"
+    )
+
+
+def _long_average(experiment: Experiment) -> str:
+    times = experiment.instrument.times
+    minutes = times.count * times.integration / 60
+    if experiment.power.coherent_time is not None or minutes <= LONG_AVERAGE:
+        return ""
+    return (
+        f"power.coherent_time = null: all {minutes:.0f} min are averaged coherently. A sky that drifts through the "
+        "beam loses power in it, the EoR as well; such as '10 min' averages the powers of blocks"
     )
 
 

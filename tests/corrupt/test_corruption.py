@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from observations import small_instrument
 from pydantic import ValidationError
 from pyuvdata.utils import uvcalibrate
+from tiny import tiny
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.gains import gains_for, make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices, from_cube, to_cube
@@ -20,8 +21,10 @@ from calstudy.corrupt.effects.reflection_gains import ReflectionGains, reflectio
 from calstudy.corrupt.interface import GainEffect, apply_effect, draw_truth
 from calstudy.corrupt.levels import rms, set_levels
 from calstudy.corrupt.noise import thermal_noise
-from calstudy.corrupt.settings import CorruptionSettings
+from calstudy.corrupt.settings import EFFECTS, CorruptionSettings
+from calstudy.experiment.files import validate
 from calstudy.experiment.model import Variant
+from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
 
@@ -212,6 +215,23 @@ def test_gains_that_are_none_are_refused(template, gains, told):
     shape = (template.Nants_telescope, template.Nfreqs, 1, template.Npols)
     with pytest.raises(InputError, match=told):
         draw_truth(Given(np.full(shape, gains, complex) if np.isscalar(gains) else gains), Observation(template))
+
+
+def test_positions_and_effects_with_one_seed_are_refused(tmp_path):
+    data = tiny(tmp_path)
+    data["instrument"] = {**data["instrument"], "as_built": {"positions": {"scatter": "1 cm", "seed": 5}}}
+    with pytest.raises(ExperimentError, match="is 5, as that of instrument"):
+        validate(data, tmp_path)
+    # Nothing is drawn from it.
+    data["instrument"]["as_built"]["positions"]["scatter"] = "0 cm"
+    assert validate(data, tmp_path).instrument.as_built.drawn_seeds == {}
+
+
+def test_default_seeds_are_all_different():
+    names = [name for name in EFFECTS.built_in() if "seed" in EFFECTS.find(name).model_fields]
+    seeds = [EFFECTS.find(name).model_fields["seed"].default for name in names if name != "reflection-gains"]
+    seeds += [AsBuilt().positions.seed, AsBuilt().beams.seed]
+    assert len(set(seeds)) == len(seeds)
 
 
 def test_two_effects_with_one_seed_are_refused():

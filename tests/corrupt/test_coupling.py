@@ -6,13 +6,20 @@ import numpy as np
 import pytest
 from observations import small_instrument
 from scipy.constants import Boltzmann, speed_of_light
+from tiny import tiny
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.corrupt.effects.crosstalk import Crosstalk
 from calstudy.corrupt.effects.mutual_coupling import MutualCoupling
 from calstudy.corrupt.interface import apply_effect, draw_truth
+from calstudy.experiment.files import validate
+from calstudy.instrument.as_built import position_offsets
+from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.telescope import make_template
+from calstudy.products.corruption import draw_effect, read_truth, truths
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +129,19 @@ def test_crosstalk_is_constant_in_time_with_its_delay_and_its_size():
     assert delays.mean() == pytest.approx(700e-9, abs=4e-9)
     assert delays.std() == pytest.approx(20e-9, rel=0.12)
     assert abs(np.mean(added[0, :, 0, 0])) < 4 * 0.2 / np.sqrt(len(size))
+
+
+def test_antennas_couple_over_their_true_distances(tmp_path):
+    """The delay of a coefficient is that of the array as built, while the data say the nominal positions."""
+    data = tiny(tmp_path)
+    data["instrument"] = {**data["instrument"], "as_built": {"positions": {"scatter": "50 cm"}}}
+    data["corruption"] = {"effects": ["mutual-coupling"]}
+    experiment = validate(data, tmp_path)
+    [drawn] = truths(Graph(experiment))
+    draw_effect(Job(settings=drawn.settings, inputs={}, output=tmp_path))
+    enu = make_layout(experiment.instrument.layout).enu
+    true = enu + position_offsets(experiment.instrument.as_built.positions, len(enu))
+    distances, nominal = (np.linalg.norm(places[:, None] - places, axis=-1) for places in (true, enu))
+    assert np.abs(distances - nominal).max() > 0.3
+    # Telescope positions are stored geocentric: some nanometres are lost.
+    np.testing.assert_allclose(read_truth(tmp_path)["delay"] * speed_of_light, distances, atol=1e-6)

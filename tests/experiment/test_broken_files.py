@@ -195,3 +195,14 @@ def test_a_catalogue_that_is_assumed_and_misses_nothing_is_noted_in_a_plan(limit
     data = {**tiny(tmp_path), "calibration": {"assumed": {"sky.foregrounds.flux_limit": limit}}}
     Path("file.yaml").write_text(yaml.safe_dump(data))
     assert ("the sky model misses none of them" in " ".join(planned(capsys).split())) is noted
+
+
+@pytest.mark.parametrize(
+    ("integration", "more", "noted"),
+    [("10 s", [], False), ("10 min", [], True), ("10 min", ["--set", "power.coherent_time=10 min"], False)],
+)
+def test_a_long_coherent_average_is_noted_in_a_plan(integration, more, noted, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    options = ["--set", f"instrument.times.integration={integration}", *more]
+    assert ("are averaged coherently" in " ".join(planned(capsys, *options).split())) is noted

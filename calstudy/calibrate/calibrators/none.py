@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from calstudy.base.observation import Frame, Observation
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Outcome, Progress
+from calstudy.instrument.size import Size
 
 
 class NoCalibration(Calibrator):
@@ -16,6 +18,10 @@ class NoCalibration(Calibrator):
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return that there is no sky model to subtract, if there is none."""
         return None if has_sky_model else "needs a sky model, and there is none"
+
+    def cost(self, size: Size) -> Cost:
+        """Return the cost of the subtraction."""
+        return Cost(1 + 1e-7 * size.samples, LIBRARIES_MEMORY + 6 * COMPLEX128 * size.samples)
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Return gains of one."""
