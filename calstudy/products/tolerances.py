@@ -1,7 +1,8 @@
 """Up to which severity of a fault a calibrator can be trusted, from worlds that differ in the severity alone.
 
 Worlds with labels such as ``positions: 2 cm`` and ``positions: 5 cm`` are severities of one fault: the text before the
-colon names it, the number after it is the severity. A world without a colon belongs to all faults, as severity zero.
+colon names it, the number after it is the severity. A world without a colon belongs to all faults, as severity zero, but
+to those that have a world of severity zero themselves.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ def faults(worlds: Sequence[str]) -> list[Fault]:
             found.setdefault(name.strip(), []).append(entry)
     result = []
     for name, entries in found.items():
-        ordered = sorted([*without, *entries])
+        own_zero = any(severity == 0 for severity, *_ in entries)
+        ordered = sorted(entries if own_zero else [*without, *entries])
         severities, labels, _ = zip(*ordered, strict=True)
         result.append(Fault(name, entries[0][2], labels, severities))
     return result

@@ -15,6 +15,11 @@ def test_worlds_are_grouped_by_fault_and_ordered_by_severity():
     assert found[0].severities == (0.0, 0.5, 2.0)
 
 
+def test_a_severity_of_zero_of_its_own_takes_the_place_of_the_ideal_world():
+    [found] = faults(["ideal", "drift: 0 %", "drift: 1 %"])
+    assert (found.worlds, found.severities) == (("drift: 0 %", "drift: 1 %"), (0.0, 1.0))
+
+
 @pytest.mark.parametrize("power", [1, 2, 4])
 def test_of_a_bias_that_is_a_power_of_the_severity_the_crossing_is_exact(power):
     wanted = 0.37
