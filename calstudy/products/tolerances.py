@@ -1,8 +1,8 @@
 """Up to which severity of a fault a calibrator can be trusted, from worlds that differ in the severity alone.
 
 Worlds with labels such as ``positions: 2 cm`` and ``positions: 5 cm`` are severities of one fault: the text before the
-colon names it, the number after it is the severity. A world without a colon belongs to all faults, as severity zero, but
-to those that have a world of severity zero themselves.
+colon names it, the number after it is the severity. A world without a colon is severity zero of all faults that have no
+world of severity zero themselves.
 """
 
 from __future__ import annotations
