@@ -34,6 +34,22 @@ class Rfi(Effect):
     )
     seed: int = Field(10, ge=0)
 
+    def refusal(self, size: Size) -> str | None:
+        """Refuse to flag all samples for certain."""
+        del size
+        if self.missed > 0:
+            return None
+        if self.broadband == 1:
+            return (
+                "broadband: 100 % with missed 0 % would flag all samples; it must be below 100 %, or missed above 0 %"
+            )
+        if self.channels == 1 and self.duty_cycle == 1:
+            return (
+                "channels: 100 % with duty_cycle 100 % and missed 0 % would flag all samples; channels or duty_cycle "
+                "must be below 100 %, or missed above 0 %"
+            )
+        return None
+
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return flux densities (Jy) and directions (azimuth, east through north, rad), and flags, (Ntimes, Nfreqs)."""
         shape = observation.n_times, observation.n_channels
