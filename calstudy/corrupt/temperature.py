@@ -42,7 +42,12 @@ class SystemTemperature(Section):
 class Autocorrelations(SystemTemperature):
     """Autocorrelations of all antennas: k_B (receiver + sky (nu / sky_frequency)^sky_index) / effective_area."""
 
-    effective_area: Area = Field(21.5, gt=0, description="Of an antenna (Tingay et al. 2013, of a tile of the MWA).")
+    effective_area: Area = Field(
+        21.5,
+        gt=0,
+        description="Of an antenna (Tingay et al. 2013, of a tile of the MWA); required where `instrument.beam` is none of "
+        "mwa-*.",
+    )
 
     def jansky(self, frequencies: np.ndarray) -> np.ndarray:
         """Return the autocorrelations, Jy, (Nfreqs,), at channel centres in Hz."""
