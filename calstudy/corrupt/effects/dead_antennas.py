@@ -25,7 +25,7 @@ class DeadAntennas(Effect):
         (), description="Counted from 0 in the order of the layout; empty: `count` at random."
     )
     count: int = Field(1, ge=1, description="How many are drawn, where none are named.")
-    seed: int = Field(9, ge=0)
+    seed: int = Field(9, ge=0, description="Seed of the choice of `count` antennas.")
 
     def refusal(self, size: Size) -> str | None:
         """Refuse antennas that are not there, and to leave fewer than three."""
