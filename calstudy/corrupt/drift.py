@@ -24,9 +24,14 @@ class _Drift(Section, ABC):
     """What all drifts have: two independent processes, of amplitude and phase, for every antenna and polarization."""
 
     amplitude: float = Field(
-        0.01, ge=0, description="Of the relative change of the amplitude of the gains, see the kind."
+        0.01,
+        ge=0,
+        description="Of the relative change of the amplitude of the gains, see the kind; the default is a "
+        "choice of this project.",
     )
-    phase: Phase = Field(0.01, ge=0, description="Of the change of their phase, see the kind.")
+    phase: Phase = Field(
+        0.01, ge=0, description="Of the change of their phase, see the kind; the default is a choice of this project."
+    )
     channels: Literal["common", "independent"] = Field(
         "common", description="Whether all channels of an antenna change alike, or each by itself."
     )
@@ -69,7 +74,12 @@ class RandomWalk(_Drift):
     """A random walk from the drawn gains: normal steps, variances grow linearly in time."""
 
     kind: Literal["random-walk"]
-    time: Time = Field(100.0, gt=0, description="Time after which the rms change is `amplitude` and `phase`.")
+    time: Time = Field(
+        100.0,
+        gt=0,
+        description="Time after which the rms change is `amplitude` and `phase`; the default is a choice of "
+        "this project.",
+    )
 
     def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return walks that start at zero, of variance t / time."""
@@ -81,7 +91,9 @@ class Sinusoid(_Drift):
     """A sinusoid about the drawn gains, of amplitude `amplitude` and `phase`, with a random start for every antenna."""
 
     kind: Literal["sinusoid"]
-    period: Time = Field(100.0, gt=0)
+    period: Time = Field(
+        100.0, gt=0, description="Duration of one oscillation; the default is a choice of this project."
+    )
 
     def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return sinusoids of unit amplitude."""
@@ -93,7 +105,12 @@ class Jumps(_Drift):
     """Jumps between integrations at random times, each normal with an rms of `amplitude` and `phase`; they add up."""
 
     kind: Literal["jumps"]
-    interval: Time = Field(100.0, gt=0, description="Mean time between jumps of an antenna (a Poisson process).")
+    interval: Time = Field(
+        100.0,
+        gt=0,
+        description="Mean time between jumps of an antenna (a Poisson process); the default is a choice of "
+        "this project.",
+    )
 
     def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return sums of the jumps so far: zero up to the first."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -38,6 +38,20 @@ class Effect(Plugin, ABC):
     )
 
     kind: str = Field("", description="Name of an effect, or a file.py.")
+
+    def refusal(self, size: Size) -> str | None:
+        """Return in one sentence why the effect cannot happen to data of this size, or None if it can.
+
+        Asked by plans, before there are data. A sentence about a setting starts with its path and a colon, such as
+        ``count: must be ...``.
+
+        Parameters
+        ----------
+        size
+            Of the data.
+        """
+        del size
+        return None
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return what the effect draws or reads for this observation, as arrays of numbers by name; by default nothing.
@@ -144,6 +158,26 @@ class GainEffect(Effect):
                 products = gains[time, first] * gains[time, second].conj()
             visibilities[time] *= products
         return visibilities
+
+
+def require_usable(effects: Sequence[Effect], size: Size) -> None:
+    """Raise InputError, with the effect's own sentence, if one of `corruption.effects` refuses data of a size.
+
+    Parameters
+    ----------
+    effects
+        All of them, in their order.
+    size
+        Of the data.
+    """
+    for place, effect in enumerate(effects):
+        with guarded(effect):
+            reason = effect.refusal(size)
+        if reason is None:
+            continue
+        field, colon, _ = reason.partition(":")
+        about_field = colon and field.split(".")[0] in type(effect).model_fields
+        raise InputError(f"corruption.effects.{place}{'.' if about_field else f' = {effect.label!r}: '}{reason}")
 
 
 def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray]:

@@ -19,7 +19,9 @@ class SystemTemperature(Section):
     sky: Temperature = Field(
         180.0, ge=0, description="Of the sky at `sky_frequency` (Furlanetto et al. 2006, away from the Galactic plane)."
     )
-    sky_frequency: Frequency = Field(180e6, gt=0)
+    sky_frequency: Frequency = Field(
+        180e6, gt=0, description="At which the temperature of the sky is `sky` (Furlanetto et al. 2006)."
+    )
     sky_index: float = Field(-2.6, ge=-5, le=1, description="Spectral index of the temperature of the sky.")
 
     def kelvin(self, frequencies: np.ndarray) -> np.ndarray:
@@ -42,7 +44,12 @@ class SystemTemperature(Section):
 class Autocorrelations(SystemTemperature):
     """Autocorrelations of all antennas: k_B (receiver + sky (nu / sky_frequency)^sky_index) / effective_area."""
 
-    effective_area: Area = Field(21.5, gt=0, description="Of an antenna (Tingay et al. 2013, of a tile of the MWA).")
+    effective_area: Area = Field(
+        21.5,
+        gt=0,
+        description="Of an antenna (Tingay et al. 2013, of a tile of the MWA); required with any `instrument.beam` but "
+        "mwa-*.",
+    )
 
     def jansky(self, frequencies: np.ndarray) -> np.ndarray:
         """Return the autocorrelations, Jy, (Nfreqs,), at channel centres in Hz."""

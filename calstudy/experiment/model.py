@@ -15,6 +15,7 @@ from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.calamity import Calamity
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import FirstOrderSettings, GaussNewtonSettings, Solver
+from calstudy.corrupt.effects.mutual_coupling import MutualCoupling
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.settings import PowerSettings
@@ -275,6 +276,22 @@ class Experiment(Section):
                 )
             if self.corruption.noise.kind == "times-foregrounds":
                 raise fault("corruption.noise", "is relative to foregrounds, but sky.foregrounds is 'none'")
+        return self
+
+    @model_validator(mode="after")
+    def _autocorrelations_are_of_the_antennas(self) -> Experiment:
+        beam = self.instrument.beam
+        if beam.is_built_in and beam.label.startswith("mwa-"):
+            return self
+        for place, effect in enumerate(self.corruption.effects):
+            autos = effect.autos if isinstance(effect, MutualCoupling) else None
+            # The value alone does not tell a default from the same number given on purpose.
+            if autos is not None and "effective_area" not in autos.model_fields_set:
+                raise fault(
+                    f"corruption.effects.{place}.autos.effective_area",
+                    f"must be given with the beam {beam.label!r}, such as 100 m2: the default, "
+                    f"{autos.effective_area:g} m2, is that of an MWA tile; or autos: null, for no autocorrelations",
+                )
         return self
 
     @model_validator(mode="after")

@@ -21,7 +21,7 @@ name: {name}
 description: A small array with cable reflections in the gains, calibrated with CALAMITY.
 
 instrument:
-  layout: {{kind: mwa-compact-minredundant, count: 16}}   # or hex, hera-19, hera-37, ..., csv with a path
+  layout: {{kind: mwa-compact-minredundant, count: 16}}   # or hex, hera-19, ..., csv with a path and location
   # location: hera                                        # mwa, hera, paper, ovro-lwa, or latitude and longitude
   beam: mwa-embedded-element                              # airy, gaussian, hera, or beamfits with a path
   channels: {{first: 167.075 MHz, width: 240 kHz, count: 128}}

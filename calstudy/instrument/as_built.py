@@ -27,9 +27,12 @@ class PositionErrors(Section):
     """True less nominal positions of antennas."""
 
     scatter: Length = Field(
-        0.0, ge=0, description="Standard deviation in each of east, north and up, independent for each antenna."
+        0.0,
+        ge=0,
+        description="Standard deviation in each of east, north and up, independent for each antenna; 0, the default, "
+        "is as designed.",
     )
-    seed: int = Field(7, ge=0)
+    seed: int = Field(7, ge=0, description="Seed of the positions.")
 
 
 class DeadDipoles(Section):
@@ -64,7 +67,7 @@ class DipoleErrors(Section):
     dead: dict[str, DeadDipoles] = Field(
         default_factory=dict, description="Tiles whose dead dipoles are given, in sets with any names."
     )
-    seed: int = Field(8, ge=0)
+    seed: int = Field(8, ge=0, description="Seed of dead dipoles and amplitudes.")
 
     @property
     def differ(self) -> bool:
@@ -80,16 +83,28 @@ class BeamErrors(Section):
     """
 
     pointing_scatter: Angle = Field(
-        0.0, ge=0, lt=45, description="Standard deviation of the tilt of an antenna towards east, and towards north."
+        0.0,
+        ge=0,
+        lt=45,
+        description="Standard deviation of the tilt of an antenna towards east, and towards north; 0, the default, "
+        "is as designed.",
     )
     rotation_scatter: Angle = Field(
-        0.0, ge=0, lt=45, description="Standard deviation of the rotation of an antenna about the vertical."
+        0.0,
+        ge=0,
+        lt=45,
+        description="Standard deviation of the rotation of an antenna about the vertical; 0, the default, "
+        "is as designed.",
     )
     width_scatter: Fraction = Field(
-        0.0, ge=0, lt=0.3, description="Standard deviation of the width over the nominal width; such as 2 %."
+        0.0,
+        ge=0,
+        lt=0.3,
+        description="Standard deviation of the width over the nominal width, such as 2 %; 0, the default, "
+        "is as designed.",
     )
     swapped: Antennas = Field((), description="Antennas whose feeds x and y are connected to each other's place.")
-    seed: int = Field(9, ge=0)
+    seed: int = Field(9, ge=0, description="Seed of tilts, rotations and widths.")
 
     @model_validator(mode="after")
     def _antennas_are_unique(self) -> BeamErrors:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import Field, SerializeAsAny, model_validator
 
@@ -18,7 +18,7 @@ LONGEST = 86_400.0
 
 
 class Site(Section):
-    """A known site. By default HERA's own arrays are at its site, and all other layouts at the MWA's."""
+    """A known site. By default HERA's own arrays are at its site, and all other layouts but CSV files at the MWA's."""
 
     kind: Literal["mwa", "hera", "paper", "ovro-lwa"]
 
@@ -152,7 +152,7 @@ class GolombLayout(ArrayLayout):
 class CsvLayout(ArrayLayout):
     """Positions from a CSV file with columns east_m, north_m, up_m and, optionally, name and number.
 
-    Give `instrument.location`: without it the array is at the MWA's site, and `calstudy plan` says so.
+    It needs `instrument.location`: such a table does not say where the array is.
     """
 
     kind: Literal["csv"]
@@ -220,7 +220,7 @@ class InstrumentSettings(Section):
     location: Location | None = Field(
         None,
         description="Where the array is: the name of a site, or coordinates; null: the site of the layout, HERA's for "
-        "its arrays and the MWA's for all others.",
+        "its arrays and the MWA's for all others. Required for positions from a CSV file.",
     )
     beam: Beam = Field(default_factory=lambda: BEAMS.make(DEFAULT_BEAM))
     antenna_beams: dict[str, AntennaBeam] = Field(
@@ -247,6 +247,17 @@ class InstrumentSettings(Section):
     def without_beams(self) -> InstrumentSettings:
         """Return the nominal instrument with the default beam: for what reads antennas, channels and times only."""
         return self.reset("beam", "antenna_beams", "as_built")
+
+    @model_validator(mode="after")
+    def _positions_of_a_file_have_a_place(self) -> InstrumentSettings:
+        if isinstance(self.layout, CsvLayout) and self.location is None:
+            sites = ", ".join(get_args(Site.model_fields["kind"].annotation))
+            raise fault(
+                "location",
+                "is required where instrument.layout is a CSV file: the name of a site "
+                f"({sites}), or coordinates (latitude and longitude)",
+            )
+        return self
 
     @model_validator(mode="after")
     def _polarizations_are_unique(self) -> InstrumentSettings:

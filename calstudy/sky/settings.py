@@ -157,7 +157,11 @@ class DiffuseMap(Section):
     """Fields that all maps of diffuse emission have."""
 
     spectral_index: float = Field(
-        -2.55, ge=-4, le=2, description="Of the brightness temperature, the same everywhere; flux has 2 more."
+        -2.55,
+        ge=-4,
+        le=2,
+        description="Of the brightness temperature, the same everywhere; flux has 2 more; the default is a "
+        "choice of this project.",
     )
     nside: Literal[16, 32, 64, 128, 256] = Field(
         256, description="HEALPix resolution; pixels should be smaller than half a fringe of the longest baseline."
@@ -180,7 +184,7 @@ class SyntheticDiffuse(DiffuseMap):
         40.0, ge=0, description="Of the fluctuations, of all multipoles up to 767 (of fewer, if nside is below 256)."
     )
     angular_index: float = Field(2.5, ge=0, le=4, description="C_l is proportional to l to the minus this.")
-    seed: int = Field(21, ge=0)
+    seed: int = Field(21, ge=0, description="Seed of the fluctuations.")
 
 
 class NoDiffuse(Section):
@@ -202,7 +206,7 @@ class Eor(Section):
     index: float = Field(0.0, ge=-3.5, le=1.0, description="P(k) = amplitude (k / pivot)^index; only for a power law.")
     pivot_k: float = Field(0.1, gt=0, description="Pivot of the power law, in 1/Mpc (no h).")
     nside: Literal[16, 32, 64, 128, 256] = Field(256, description="HEALPix resolution.")
-    seed: int = Field(2, ge=0)
+    seed: int = Field(2, ge=0, description="Seed of the maps.")
 
     @model_validator(mode="after")
     def _index_is_used(self) -> Eor:

@@ -9,12 +9,14 @@ from calstudy.base.observation import Frame
 from calstudy.base.plugins import guarded
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import Calibrator
+from calstudy.corrupt.interface import require_usable
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.distinct_beams import nominal_beams
 from calstudy.instrument.interface import model_of
 from calstudy.instrument.layouts import Layout, make_array, make_layout
 from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.size import Size
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.sky.counts import expected_sources
@@ -25,8 +27,9 @@ LONG_AVERAGE = 15.0
 
 
 def require_possible(experiment: Experiment) -> None:
-    """Raise InputError if a beam cannot be made, or the calibrator refuses antennas, baselines and channels."""
+    """Raise InputError if a beam cannot be made, or an effect or the calibrator refuses the data."""
     require_beams(experiment.instrument)
+    require_usable(experiment.corruption.effects, Size.of(experiment.instrument))
     require_calibration(experiment)
 
 

@@ -130,13 +130,7 @@ def sites(tasks: Sequence[Task]) -> list[str]:
     from calstudy.instrument.sites import describe
 
     instruments = [task.settings["instrument"] for task in tasks if "instrument" in task.settings]
-    assumed = "; assumed, for instrument.layout is a CSV file and there is no instrument.location"
-    return list(
-        dict.fromkeys(
-            describe(found.site) + (assumed if found.layout.kind == "csv" and found.location is None else "")
-            for found in instruments
-        )
-    )
+    return list(dict.fromkeys(describe(found.site) for found in instruments))
 
 
 def _show_total(plan: Mapping[str, Any], console: Console) -> None:

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 from observations import small_instrument
 from scipy.constants import Boltzmann, speed_of_light
 from tiny import tiny
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.identity import identity
 from calstudy.base.observation import Observation
 from calstudy.corrupt.effects.crosstalk import Crosstalk
 from calstudy.corrupt.effects.mutual_coupling import MutualCoupling
 from calstudy.corrupt.interface import apply_effect, draw_truth
-from calstudy.experiment.files import validate
+from calstudy.experiment.files import dump, override, validate
 from calstudy.instrument.as_built import position_offsets
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.telescope import make_template
 from calstudy.products.corruption import draw_effect, read_truth, truths
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job
+from calstudy.studies.load import load_study
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +116,39 @@ def test_coupling_needs_all_baselines(observed):
         corrupted(MutualCoupling(), np.zeros(part.shape, complex), part)
 
 
+def test_the_area_of_an_mwa_tile_is_not_taken_for_that_of_another_antenna(tmp_path):
+    """Autocorrelations go as its inverse: HERA's dish has 4.8 times the area of a tile."""
+
+    def experiment(beam, **coupling):
+        data = override(tiny(tmp_path), "instrument.beam", beam)
+        effects = [{"kind": "per-channel-gains"}, {"kind": "mutual-coupling", "seed": 6, **coupling}]
+        return validate(override(data, "corruption.effects", effects), tmp_path)
+
+    for beam in ("gaussian", {"kind": "airy", "diameter": "14 m"}, "short-dipole"):
+        for coupling in ({}, {"autos": {"receiver": "60 K"}}):
+            with pytest.raises(
+                ExperimentError, match=r"effects\.1\.autos\.effective_area: must be given with the beam"
+            ):
+                experiment(beam, **coupling)
+    given = experiment("gaussian", autos={"effective_area": "21.5 m2"})
+    experiment("gaussian", autos=None)
+    for beam in ("mwa-embedded-element", "mwa-analytic"):
+        coupling = experiment(beam).corruption.effects[1]
+        # Given or not, the same number is the same effect: keys and draws do not change.
+        assert identity(coupling) == identity(given.corruption.effects[1])
+    assert validate(yaml.safe_load(dump(given)), tmp_path) == given
+    swept = override(tiny(tmp_path), "instrument.beam", "mwa-analytic")
+    swept = override(swept, "corruption.effects", [{"kind": "mutual-coupling", "seed": 6}])
+    swept = override(swept, "sweep", {"instrument.beam": ["mwa-analytic", "gaussian"]})
+    with pytest.raises(ExperimentError, match="effective_area: must be given with the beam 'gaussian'"):
+        load_study_of(swept, tmp_path)
+
+
+def load_study_of(data, folder):
+    (folder / "study.yaml").write_text(yaml.safe_dump(data))
+    return load_study(folder / "study.yaml")
+
+
 def test_crosstalk_is_constant_in_time_with_its_delay_and_its_size():
     instrument = small_instrument(layout={"kind": "hex", "side": 4}, channels={"count": 64, "width": "400 kHz"})
     observed = Observation(make_template(instrument))
@@ -135,7 +171,7 @@ def test_antennas_couple_over_their_true_distances(tmp_path):
     """The delay of a coefficient is that of the array as built, while the data say the nominal positions."""
     data = tiny(tmp_path)
     data["instrument"] = {**data["instrument"], "as_built": {"positions": {"scatter": "50 cm"}}}
-    data["corruption"] = {"effects": ["mutual-coupling"]}
+    data["corruption"] = {"effects": [{"kind": "mutual-coupling", "autos": None}]}
     experiment = validate(data, tmp_path)
     [drawn] = truths(Graph(experiment))
     draw_effect(Job(settings=drawn.settings, inputs={}, output=tmp_path))

@@ -23,6 +23,7 @@ from calstudy.products import agreement, calibration, corruption, signal_loss, s
 from calstudy.products.files import read_json, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.products.selection import read_gains
+from calstudy.studies.preflight import require_possible
 
 DEAD, GAPS = 2, [5, 6, 20]
 
@@ -50,10 +51,83 @@ def test_a_dead_antenna_takes_all_of_its_baselines_and_no_other(observed):
 
 
 def test_dead_antennas_that_cannot_be_are_refused(observed):
-    with pytest.raises(InputError, match="dead-antennas: antennas has 7, but there are 7, counted from 0"):
+    with pytest.raises(InputError, match="dead-antennas: antennas: names antenna 7, but there are 7 antennas, counted"):
         draw_truth(DeadAntennas(antennas=(7,)), observed)
-    with pytest.raises(InputError, match="fewer than three antennas would be left"):
+    with pytest.raises(InputError, match="count: 5 of 7 antennas would be dead; at most 4 can be, for 3 must be left"):
         draw_truth(DeadAntennas(count=5), observed)
+
+
+@pytest.mark.parametrize(
+    ("effect", "told"),
+    [
+        (
+            {"kind": "dead-antennas", "antennas": [99, 3]},
+            "antennas: names antenna 99, but there are 7 antennas, counted",
+        ),
+        ({"kind": "dead-antennas", "antennas": [0, 1, 2, 3, 4]}, "antennas: 5 of 7 antennas would be dead; at most 4"),
+        ({"kind": "dead-antennas", "antennas": [0, 1, 2, 3, 3]}, None),
+        (
+            {"kind": "dead-antennas", "count": 5},
+            "count: 5 of 7 antennas would be dead; at most 4 can be, for 3 must be",
+        ),
+        ({"kind": "dead-antennas", "count": 4}, None),
+        # 64 channels of 80 kHz: the middle ones are centred 2.52 MHz from the ends.
+        ({"kind": "channel-flags", "band_edges": "2.6 MHz"}, "band_edges: 2.6 MHz: all 64 channels would be flagged"),
+        ({"kind": "channel-flags", "band_edges": "2.6 MHz"}, "; 2.52 MHz at most do not cover the band"),
+        ({"kind": "channel-flags", "band_edges": "2.52 MHz", "coarse_width": None}, None),
+        (
+            {"kind": "channel-flags", "coarse_edges": "640 kHz"},
+            " = 'channel-flags': all 64 channels would be flagged by",
+        ),
+        ({"kind": "channel-flags"}, None),
+        ({"kind": "rfi", "channels": "100 %", "duty_cycle": 1}, "channels: 100 % with duty_cycle 100 % and missed 0 %"),
+        ({"kind": "rfi", "broadband": "100 %"}, "broadband: 100 % with missed 0 % would flag all samples"),
+        ({"kind": "rfi", "channels": "100 %", "duty_cycle": 1, "missed": "1 %"}, None),
+        ({"kind": "rfi", "channels": "100 %", "duty_cycle": 0.99}, None),
+    ],
+)
+def test_a_plan_refuses_what_would_fail_or_leave_no_data(effect, told, observed, tmp_path):
+    """What it refuses for its flags flags all samples, and what it does not refuse leaves some."""
+    instrument = {
+        "layout": {"kind": "hex", "side": 2},
+        "beam": "gaussian",
+        "channels": {"count": 64, "width": "80 kHz"},
+        "times": {"count": 50},
+    }
+    data = {"name": "flagged", "instrument": instrument, "variants": {"noise": {"components": ["noise"]}}}
+    settings = {"effects": [{"kind": "per-channel-gains"}, effect]}
+    outputs = {"figures": []}
+    experiment = validate({**data, "corruption": settings, "outputs": outputs}, tmp_path)
+    made = experiment.corruption.effects[1]
+    if told is None:
+        require_possible(experiment)
+        assert not flags_of(made, observed).all()
+        return
+    with pytest.raises(InputError) as caught:
+        require_possible(experiment)
+    message = str(caught.value)
+    assert told in message
+    assert message.startswith(("corruption.effects.1.", "corruption.effects.1 = "))
+    if effect["kind"] != "dead-antennas":
+        assert flags_of(made, observed).all()
+
+
+def test_an_effect_of_ones_own_is_asked_too(tmp_path):
+    code = """
+from calstudy.corrupt.interface import Effect
+
+class Few(Effect):
+    most: int = 5
+
+    def refusal(self, size):
+        if size.antennas > self.most:
+            return f"most: {size.antennas} antennas are too many; at most {self.most}"
+"""
+    (tmp_path / "few.py").write_text(code)
+    data = override(tiny(tmp_path), "corruption.effects", [{"kind": "few.py"}])
+    with pytest.raises(InputError, match=r"^corruption\.effects\.0\.most: 7 antennas are too many; at most 5$"):
+        require_possible(validate(data, tmp_path))
+    require_possible(validate(override(data, "corruption.effects.0.most", 7), tmp_path))
 
 
 def test_the_coarse_channels_of_the_mwa_lose_their_edges_and_centres(observed):

@@ -113,7 +113,7 @@ def unknown_keys(folder: Path) -> Iterator[Broken]:
 
 def missing_files(folder: Path) -> Iterator[Broken]:
     """Yield experiments that name input files which are not there, or are folders."""
-    data = tiny(folder)
+    data = override(tiny(folder), "instrument.location", "mwa")
     for path, block in (
         ("instrument.layout", {"kind": "csv"}),
         ("instrument.beam", {"kind": "beamfits"}),
@@ -160,7 +160,8 @@ def bad_layouts(folder: Path) -> Iterator[Broken]:
     for index, (name, table) in enumerate(LAYOUTS.items()):
         path = folder / f"layout{index}.csv"
         path.write_bytes(table.encode("latin-1"))
-        data = _with(tiny(folder), ("instrument", "layout"), {"kind": "csv", "path": str(path)})
+        data = override(tiny(folder), "instrument.location", "mwa")
+        data = override(data, "instrument.layout", {"kind": "csv", "path": str(path)})
         yield Broken(f"layout: {name}", yaml.safe_dump(data, sort_keys=False).encode(), (path.name, "longest baseline"))
 
 
@@ -213,7 +214,11 @@ IMPLAUSIBLE: list[tuple[str, Any, str]] = [
     ("outputs.store", "/proc/store", "cannot be written (No such file or directory); no folder can be made in /proc"),
     ("outputs.runs", "/proc/runs", "cannot be written (No such file or directory); no folder can be made in /proc"),
     ("outputs.store", "x" * 300, "cannot be written (File name too long)"),
-    ("instrument.layout", {"kind": "csv", "path": "x" * 300}, "cannot be read (File name too long"),
+    (
+        "instrument",
+        {"layout": {"kind": "csv", "path": "x" * 300}, "location": "mwa"},
+        "cannot be read (File name too long",
+    ),
     ("calibration.assumed", {"sky_model": "x" * 300}, "cannot be read (File name too long"),
     ("outputs.store", None, "outputs.store (empty): must be a path"),
     ("outputs.convergence.steps", ["a"], "must be a whole number"),

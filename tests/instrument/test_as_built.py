@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mwa_pb import beam_full_EE, config
 from pydantic import ValidationError
+from pyuvdata import UVBeam
 from pyuvdata.analytic_beam import AiryBeam, ShortDipoleBeam
 from scipy.constants import speed_of_light
 from scipy.stats import binom
@@ -179,6 +180,38 @@ def test_a_turned_dipole_is_a_dipole_along_the_turned_axis():
     cosine = np.cos(zenith_angle)
     along_zenith_angle = np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), -np.sin(zenith_angle)])
     np.testing.assert_allclose(found[:, 0], [axis @ along_azimuth, axis @ along_zenith_angle], atol=1e-12)
+
+
+class DipoleTable:
+    """A short dipole, tabulated every degree."""
+
+    name, stand_in = "dipole", None
+
+    def at(self, frequencies):
+        axes = {"axis1_array": np.radians(np.arange(360.0)), "axis2_array": np.radians(np.arange(91.0))}
+        table = ShortDipoleBeam().to_uvbeam(freq_array=frequencies, **axes)
+        table.peak_normalize()
+        return table
+
+
+@pytest.mark.parametrize(
+    "nominal", [ExactBeam(ShortDipoleBeam(), "dipole", None), DipoleTable()], ids=["exact", "table"]
+)
+def test_a_swapped_antenna_has_the_other_dipole_on_each_feed(nominal):
+    """The far field of a dipole along north on feed x, and of one along east on feed y."""
+    azimuth, zenith_angle = np.radians(np.array([[0, 10], [40, 5], [135, 30], [250, 60], [300, 80]], dtype=float)).T
+    cosine = np.cos(zenith_angle)
+    along_north = np.array([np.cos(azimuth), cosine * np.sin(azimuth)])
+    along_east = np.array([-np.sin(azimuth), cosine * np.cos(azimuth)])
+    for swapped, expected in ((True, [along_north, along_east]), (False, [along_east, along_north])):
+        beam = MisalignedBeam(nominal, Misalignment(swapped=swapped)).at(FREQUENCY)
+        if isinstance(beam, UVBeam):
+            rows, columns = np.rint(np.degrees([zenith_angle, azimuth])).astype(int)
+            found = beam.data_array[:, :, 0, rows, columns]
+        else:
+            found = beam.efield_eval(az_array=azimuth, za_array=zenith_angle, freq_array=FREQUENCY)[:, :, 0]
+        # Directions on the grid of the table, where splines have its values but for rounding.
+        np.testing.assert_allclose(np.moveaxis(found, 1, 0), expected, atol=1e-10)
 
 
 def test_an_unpolarized_beam_is_moved_as_a_whole():

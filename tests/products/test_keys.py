@@ -167,6 +167,7 @@ def layout_file(folder: Path, name: str, text: str = LAYOUT) -> Path:
 
 def simulated(folder: Path, layout: Path) -> str:
     data = override(tiny(folder), "instrument.layout", {"kind": "csv", "path": str(layout)})
+    data = override(data, "instrument.location", "mwa")
     return simulation.eor(Graph(validate(data, folder))).key
 
 

@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from simulation_cases import observe, random_sky, relative_error
+from pyuvdata.analytic_beam import UniformBeam
+from simulation_cases import local_coordinates, observe, point_sky, random_sky, relative_error
 
 from calstudy.base.errors import ExperimentError
-from calstudy.base.visibilities import baseline_vectors, to_cube
+from calstudy.base.visibilities import antenna_indices, baseline_vectors, to_cube
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import dump, validate
 from calstudy.instrument.antenna_beams import AntennaBeams
 from calstudy.instrument.as_built import Misalignment, position_offsets
+from calstudy.instrument.beams import ExactBeam
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.misaligned import MisalignedBeam
 from calstudy.papers.calamity2022 import Calamity2022
@@ -78,14 +80,15 @@ def test_scattered_positions_are_those_of_a_csv_of_the_shifted_ones(tmp_path: Pa
 
 @pytest.fixture(scope="module")
 def misaligned(gaussian_beam, dipole_beam):
-    """Two antennas with one beam, two whose antennas are tilted or swapped, of a polarized and an unpolarized beam."""
+    """An antenna as designed, and others that are tilted, swapped, or tilted with an unpolarized beam."""
     tilted = MisalignedBeam(dipole_beam, Misalignment(east=0.1, north=-0.2, rotation=0.3, width=0.9))
-    swapped = MisalignedBeam(gaussian_beam, Misalignment(north=0.05, swapped=True))
-    return AntennaBeams((dipole_beam, tilted, swapped), np.array([0, 1, 0, 2]))
+    swapped = MisalignedBeam(dipole_beam, Misalignment(north=0.05, swapped=True))
+    unpolarized = MisalignedBeam(gaussian_beam, Misalignment(north=0.05))
+    return AntennaBeams((dipole_beam, tilted, swapped, unpolarized), np.array([0, 1, 0, 2, 3]))
 
 
 def test_engines_agree_on_misaligned_antennas(misaligned):
-    template = observe(count=4, channels=2, times=1)
+    template = observe(count=5, channels=2, times=1)
     sky = random_sky(template, count=40)
     expected = PyuvsimEngine().simulate(sky, misaligned, template)
     for engine in (DenseEngine(), MatvisEngine(), FftvisEngine()):
@@ -93,6 +96,37 @@ def test_engines_agree_on_misaligned_antennas(misaligned):
         assert relative_error(engine.simulate(sky, misaligned, template), expected) < 1e-10
     nominal = PyuvsimEngine().simulate(sky, misaligned.beams[0], template)
     assert relative_error(expected, nominal) > 0.1
+
+
+@pytest.mark.parametrize("engine", [DenseEngine(), PyuvsimEngine()], ids=lambda engine: engine.label)
+def test_a_swapped_dipole_correlates_with_the_other_dipole(engine, dipole_beam):
+    """One source of 1 Jy: without its fringe, xx is half the product of the far fields on the feeds x of two antennas.
+
+    E = (-sin a, cos z cos a) is the field of a dipole along east at the azimuth a and zenith angle z, and (cos a,
+    cos z sin a) of one along north.
+    """
+    swapped = MisalignedBeam(dipole_beam, Misalignment(swapped=True))
+    beams = AntennaBeams((dipole_beam, swapped), np.array([0, 0, 1, 1]))
+    template = observe(count=4, channels=1, times=1)
+    azimuth, zenith_angle = np.radians(65.0), np.radians(40.0)
+    # Of astropy north through east, of beams east through north.
+    sky = point_sky(local_coordinates(template, np.pi / 2 - zenith_angle, np.pi / 2 - azimuth), [1.0])
+    cosine = np.cos(zenith_angle)
+    east = np.array([-np.sin(azimuth), cosine * np.cos(azimuth)])
+    north = np.array([np.cos(azimuth), cosine * np.sin(azimuth)])
+    uniform = ExactBeam(UniformBeam(), "uniform", None)
+    # A uniform beam has half the flux density in every visibility, with the same fringe.
+    fringes = 2 * engine.simulate(sky, uniform, template)
+    found = (engine.simulate(sky, beams, template) / fringes)[0, :, 0]
+    pairs = [tuple(pair) for pair in antenna_indices(template)]
+    for pair, xx, yy in (
+        ((0, 1), east @ east, north @ north),
+        ((0, 2), east @ north, north @ east),
+        ((1, 3), east @ north, north @ east),
+        ((2, 3), north @ north, east @ east),
+    ):
+        # Only rounding: the direction goes through ICRS and back, in double precision.
+        np.testing.assert_allclose(found[pairs.index(pair)], [xx / 2, yy / 2], atol=1e-9)
 
 
 def test_a_misaligned_table_goes_to_all_engines(embedded_beam):

@@ -11,7 +11,7 @@ from simulation_cases import observe, random_sky, relative_error
 
 from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.beam_models.gaussian import GaussianBeam
-from calstudy.instrument.settings import Channels, CsvLayout, InstrumentSettings, Times
+from calstudy.instrument.settings import Channels, CsvLayout, InstrumentSettings, Site, Times
 from calstudy.simulate.chunks import simulate_visibilities
 from calstudy.simulate.component import Component
 from calstudy.simulate.engines.dense import DenseEngine
@@ -64,6 +64,7 @@ def test_a_uniform_sky_gives_its_temperature_over_the_beam(tmp_path):
     uniform = section.SyntheticDiffuse(kind="synthetic", nside=64, mean="200 K", rms="0 K", spectral_index=-2.5)
     instrument = InstrumentSettings(
         layout=CsvLayout(kind="csv", path=tmp_path / "pair.csv"),
+        location=Site(kind="mwa"),
         beam=GaussianBeam(kind="gaussian"),
         channels=Channels(first="170 MHz", width="2 MHz", count=8),
         times=Times(count=1),

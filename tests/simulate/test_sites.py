@@ -115,10 +115,15 @@ def test_plans_name_the_site(tmp_path: Path):
     (tmp_path / "array.csv").write_text("east_m,north_m,up_m\n0,0,0\n14,0,0\n0,14,0\n30,7,0\n")
     layout = {"kind": "csv", "path": "array.csv"}
     for extra, told in (
-        ({"layout": layout}, "mwa, latitude -26.7033 deg.*assumed.*no instrument.location"),
+        ({}, "mwa, latitude -26.7033 deg"),
         ({"layout": layout, "location": "hera"}, "hera, latitude -30.7215 deg"),
         ({"location": KAROO}, "latitude -30.7215 deg, longitude 21.4283 deg, 1052 m"),
     ):
         (line,) = sites([simulation.foregrounds(Graph(experiment(tmp_path, **extra)))])
         assert re.match(told, line)
-    assert "assumed" not in line
+    with pytest.raises(ExperimentError) as caught:
+        experiment(tmp_path, layout=layout)
+    assert str(caught.value).splitlines()[-1].strip(" -") == (
+        "instrument.location: is required where instrument.layout is a CSV file: the name of a site (mwa, hera, paper, "
+        "ovro-lwa), or coordinates (latitude and longitude)"
+    )

@@ -329,7 +329,9 @@ LAYOUTS = {
 def test_assumed_antennas_must_be_those_of_the_data(tmp_path, name):
     table, told = LAYOUTS[name]
     (tmp_path / "layout.csv").write_text(table)
-    data = sky_based(tmp_path, **{"instrument.layout": {"kind": "csv", "path": "layout.csv"}})
+    data = sky_based(
+        tmp_path, **{"instrument.layout": {"kind": "csv", "path": "layout.csv"}, "instrument.location": "mwa"}
+    )
     with pytest.raises(InputError, match=f"calibration.assumed.instrument.layout: {told}"):
         require_calibration(validate(data, tmp_path))
 
@@ -359,6 +361,7 @@ def test_a_file_is_brought_to_the_order_of_the_data(tmp_path):
     """Antenna numbers of a layout may come in any order; pyuvdata sorts baselines by them."""
     (tmp_path / "layout.csv").write_text("east_m,north_m,up_m,number\n0,0,0,3\n14,0,0,1\n0,28,0,7\n40,9,0,2\n")
     data = override(tiny(tmp_path), "instrument.layout", {"kind": "csv", "path": "layout.csv"})
+    data = override(data, "instrument.location", "mwa")
     template = make_template(validate(data, tmp_path).instrument)
     shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
     normal = np.random.default_rng(1).standard_normal((2, *shape))

@@ -159,10 +159,10 @@ def test_faults_name_the_case_and_the_field(tmp_path):
 
 def test_an_array_that_cannot_be_made_is_not_a_refusal_of_calibrators(tmp_path):
     (tmp_path / "positions.csv").write_text("number,east_m,north_m\n1,0,0\n2,14,0\n")
+    layout = {"kind": "csv", "path": "positions.csv"}
+    worlds = {"mine": {"instrument.layout": layout, "instrument.location": "mwa"}}
     with pytest.raises(InputError, match=r"^instrument\.layout\.path: .*missing: up_m$"):
-        load_study(
-            comparison_file(tmp_path, worlds={"mine": {"instrument.layout": {"kind": "csv", "path": "positions.csv"}}})
-        )
+        load_study(comparison_file(tmp_path, worlds=worlds))
 
 
 def test_scales_of_the_file_and_of_its_experiment_go_together(tmp_path):

@@ -129,7 +129,7 @@ def test_a_plan_asks_the_calibrator(tmp_path, calibrator, layout, modelled, sent
     changes = {}
     if layout is not None:
         (tmp_path / layout).write_text(SCATTERED)
-        changes["layout"] = {"kind": "csv", "path": str(tmp_path / layout)}
+        changes = {"layout": {"kind": "csv", "path": str(tmp_path / layout)}, "location": "mwa"}
     data = measurement(**changes)
     data.write_uvh5(tmp_path / "data.uvh5")
     section = {"data": "data.uvh5"}

@@ -64,9 +64,15 @@ class Bandpass(GainEffect):
 
     version: ClassVar[int] = 2
 
-    sigma: float = Field(0.1, ge=0, le=1, description="rms over the band of x and of y alike.")
+    sigma: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="rms over the band of the real and of the imaginary part of g - 1, each; the default is a "
+        "choice of this project.",
+    )
     shape: Shape = Polynomial(kind="polynomial")
-    seed: int = Field(11, ge=0)
+    seed: int = Field(11, ge=0, description="Seed of x and y.")
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1, Npols), with an independent draw for every polarization."""

@@ -12,6 +12,7 @@ from calstudy.corrupt.interface import Effect, Truth
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
+    from calstudy.instrument.size import Size
 
 
 class ChannelFlags(Effect):
@@ -28,10 +29,27 @@ class ChannelFlags(Effect):
     coarse_edges: Frequency = Field(80e3, ge=0, description="Flagged at either edge of a coarse channel.")
     coarse_centres: bool = Field(True, description="Whether the channel at the centre of a coarse channel is flagged.")
 
+    def refusal(self, size: Size) -> str | None:
+        """Refuse to flag all channels."""
+        frequencies = size.channels.first + size.channels.width * np.arange(size.channels.count)
+        if not self._flagged(frequencies).all():
+            return None
+        flagged = f"all {size.channels.count} channels would be flagged"
+        if not self.model_copy(update={"coarse_width": None})._flagged(frequencies).all():
+            return (
+                f"{flagged} by band_edges, coarse_edges and coarse_centres together; one channel at least must be left"
+            )
+        # From an end of the band to the centre of the channel that is farthest from both ends.
+        most = ((size.channels.count + 1) // 2 - 0.5) * size.channels.width
+        return f"band_edges: {self.band_edges / 1e6:g} MHz: {flagged}; {most / 1e6:g} MHz at most do not cover the band"
+
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return which channels are flagged, (Nfreqs,)."""
         del random
-        frequencies = observation.frequencies
+        return {"channels": self._flagged(observation.frequencies)}
+
+    def _flagged(self, frequencies: np.ndarray) -> np.ndarray:
+        """Return which channels are flagged, bool, (Nfreqs,), of centres in Hz."""
         # Half a channel lies between the outermost centres and the ends of the band. Frequencies are good to 1 Hz.
         half = (frequencies[-1] - frequencies[0]) / (len(frequencies) - 1) / 2
         low, high = frequencies[0] - half, frequencies[-1] + half
@@ -42,7 +60,7 @@ class ChannelFlags(Effect):
             if self.coarse_centres:
                 # The upper one of two channels that meet at the centre.
                 flagged |= (offset - half <= 1) & (offset + half > 1)
-        return {"channels": flagged}
+        return flagged
 
     def flags(self, observation: Observation, truth: Truth) -> np.ndarray:
         """Return the flags, (1, 1, Nfreqs, 1)."""

@@ -20,10 +20,18 @@ class Crosstalk(Effect):
     Kern et al. (2019) found such terms in HERA, at delays of cables.
     """
 
-    amplitude: FluxDensity = Field(0.1, ge=0, description="rms of |c| over the baselines.")
-    delay: Delay = Field(900e-9, description="Mean of the normal distribution of the delay.")
-    delay_scatter: Delay = Field(50e-9, ge=0)
-    seed: int = Field(8, ge=0)
+    amplitude: FluxDensity = Field(
+        0.1, ge=0, description="rms of the modulus of c over the baselines; the default is a choice of this project."
+    )
+    delay: Delay = Field(
+        900e-9, description="Mean of the normal distribution of the delay; the default is a choice of this project."
+    )
+    delay_scatter: Delay = Field(
+        50e-9,
+        ge=0,
+        description="Standard deviation of the delay over the baselines; the default is a choice of this project.",
+    )
+    seed: int = Field(8, ge=0, description="Seed of the amplitudes and delays.")
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return amplitudes (Jy, complex) and delays (s) of the cross-correlations, (Nbls, 1, Npols)."""

@@ -12,6 +12,10 @@ from calstudy.corrupt.interface import Effect, Truth
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
+    from calstudy.instrument.size import Size
+
+LEAST = 3
+"""Antennas that must be left: fewer do not tell the gains of each."""
 
 
 class DeadAntennas(Effect):
@@ -23,7 +27,23 @@ class DeadAntennas(Effect):
         (), description="Counted from 0 in the order of the layout; empty: `count` at random."
     )
     count: int = Field(1, ge=1, description="How many are drawn, where none are named.")
-    seed: int = Field(12, ge=0)
+    seed: int = Field(12, ge=0, description="Seed of the choice of `count` antennas.")
+
+    def refusal(self, size: Size) -> str | None:
+        """Refuse antennas that are not there, and to leave fewer than three."""
+        return self._refusal(size.antennas)
+
+    def _refusal(self, count: int) -> str | None:
+        """Return why this cannot happen to so many antennas, or None."""
+        if self.antennas and max(self.antennas) >= count:
+            return f"antennas: names antenna {max(self.antennas)}, but there are {count} antennas, counted from 0"
+        field, dead = ("antennas", len(set(self.antennas))) if self.antennas else ("count", self.count)
+        if count - dead < LEAST:
+            return (
+                f"{field}: {dead} of {count} antennas would be dead; at most {max(count - LEAST, 0)} can be, for "
+                f"{LEAST} must be left"
+            )
+        return None
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return the antenna numbers, ascending.
@@ -31,16 +51,11 @@ class DeadAntennas(Effect):
         Raises
         ------
         InputError
-            If an antenna is not there, or fewer than three would be left.
+            As `refusal`.
         """
         numbers = np.asarray(observation.uvd.telescope.antenna_numbers)
-        if self.antennas and max(self.antennas) >= len(numbers):
-            raise InputError(
-                f"corruption.effects: dead-antennas: antennas has {max(self.antennas)}, but there are {len(numbers)}, "
-                "counted from 0"
-            )
-        if len(numbers) - (len(set(self.antennas)) or self.count) < 3:
-            raise InputError("corruption.effects: dead-antennas: fewer than three antennas would be left")
+        if (reason := self._refusal(len(numbers))) is not None:
+            raise InputError(f"corruption.effects: dead-antennas: {reason}")
         dead = list(self.antennas) or random.choice(len(numbers), self.count, replace=False)
         return {"numbers": np.unique(numbers[dead])}
 

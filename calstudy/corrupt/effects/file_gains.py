@@ -23,7 +23,7 @@ class FileGains(GainEffect):
     The file holds gains for one time, which are constant, or for as many as there are integrations, in their order.
     """
 
-    path: Path = Field(strict=False)
+    path: Path = Field(strict=False, description="CalH5 or calfits file, relative to the experiment file or absolute.")
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols).

@@ -27,14 +27,23 @@ class MutualCoupling(Effect):
     """
 
     amplitude: float = Field(
-        1e-3, ge=0, lt=1, description="Modulus of e for two antennas at `distance`, a ratio of voltages."
+        1e-3,
+        ge=0,
+        lt=1,
+        description="Modulus of e for two antennas at `distance`, a ratio of voltages; the default is a "
+        "choice of this project.",
     )
-    distance: Length = Field(14.0, gt=0)
+    distance: Length = Field(
+        14.0,
+        gt=0,
+        description="Distance of two antennas at which the modulus of e is `amplitude`; the default is a "
+        "choice of this project.",
+    )
     falloff: float = Field(1.0, ge=0, le=4, description="Exponent; 1: a wave that spreads in all directions.")
     autos: Autocorrelations | None = Field(
         Autocorrelations(), description="Autocorrelations of the antennas; null: zero."
     )
-    seed: int = Field(6, ge=0)
+    seed: int = Field(6, ge=0, description="Seed of the phases phi.")
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return moduli, delays (s) and phases (rad) of the coefficients, symmetric, (Nants, Nants), zero for itself.

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
 class PerChannelGains(GainEffect):
     """g = 1 + sigma (n + i n'), independent per antenna and channel (paper §Simulations)."""
 
-    sigma: float = Field(0.1, ge=0, le=10)
-    seed: int = Field(5, ge=0)
+    sigma: float = Field(
+        0.1, ge=0, le=10, description="rms of the real and of the imaginary part of g - 1, each (paper §Simulations)."
+    )
+    seed: int = Field(5, ge=0, description="Seed of n and n'.")
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1, Npols), with an independent draw for every polarization."""

@@ -20,8 +20,8 @@ class ReflectionGains(GainEffect):
 
     amplitude: float = Field(0.01, ge=0, lt=1, description="Mean of the exponential distribution of r.")
     delay: Delay = Field(1200e-9, description="Mean of the normal distribution of the delay.")
-    delay_scatter: Delay = Field(100e-9, ge=0)
-    seed: int = Field(5, ge=0)
+    delay_scatter: Delay = Field(100e-9, ge=0, description="Standard deviation of that distribution.")
+    seed: int = Field(5, ge=0, description="Seed of r, tau and phi.")
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1, Npols), with an independent draw for every polarization.

@@ -25,14 +25,40 @@ class Rfi(Effect):
     part that the flagging misses.
     """
 
-    channels: Fraction = Field(0.03, ge=0, le=1, description="Chance of a channel to be affected.")
-    duty_cycle: Fraction = Field(0.5, ge=0, le=1, description="Part of the integrations in which it then is occupied.")
+    channels: Fraction = Field(
+        0.03, ge=0, le=1, description="Chance of a channel to be affected; the default is a choice of this project."
+    )
+    duty_cycle: Fraction = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="Part of the integrations in which it then is occupied; the default is a choice of this project.",
+    )
     broadband: Fraction = Field(0.0, ge=0, le=1, description="Chance of an integration to be occupied in all channels.")
     missed: Fraction = Field(0.0, ge=0, le=1, description="Part of the occupied samples that is not flagged.")
     flux: FluxDensity = Field(
-        100.0, ge=0, description="Mean of the flux density times the beam, in a visibility, where a sample is occupied."
+        100.0,
+        ge=0,
+        description="Mean of the flux density times the beam, in a visibility, where a sample is occupied; "
+        "the default is a choice of this project.",
     )
-    seed: int = Field(10, ge=0)
+    seed: int = Field(10, ge=0, description="Seed of what is occupied, flux densities, directions and missed samples.")
+
+    def refusal(self, size: Size) -> str | None:
+        """Refuse to flag all samples for certain."""
+        del size
+        if self.missed > 0:
+            return None
+        if self.broadband == 1:
+            return (
+                "broadband: 100 % with missed 0 % would flag all samples; it must be below 100 %, or missed above 0 %"
+            )
+        if self.channels == 1 and self.duty_cycle == 1:
+            return (
+                "channels: 100 % with duty_cycle 100 % and missed 0 % would flag all samples; channels or duty_cycle "
+                "must be below 100 %, or missed above 0 %"
+            )
+        return None
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return flux densities (Jy) and directions (azimuth, east through north, rad), and flags, (Ntimes, Nfreqs)."""
