@@ -1,7 +1,9 @@
 """The notebooks are stored without outputs, and run from top to bottom."""
 
 import ast
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import nbclient
 import nbformat
@@ -82,3 +84,36 @@ def test_a_notebook_runs(path, tmp_path, request):
         # Outputs name folders of the test where a reader's lie beside the notebooks.
         text = nbformat.writes(notebook).replace(str(tmp_path), "..")
         (Path(folder) / path.name).write_text(text, encoding="utf-8")
+
+
+def test_a_calibrator_is_chosen_only_if_its_bias_is_known_to_be_small(tmp_path, capsys):
+    """The cells after the run, on scores that are made up; the limit is 0.1: with an error of 0.04 all is open."""
+
+    def case(transfer, bias, error):
+        bands = [{"transfer": transfer, "transfer_error": 0.01, "bias": bias, "bias_error": error}] * 3
+        return {"bands": bands, "by_status": {"converged": 4}, "sky_model_error": 0.25}
+
+    good = {"small": case(0.5, 0.01, 0.01), "larger": case(0.6, -0.01, 0.01), "noisy": case(0.9, 0.05, 0.04)}
+    table = {
+        "ideal": good | {"biased": case(0.95, 0.0, 0.01)},
+        "missing": good | {"biased": case(0.95, 3.0, 0.2), "small": case(0.4, 0.01, 0.01)},
+        "coupling: 0.001": {name: case(0.9, 1e6, 1.0) for name in (*good, "biased")},
+    }
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "comparison.json").write_text(json.dumps(table))
+    cells = {cell.id: cell.source for cell in nbformat.read(NOTEBOOKS / "which-calibration.ipynb", as_version=4).cells}
+    names = {"result": SimpleNamespace(folder=tmp_path), "rows": range(18)}
+    for cell in ("which-09", "which-11"):
+        exec(cells[cell], names)
+    capsys.readouterr()
+    exec(cells["which-15"], names)
+    told = capsys.readouterr().out.strip().split("\n\n")
+    assert [text.split(" h/Mpc")[0] for text in told] == ["k of 0.1 to 0.2", "k of 0.2 to 0.5"]
+    for text in told:
+        chosen, *others = [line.strip() for line in text.splitlines()[1:]]
+        assert chosen == "below in all: larger (T at least 0.60), small (T at least 0.40)"
+        assert others == ["open: noisy, in ideal, missing", "above: biased, in missing"]
+    exec(cells["which-17"], names)
+    told = capsys.readouterr().out
+    assert "missing: the sky model is off by 25.0 %" in told
+    assert told.count("(above)") == 2 * (1 + 4)

@@ -126,7 +126,7 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
 def _skipped(structure: FitStructure, message: str) -> Solution:
     gains = np.ones((structure.n_antennas, structure.n_frequencies), complex)
     model = np.zeros((structure.n_baselines, structure.n_frequencies), complex)
-    return Solution(gains, model, np.empty(0), "skipped", message, 0, 0.0)
+    return Solution(gains, model, np.empty(0), "skipped", message, 0, 0.0, 0.0)
 
 
 def _outcome(solution: Solution, peak_memory: int) -> Outcome:
@@ -136,6 +136,7 @@ def _outcome(solution: Solution, peak_memory: int) -> Outcome:
         steps=solution.n_steps,
         loss_history=solution.loss_history,
         seconds=solution.seconds,
+        cpu_seconds=solution.cpu_seconds,
         newton_decrement=solution.newton_decrement,
         decrement_rms=solution.decrement_rms,
         peak_memory=peak_memory,

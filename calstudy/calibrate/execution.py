@@ -282,7 +282,7 @@ class _Returned:
         return residual
 
     def _records(self, usage: Usage) -> list[SolveRecord]:
-        share = usage.seconds / len(self.outcomes)
+        share, cpu_share = (value / len(self.outcomes) for value in (usage.seconds, usage.cpu_seconds))
         found = []
         for index, outcome in enumerate(self.outcomes):
             p, group = divmod(index, len(self.groups))
@@ -298,6 +298,7 @@ class _Returned:
                     n_steps=outcome.steps,
                     loss_history=np.asarray(outcome.loss_history, float),
                     seconds=share if outcome.seconds is None else outcome.seconds,
+                    cpu_seconds=cpu_share if outcome.cpu_seconds is None else outcome.cpu_seconds,
                     newton_decrement=outcome.newton_decrement,
                     decrement_rms=outcome.decrement_rms,
                     peak_memory=usage.peak_memory if outcome.peak_memory is None else outcome.peak_memory,

@@ -72,6 +72,8 @@ class Outcome:
         What was minimized, before the first step and after each.
     seconds
         Wall time; None for an equal share of the whole.
+    cpu_seconds
+        Processor time, of programs that the calibrator starts as well; None for an equal share of the whole.
     newton_decrement, decrement_rms
         As in `calstudy.calibrate.solution.Solution`; NaN if unknown.
     peak_memory
@@ -85,6 +87,7 @@ class Outcome:
     steps: int | None = None
     loss_history: np.ndarray = field(default_factory=lambda: np.empty(0))
     seconds: float | None = None
+    cpu_seconds: float | None = None
     newton_decrement: float = np.nan
     decrement_rms: float = np.nan
     peak_memory: int | None = None

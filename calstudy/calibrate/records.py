@@ -30,6 +30,8 @@ class SolveRecord:
         Polarization number of the AIPS convention, such as -5 for XX.
     n_steps
         None if the calibrator does not iterate.
+    cpu_seconds
+        None if unknown: records of earlier versions lack it.
     peak_memory
         Largest resident memory of the process during the solve, bytes.
     diagnostics
@@ -45,6 +47,7 @@ class SolveRecord:
     n_steps: int | None
     loss_history: np.ndarray
     seconds: float
+    cpu_seconds: float | None
     newton_decrement: float
     decrement_rms: float
     peak_memory: int
@@ -64,6 +67,7 @@ class SolveRecord:
             "first_loss": _number(losses[0]) if losses.size else None,
             "last_loss": _number(losses[-1]) if losses.size else None,
             "seconds": self.seconds,
+            "cpu_seconds": self.cpu_seconds,
             "newton_decrement": _number(self.newton_decrement),
             "decrement_rms": _number(self.decrement_rms),
             "peak_memory": self.peak_memory,

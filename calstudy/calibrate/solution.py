@@ -31,6 +31,8 @@ class Solution:
         Steps taken.
     seconds
         Wall time.
+    cpu_seconds
+        Processor time of this process over the same time, all threads together; on a GPU likewise that of the process.
     newton_decrement
         Relative Newton decrement, which says how far from the minimum the iteration stopped: the decrease of the loss
         that one more Gauss-Newton step is predicted to bring, d^T H^-1 d with the descent direction d and the
@@ -49,6 +51,7 @@ class Solution:
     message: str
     n_steps: int
     seconds: float
+    cpu_seconds: float
     newton_decrement: float = math.nan
     decrement_rms: float = math.nan
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from calstudy.figures import CasesFigure
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
+from calstudy.products.tolerances import SIGMAS, upper_limit
 from calstudy.run.task import Job
+from calstudy.verdicts.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,8 +27,10 @@ DARK = 10.0
 ROW_HEIGHT, HEADING_HEIGHT = 0.3, 0.45
 LABELS_WIDTH = 72
 """Characters that fit below the matrix."""
-SIGNIFICANT = 2.0
-"""A bias of fewer standard deviations is written and coloured as that many of them."""
+LARGE_ERROR = 0.1
+"""T with a larger standard deviation is not written with two decimals alone, which would look exact."""
+ROOM_FOR_ERROR = 8
+"""Worlds side by side in whose cells T fits with its error; with more, it has one decimal."""
 
 
 @style.journal_style()
@@ -35,7 +39,8 @@ def draw_matrix(
 ) -> Figure:
     """Draw a matrix for each band of k: worlds from left to right, calibrators from top to bottom.
 
-    The colour is the bias. A bias within two standard deviations of zero is shown as an upper limit of two of them.
+    The colour is the bias. Of a bias within two standard deviations of zero, the 95 % upper limit is written and
+    coloured.
 
     Parameters
     ----------
@@ -89,14 +94,14 @@ def _draw_band(
                 axes.text(column, row, "no scores", ha="center", va="center", size=style.SMALL_SIZE, color=style.GREY)
                 continue
             case = found[name]
-            bias, error = case.bands.bias[band], case.bands.bias_error[band]
-            shown = max(abs(bias), SIGNIFICANT * error) if np.isfinite(error) else abs(bias)
+            bands = case.bands
+            shown, bias = _bias(bands.bias[band], bands.bias_error[band])
             if np.isfinite(shown):
-                colours[row, column] = shades.to_rgba(shown)
+                colours[row, column] = shades.to_rgba(np.asarray(shown))
             axes.text(
                 column,
                 row,
-                f"{_bias_text(bias, error)}\n$T$ = {case.bands.transfer[band]:.2f}",
+                f"{bias}\n$T$ = {_transfer(bands.transfer[band], bands.transfer_error[band], len(cases))}",
                 ha="center",
                 va="center",
                 fontsize=style.SMALL_SIZE,
@@ -108,10 +113,20 @@ def _draw_band(
     axes.tick_params(length=0)
 
 
-def _bias_text(bias: float, error: float) -> str:
-    if np.isfinite(error) and abs(bias) < SIGNIFICANT * error:
-        return f"bias < {_digits(SIGNIFICANT * error)}"
-    return f"bias {_digits(bias)}"
+def _bias(bias: float, error: float) -> tuple[float, str]:
+    """Return the size that is coloured, the bias or its upper limit, and what is written."""
+    if np.isfinite(error) and abs(bias) < SIGMAS * error:
+        limit = upper_limit(bias, error)
+        return limit, f"bias < {_digits(limit)}"
+    return abs(bias), f"bias {_digits(bias)}"
+
+
+def _transfer(value: float, error: float, n_worlds: int) -> str:
+    if not np.isfinite(value):
+        return "–"
+    if not (np.isfinite(error) and error > LARGE_ERROR):
+        return f"{value:.2f}"
+    return number(value, error) if n_worlds <= ROOM_FOR_ERROR else f"{value:.1f}"
 
 
 def _digits(value: float) -> str:
@@ -125,7 +140,11 @@ def _digits(value: float) -> str:
 class ComparisonMatrix(CasesFigure):
     """A matrix of calibrators and worlds for each band of k: colour and number are the bias, T is written below it."""
 
-    caption = "Bias of every calibrator in every world, in units of the EoR, and the part T of the EoR that is left."
+    version: ClassVar[int] = 2
+    caption = (
+        "Bias of every calibrator in every world, in units of the EoR (<: 95 % upper limit), and the part T of the EoR "
+        "that is left."
+    )
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
         """Draw all cases."""

@@ -157,4 +157,5 @@ def _record(content: Mapping[str, Any]) -> SolveRecord:
     fields = {name: value for name, value in content.items() if name not in ("first_loss", "last_loss")}
     losses = [np.nan if loss is None else loss for loss in fields.pop("loss_history")]
     numbers = {name: np.nan if fields[name] is None else fields[name] for name in NOT_FINITE}
-    return SolveRecord(**{**fields, **numbers, "loss_history": np.array(losses, float)})
+    # Pieces of earlier versions do not say it.
+    return SolveRecord(**{"cpu_seconds": None, **fields, **numbers, "loss_history": np.array(losses, float)})

@@ -63,7 +63,8 @@ def read_result(folder: Path) -> CalibrationResult:
             name: math.nan if value is None and name in NUMBERS else value for name, value in summary.items()
         }
         losses = np.array([known.pop("first_loss"), known.pop("last_loss")], dtype=float)
-        records.append(SolveRecord(**known, loss_history=losses))
+        # Products of earlier versions do not say it.
+        records.append(SolveRecord(**{"cpu_seconds": None, **known}, loss_history=losses))
     return CalibrationResult(
         gains=UVCal.from_file(folder / GAINS), model=model, residual=residual, solutions=tuple(records)
     )

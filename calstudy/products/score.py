@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import statistics
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
@@ -153,20 +154,40 @@ def _held_out_chi_squared(job: Job) -> float | None:
 
 
 def _solves(job: Job) -> dict[str, Any]:
-    """Return how the solves of the data with the EoR ended, and what one integration took, None if nobody knows."""
+    """Return how the solves of the data with the EoR ended, and what they took, None if nobody knows."""
     records = [
         record for parity in PARITIES for record in read_json(job.inputs[f"calibration:{parity}"] / SOLUTION)["records"]
     ]
     statuses = [record["status"] for record in records]
-    integrations = sum(record["n_integrations"] for record in records)
     by_status = {status: statuses.count(status) for status in sorted(set(statuses))}
     if set(statuses) == {"by-file"}:
-        return {"by_status": by_status, "seconds_per_integration": None, "peak_memory": None}
+        return {"by_status": by_status, "cpu_seconds_per_integration": None, "peak_memory": None}
     return {
         "by_status": by_status,
-        "seconds_per_integration": sum(record["seconds"] for record in records) / integrations,
+        "cpu_seconds_per_integration": cpu_seconds_per_integration(records),
         "peak_memory": max(record["peak_memory"] for record in records),
     }
+
+
+def cpu_seconds_per_integration(records: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the processor seconds that an integration takes, with all of its polarizations.
+
+    The median over solves, for the first in a process compiles as well. Solves that were skipped do not count.
+
+    Parameters
+    ----------
+    records
+        As `calstudy.calibrate.records.SolveRecord.summary` returns them.
+
+    Returns
+    -------
+    None if some record does not tell, as those of earlier versions, or if nothing was solved.
+    """
+    solved = [record for record in records if record["status"] != "skipped"]
+    if not solved or any(record.get("cpu_seconds") is None for record in solved):
+        return None
+    polarizations = len({record["polarization"] for record in solved})
+    return polarizations * statistics.median(record["cpu_seconds"] / record["n_integrations"] for record in solved)
 
 
 def _cost(task: Task) -> Cost:
@@ -174,4 +195,4 @@ def _cost(task: Task) -> Cost:
     return Cost(0.5 + samples * 1.5e-7, LIBRARIES_MEMORY + 8 * samples * COMPLEX128, 1e6)
 
 
-SCORE = Stage(name="score", version=1, make=make_score, cost=_cost)
+SCORE = Stage(name="score", version=2, make=make_score, cost=_cost)

@@ -23,6 +23,14 @@ SIGMAS = 2.0
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 
+def upper_limit(bias: float, error: float) -> float:
+    """Return the 95 % upper limit of the size of a bias, from its standard deviation: |bias| + 2 sigma.
+
+    What was measured counts in full: a bias of 1.9 standard deviations may as well be 3.9 as none.
+    """
+    return abs(bias) + SIGMAS * error
+
+
 @dataclass(frozen=True)
 class Fault:
     """Worlds that differ in how severe one fault is.
@@ -92,7 +100,7 @@ def tolerance(severities: Sequence[float], bias: np.ndarray, error: np.ndarray) 
     """
     used = [place for place, severity in enumerate(severities) if severity > 0 and np.isfinite(bias[place])]
     reached = [place for place in used if abs(bias[place]) >= LIMIT and abs(bias[place]) >= SIGMAS * error[place]]
-    unclear = [place for place in used if place not in reached and abs(bias[place]) + SIGMAS * error[place] > LIMIT]
+    unclear = [place for place in used if place not in reached and upper_limit(bias[place], error[place]) > LIMIT]
     if not used:
         return Tolerance(math.nan, "?")
     if unclear and (not reached or unclear[0] < reached[0]):

@@ -18,6 +18,7 @@ from calstudy.products.files import read_json
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import SUMMARY
 from calstudy.products.score import score as score_task
+from calstudy.products.tolerances import upper_limit
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.studies.comparison import Comparison
@@ -27,9 +28,8 @@ from calstudy.studies.study import Budget, make
 from calstudy.verdicts.tables import Table
 
 LOG = "score.log"
-SIGMAS = 2.0
 LIMIT = 1.0
-"""A band of k counts if the bias with so many standard deviations is below this part of the EoR."""
+"""A band of k counts if the upper limit of the bias is below this part of the EoR."""
 
 
 class Row(Section):
@@ -138,7 +138,7 @@ class _Standing:
         limits, kept = [], []
         for band in row.scores["bands"]:
             known = band["bias"] is not None and band["bias_error"] is not None and band["transfer"] is not None
-            limit = abs(band["bias"]) + SIGMAS * band["bias_error"] if known else float("inf")
+            limit = upper_limit(band["bias"], band["bias_error"]) if known else float("inf")
             limits.append(limit)
             if limit < LIMIT:
                 kept.append(band["transfer"])

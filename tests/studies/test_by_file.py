@@ -174,7 +174,7 @@ def test_a_built_in_calibrator_through_files_gives_its_own_row(exported, home, b
         assert mine.scores[name] == pytest.approx(built_in.scores[name], rel=1e-9), name
     assert_same_bands(mine.scores, built_in.scores)
     assert set(mine.scores["by_status"]) == {"by-file"}
-    assert mine.scores["seconds_per_integration"] is None
+    assert mine.scores["cpu_seconds_per_integration"] is None
 
 
 def test_data_sets_are_told_by_their_digests_and_not_by_their_names(skycal, home, tmp_path):
@@ -450,7 +450,7 @@ def row(world, calibrator, bias, error, transfer, digest="d"):
         "gain_error_as_fitted": None,
         "held_out_chi_squared": None,
         "by_status": {"by-file": 1},
-        "seconds_per_integration": None,
+        "cpu_seconds_per_integration": None,
         "peak_memory": None,
     }
     return Row(world=world, calibrator=calibrator, digest=digest, scores=scores)

@@ -131,6 +131,7 @@ def test_tables_and_figures_hold_every_case(compared):
     cases = {(row["world"], row["calibrator"]) for row in rows}
     assert cases == {(world, name) for world in WORLDS for name in CALIBRATORS}
     assert len(rows) == len(cases) * (len(BANDS) - 1)
+    assert all(float(row["CPU seconds per integration"]) > 0 for row in rows)
     text = (folder / "tables" / "comparison.md").read_text()
     assert all(f"| {name} |" in text for name in CALIBRATORS)
     for figure in FIGURES:

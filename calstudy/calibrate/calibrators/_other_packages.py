@@ -108,15 +108,20 @@ class OtherPackage(Calibrator):
         full = [number for number, times in enumerate(groups) if measured.weights[times].any()]
         shape = (measured.frame.n_antennas, measured.frame.n_channels, len(groups))
         gains = np.full(shape, np.nan, complex)
-        ended = [Outcome(status="skipped", message="every sample is flagged or has no weight")] * len(groups)
+        message = "every sample is flagged or has no weight"
+        ended = [Outcome(status="skipped", message=message, seconds=0.0, cpu_seconds=0.0)] * len(groups)
         if full:
             with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
                 # They divide by what may be zero, and tell of numbers that they replace themselves.
                 warnings.simplefilter("ignore")
                 gains[:, :, full], found = self.solve(measured, [groups[number] for number in full])
             for number, outcome in zip(full, found, strict=True):
-                seconds = usage.seconds / len(full)
-                ended[number] = replace(outcome, seconds=seconds, peak_memory=usage.peak_memory)
+                ended[number] = replace(
+                    outcome,
+                    seconds=usage.seconds / len(full),
+                    cpu_seconds=usage.cpu_seconds / len(full),
+                    peak_memory=usage.peak_memory,
+                )
         return gains, ended
 
 

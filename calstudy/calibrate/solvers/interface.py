@@ -101,7 +101,7 @@ def solve_warm(
 
 def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) -> tuple[Solution, Any]:
     """Return the solution and the solver's last state."""
-    started = time.perf_counter()
+    started, cpu_started = time.perf_counter(), time.process_time()
     state = solver.init(problem, warm)
     while (verdict := solver.terminate(state)) is None:
         state = solver.step(state)
@@ -118,7 +118,7 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
             rms = decrement_rms(gains, model, problem, newton_decrement)
         except ValueError as error:
             verdict = Verdict("failed", str(error))
-    seconds = time.perf_counter() - started
+    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
     solution = Solution(
         gains,
         model,
@@ -127,6 +127,7 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
         verdict.message,
         losses.size - 1,
         seconds,
+        cpu_seconds,
         newton_decrement,
         rms,
     )

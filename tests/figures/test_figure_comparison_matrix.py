@@ -1,0 +1,93 @@
+"""The matrix of calibrators and worlds: what its cells say must be what was measured, and no more."""
+
+import re
+
+import numpy as np
+import pytest
+from matplotlib.colors import same_color
+
+from calstudy.experiment.model import FIGURES
+from calstudy.figures.comparison_matrix import draw_matrix
+from calstudy.plotting import style
+from calstudy.power.score import BANDS, Score
+from calstudy.products.comparison import Case
+from calstudy.products.tolerances import upper_limit
+
+N_BANDS = len(BANDS) - 1
+
+
+def case(bias=1.0, bias_error=0.1, transfer=0.9, transfer_error=0.01):
+    """A case with the same scores in all bands of k."""
+    edges = np.array(BANDS)
+    columns = {name: np.full(N_BANDS, value) for name, value in locals().items() if name != "edges"}
+    nothing = np.full(N_BANDS, np.nan)
+    score = Score(k=edges[1:], bin_edges=edges, recovered=nothing, recovered_error=nothing, flux_scale=1.0, **columns)
+    return Case(score, score, {})
+
+
+def draw(cases):
+    """Draw cases by world of one calibrator."""
+    return draw_matrix({world: {"mine": found} for world, found in cases.items()}, ["mine"])
+
+
+def cell(found, worlds=1):
+    """What the first cell of the first band says, and its colour."""
+    axes = draw({f"world {number}": found for number in range(worlds)}).axes[0]
+    return axes.texts[0].get_text().split("\n"), axes.images[0].get_array()[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("bias", "error", "told"),
+    [
+        (0.224, 0.121, "bias < 0.47"),
+        (-0.224, 0.121, "bias < 0.47"),
+        (0.0, 0.121, "bias < 0.24"),
+        (0.3, 0.121, "bias 0.3"),
+        (-3.0, 0.5, "bias -3"),
+        (7.0, np.nan, "bias 7"),
+        (np.nan, np.nan, "bias –"),
+    ],
+)
+def test_a_bias_that_is_not_significant_is_an_upper_limit_that_holds_what_was_measured(bias, error, told):
+    (text, _), colour = cell(case(bias, error))
+    assert text == told
+    # The colour is that of the number that is written.
+    size = upper_limit(bias, error) if "<" in told else abs(bias)
+    other = cell(case(size, 1e-9))[1] if np.isfinite(size) else np.ones(4)
+    assert same_color(colour, other)
+
+
+def test_a_limit_is_above_the_bias_by_two_standard_deviations():
+    assert upper_limit(-0.224, 0.121) == pytest.approx(0.466)
+
+
+@pytest.mark.parametrize(
+    ("transfer", "error", "worlds", "told"),
+    [
+        (0.374, 0.01, 1, "0.37"),
+        (0.374, 0.1, 1, "0.37"),
+        (0.374, 0.26, 1, "0.37 ± 0.26"),
+        (0.374, 0.26, 10, "0.4"),
+        (0.374, 0.01, 10, "0.37"),
+        (0.374, np.nan, 1, "0.37"),
+        (np.nan, np.nan, 1, "–"),
+    ],
+)
+def test_t_has_no_more_decimals_than_its_error_allows(transfer, error, worlds, told):
+    (_, text), _ = cell(case(transfer=transfer, transfer_error=error), worlds)
+    assert text == f"$T$ = {told}"
+
+
+@pytest.mark.parametrize("worlds", [1, 3, 6, 8, 10])
+def test_texts_stay_in_their_cells(worlds):
+    widest = case(bias=0.0984, bias_error=0.0984, transfer=-0.374, transfer_error=0.26)
+    figure = draw({f"w{number}": widest for number in range(worlds)})
+    with style.journal_style():
+        figure.draw_without_rendering()
+        axes = figure.axes[0]
+        width = axes.get_window_extent().width / worlds
+        assert all(text.get_window_extent().width < width for text in axes.texts)
+
+
+def test_the_caption_says_what_the_sign_means():
+    assert re.search(r"<: 95 % upper limit", FIGURES.make("comparison-matrix").caption)
