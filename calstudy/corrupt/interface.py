@@ -27,6 +27,11 @@ class Effect(Plugin, ABC):
 
     Fields of a subclass are its settings. One that draws random numbers declares ``seed: int``.
 
+    Attributes
+    ----------
+    uses_positions
+        Whether anything depends on where antennas are. Its observation then has them where they are as built.
+
     Notes
     -----
     The `Observation` that `draw` and `apply` are given is without data: antennas, baselines, channels, times and
@@ -36,6 +41,8 @@ class Effect(Plugin, ABC):
     registry: ClassVar[Registry[Effect]] = Registry(
         "effect", "calstudy.corrupt.effects", "calstudy.corrupt.interface:Effect"
     )
+
+    uses_positions: ClassVar[bool] = True
 
     kind: str = Field("", description="Name of an effect, or a file.py.")
 
@@ -116,6 +123,8 @@ class GainEffect(Effect):
 
     The product of all gain effects is the true gains, with which a calibration is compared.
     """
+
+    uses_positions: ClassVar[bool] = False
 
     drift: Drift | None = Field(None, description="How the gains change during the run; null: they are constant.")
 

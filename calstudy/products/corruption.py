@@ -47,10 +47,10 @@ def _truth(graph: Graph, place: int) -> Task:
 
 
 def _antennas(graph: Graph, effects: Sequence[Effect]) -> InstrumentSettings:
-    """Return the instrument that effects happen in: without beams, but with the true positions, which gains ignore."""
+    """Return the instrument that effects happen in: without beams, but with the true positions for what uses them."""
     instrument = graph.experiment.instrument
     nominal = instrument.without_beams()
-    if all(isinstance(effect, GainEffect) for effect in effects):
+    if not any(effect.uses_positions for effect in effects):
         return nominal
     return nominal.model_copy(update={"as_built": AsBuilt(positions=instrument.as_built.positions)})
 

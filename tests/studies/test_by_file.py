@@ -266,9 +266,10 @@ def test_faults_of_folders_are_sentences(skycal, home, tmp_path, capsys):
     assert "other digests" in told(skycal, home / "secret.yaml", "--set", "corruption.noise.seeds=[7, 8]")
     lacking = tmp_path / "lacking"
     shutil.copytree(skycal, lacking)
-    (lacking / "data-3.calh5").rename(lacking / "data-2.calfits")
+    shutil.copy(lacking / "data-2.calh5", lacking / "data-2.calfits")
     assert "has data-2.calh5 and data-2.calfits; keep one" in told(lacking)
     (lacking / "data-2.calfits").unlink()
+    (lacking / "data-3.calh5").unlink()
     assert "no gains for data-3 (allowed: data-3.calh5, data-3.calfits, data-3.cal)" in told(lacking)
     (lacking / "data-3.calh5").write_text("nothing")
     assert "not a readable CalH5 or calfits file" in told(lacking)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +21,8 @@ class ChannelFlags(Effect):
     The defaults are those of the MWA, whose coarse channels are centred at multiples of 1.28 MHz and lose 80 kHz at
     either edge, and the central channel (Offringa et al. 2015).
     """
+
+    uses_positions: ClassVar[bool] = False
 
     band_edges: Frequency = Field(0.0, ge=0, description="Flagged at either end of the band.")
     coarse_width: Frequency | None = Field(

@@ -22,6 +22,7 @@ class DeadAntennas(Effect):
     """Flags of all baselines of some antennas: named ones, or a number of them at random."""
 
     version: ClassVar[int] = 2
+    uses_positions: ClassVar[bool] = False
 
     antennas: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
         (), description="Counted from 0 in the order of the layout; empty: `count` at random."
