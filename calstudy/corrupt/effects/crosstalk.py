@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -19,6 +19,8 @@ class Crosstalk(Effect):
 
     Kern et al. (2019) found such terms in HERA, at delays of cables.
     """
+
+    uses_positions: ClassVar[bool] = False
 
     amplitude: FluxDensity = Field(
         0.1, ge=0, description="rms of the modulus of c over the baselines; the default is a choice of this project."
