@@ -169,7 +169,9 @@ def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
             bias, error = (np.array([getattr(item, name)[band] for item in bands]) for name in ("bias", "bias_error"))
             found = tolerance([fault.severities[place] for place in there], bias, error)
             known = "" if found.relation == "=" else f"{found.relation} "
-            cells.append("noise" if found.relation == "?" else f"{known}{found.severity:.2g} {fault.unit}".strip())
+            # Two digits, and powers of ten for what is not between 0.0001 and a million alone.
+            severity = f"{float(f'{found.severity:.2g}'):g}"
+            cells.append("noise" if found.relation == "?" else f"{known}{severity} {fault.unit}".strip())
         rows.append((fault.name, *cells))
     if not rows:
         return []
