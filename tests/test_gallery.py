@@ -54,5 +54,5 @@ def test_the_verdicts_are_those_of_the_claims(folder):
 
 @folders
 def test_the_command_makes_the_study(folder):
-    [experiment] = re.findall(r"^python -m calstudy run (\S+)$", SECTIONS[folder], re.MULTILINE)
+    [experiment] = re.findall(r"^python -m calstudy run (\S+)(?: --scale small)?$", SECTIONS[folder], re.MULTILINE)
     assert folder in names_made_by(experiment)
