@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
@@ -82,8 +83,9 @@ def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[An
                 tile_beams = model_of(section).make_tiles(settings.channels, np.array(tiles))
             made |= {(model, amplitudes): beam for amplitudes, beam in zip(tiles, tile_beams, strict=True)}
     nominal = Misalignment()
-    shared = {key: NominalBeam(beam) for key, beam in made.items()}
     found = [((beam.model, beam.amplitudes), beam.misalignment) for beam in distinct]
+    counts = Counter(key for key, error in found if error != nominal)
+    shared = {key: NominalBeam(made[key], keep=count > 1) for key, count in counts.items()}
     return [made[key] if error == nominal else MisalignedBeam(shared[key], error) for key, error in found]
 
 

@@ -30,11 +30,13 @@ class NominalBeam:
     ----------
     beam
         As designed.
+    keep
+        Whether several antennas have it, so that it is worth the memory.
     """
 
-    def __init__(self, beam: AntennaBeam) -> None:
+    def __init__(self, beam: AntennaBeam, keep: bool = True) -> None:
         self.name, self.stand_in = beam.name, beam.stand_in
-        self._beam = beam
+        self._beam, self._keep = beam, keep
         self._kept: tuple[np.ndarray, UVBeam, np.ndarray] | None = None
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
@@ -49,12 +51,15 @@ class NominalBeam:
         InputError
             If a table does not go all around.
         """
-        if self._kept is None or not np.array_equal(self._kept[0], frequencies):
-            beam = self.at(frequencies)
-            if not isinstance(beam, UVBeam):
-                return beam, np.empty(0)
-            self._kept = np.array(frequencies), beam, _splines_of(beam)
-        return self._kept[1:]
+        if self._kept is not None and np.array_equal(self._kept[0], frequencies):
+            return self._kept[1:]
+        beam = self.at(frequencies)
+        if not isinstance(beam, UVBeam):
+            return beam, np.empty(0)
+        splines = _splines_of(beam)
+        if self._keep:
+            self._kept = np.array(frequencies), beam, splines
+        return beam, splines
 
 
 class MisalignedBeam:
@@ -73,7 +78,7 @@ class MisalignedBeam:
 
     def __init__(self, beam: AntennaBeam, misalignment: Misalignment) -> None:
         self.name, self.stand_in = beam.name, beam.stand_in
-        self._beam = beam if isinstance(beam, NominalBeam) else NominalBeam(beam)
+        self._beam = beam if isinstance(beam, NominalBeam) else NominalBeam(beam, keep=False)
         self._misalignment = misalignment
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:

@@ -33,7 +33,9 @@ def agreement(graph: Graph) -> Task | None:
     if not (residual.effects and residual.calibrate and {"foregrounds", "noise"} <= set(residual.components)):
         return None
     power = graph.experiment.power
-    settings = {"buffer": power.wedge_buffer, "redundancy_tolerance": power.redundancy_tolerance}
+    settings: dict[str, Any] = {"buffer": power.wedge_buffer, "redundancy_tolerance": power.redundancy_tolerance}
+    if graph.experiment.instrument.times.count > MOST_INTEGRATIONS:
+        settings["integrations"] = MOST_INTEGRATIONS
     inputs = {
         "data": corruption.data(graph, residual, "even"),
         "noise": corruption.data(graph, noise, "even"),

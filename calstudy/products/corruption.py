@@ -97,8 +97,11 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         "even" or "odd".
     """
     experiment = graph.experiment
+    # Variants are compared, and give each other's errors: all have the same samples.
+    flagging = [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]
     effects = experiment.corruption.effects if variant.effects else ()
-    settings: dict[str, Any] = {"components": sorted(variant.components), "instrument": _antennas(graph, effects)}
+    acting = effects or [experiment.corruption.effects[place] for place in flagging]
+    settings: dict[str, Any] = {"components": sorted(variant.components), "instrument": _antennas(graph, acting)}
     inputs = {"levels": levels(graph)}
     label = "+".join(variant.components)
     if "noise" in variant.components:
@@ -115,9 +118,8 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         settings["effects"] = list(effects)
         inputs |= _numbered(truths(graph))
         label = f"effects on ({label})"
-    elif flagging := [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]:
-        # Variants are compared, and give each other's errors: all have the same samples.
-        settings["flagged_by"] = [experiment.corruption.effects[place] for place in flagging]
+    elif flagging:
+        settings["flagged_by"] = acting
         inputs |= _numbered([_truth(graph, place) for place in flagging])
     return Task(CORRUPT, label, settings, inputs, temporary=not graph.keep_visibilities)
 

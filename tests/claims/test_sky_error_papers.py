@@ -88,7 +88,7 @@ def test_every_statement_has_the_runs_that_it_needs(members):
         ("byrne2023", "delay_weighted", "sky-based-incomplete", "not 'delay-weighted'"),
         ("joseph2020", "dead_dipoles", "sky-based", "dead_tiles is 0"),
         ("chokshi2024", "one_beam", "deformed-beams-known", "calibration.assumed has instrument.as_built"),
-        ("chokshi2024", "all_beams", "deformed-beams", "does not have instrument.as_built.dipoles"),
+        ("chokshi2024", "all_beams", "deformed-beams", "does not have the true instrument"),
         ("chokshi2024", "one_beam", "dead-dipoles", "amplitude_scatter is 0"),
     ],
 )
@@ -131,6 +131,21 @@ def test_redundant_calibration_without_omnical_is_refused():
     calibration = "calibration={calibrator: redcal, steps: [firstcal, logcal, abscal]}"
     biased = load(EXPERIMENTS / "hexagon.yaml", overrides=[calibration])
     assert "no omnical" in paper("byrne2019").refusal("redundant_complete", biased)
+
+
+@pytest.mark.parametrize(
+    ("assumed", "accepted"),
+    [
+        ("amplitude_scatter: 10 %, seed: 3", True),
+        ("amplitude_scatter: 10 %", False),
+        ("dead_tiles: 0.1, seed: 3", False),
+    ],
+)
+def test_known_beams_are_the_true_ones(assumed, accepted):
+    dipoles = "instrument.as_built.dipoles={amplitude_scatter: 10 %, seed: 3}"
+    known = f"calibration={{calibrator: sky-based, assumed: {{instrument.as_built.dipoles: {{{assumed}}}}}}}"
+    run = load(EXPERIMENTS / "hexagon.yaml", overrides=[dipoles, known])
+    assert (paper("chokshi2024").refusal("all_beams", run) is None) is accepted
 
 
 def test_gains_of_any_kind_are_no_other_fault(members):
