@@ -15,8 +15,8 @@ from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.calamity import Calamity
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import FirstOrderSettings, GaussNewtonSettings, Solver
-from calstudy.corrupt.effects.mutual_coupling import MutualCoupling
 from calstudy.corrupt.settings import CorruptionSettings
+from calstudy.corrupt.temperature import Autocorrelations
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.simulate.settings import SimulationSettings
@@ -284,9 +284,9 @@ class Experiment(Section):
         if beam.is_built_in and beam.label.startswith("mwa-"):
             return self
         for place, effect in enumerate(self.corruption.effects):
-            autos = effect.autos if isinstance(effect, MutualCoupling) else None
+            autos = getattr(effect, "autos", None)
             # The value alone does not tell a default from the same number given on purpose.
-            if autos is not None and "effective_area" not in autos.model_fields_set:
+            if isinstance(autos, Autocorrelations) and "effective_area" not in autos.model_fields_set:
                 raise fault(
                     f"corruption.effects.{place}.autos.effective_area",
                     f"must be given with the beam {beam.label!r}, such as 100 m2: the default, "
