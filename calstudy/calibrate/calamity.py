@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from calstudy.base.observation import Observation
 from calstudy.base.resources import Usage
+from calstudy.calibrate.degeneracy import sky_model_slope
 from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
@@ -33,12 +34,19 @@ def make_solver(settings: GainFit) -> Solver:
 
 
 class Solve(NamedTuple):
-    """One solve: its integrations, its polarization, and how it went."""
+    """One solve: its integrations, its polarization, and how it went.
+
+    Attributes
+    ----------
+    diagnostics
+        The slope of the calibrated data on the sky model, and the rms of its band shape; empty without a sky model.
+    """
 
     times: slice
     polarization: int
     solution: Solution
     peak_memory: int
+    diagnostics: Mapping[str, float]
 
 
 def fit(
@@ -75,8 +83,9 @@ def fit(
     gains, gain_flags = np.ones(prepared.start.shape, complex), np.ones(prepared.start.shape, bool)
     model = np.zeros(shape, complex)
     outcomes = []
-    for times, p, solution, peak_memory in _solve_all(settings, prepared, progress):
-        outcomes.append(_outcome(solution, peak_memory))
+    for solve in _solve_all(settings, prepared, progress):
+        times, p, solution = solve.times, solve.polarization, solve.solution
+        outcomes.append(_outcome(solve))
         if not solution.usable:
             continue
         model[times, :, :, p] = solution.model.reshape(-1, *shape[1:3])
@@ -101,13 +110,16 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
     for p in range(n_polarizations):
         warm: WarmStart | None = None
         for index, times in enumerate(groups):
+            diagnostics: dict[str, float]
             with Usage() as usage:
                 problem = make_problem(prepared, settings, times, p)
                 if isinstance(problem, str):
                     solution = _skipped(repeat_structure(prepared.structure, times.stop - times.start), problem)
+                    diagnostics = {}
                 else:
                     solution, warm = _solve(problem, solver, warm if settings.solver.warm_start else None)
-            yield Solve(times, p, solution, usage.peak_memory)
+                    diagnostics = _diagnostics(solution, problem)
+            yield Solve(times, p, solution, usage.peak_memory, diagnostics)
             if progress is not None:
                 progress(p * len(groups) + index + 1, len(groups) * n_polarizations)
 
@@ -129,7 +141,16 @@ def _skipped(structure: FitStructure, message: str) -> Solution:
     return Solution(gains, model, np.empty(0), "skipped", message, 0, 0.0, 0.0)
 
 
-def _outcome(solution: Solution, peak_memory: int) -> Outcome:
+def _diagnostics(solution: Solution, problem: CalibrationProblem) -> dict[str, float]:
+    """Return what a solution tells of the scale and the band shape of g_a g_b*, as far as there is a sky model."""
+    if problem.sky_model is None or not solution.usable or not np.any(problem.weights * np.abs(problem.sky_model)):
+        return {}
+    slope, shape = sky_model_slope(solution.gains, problem)
+    return {"sky_model_slope": slope, "band_shape_rms": float(np.sqrt(np.nanmean((shape - 1) ** 2)))}
+
+
+def _outcome(solve: Solve) -> Outcome:
+    solution = solve.solution
     return Outcome(
         status=solution.status,
         message=solution.message,
@@ -139,7 +160,8 @@ def _outcome(solution: Solution, peak_memory: int) -> Outcome:
         cpu_seconds=solution.cpu_seconds,
         newton_decrement=solution.newton_decrement,
         decrement_rms=solution.decrement_rms,
-        peak_memory=peak_memory,
+        peak_memory=solve.peak_memory,
+        diagnostics=solve.diagnostics,
     )
 
 

@@ -66,12 +66,10 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
         used = problem.antenna_weights > 0
         return float(np.exp(2 * np.mean(np.log(np.abs(gains[used] / problem.initial_gains[used])))))
     if problem.prior == "sky-model":
-        sky_model: Any = problem.sky_model
-        calibrated = problem.visibilities / gain_products(gains, problem.structure.antennas)
-        overlap = float(np.sum(problem.weights * (sky_model.conj() * calibrated).real))
-        if not overlap > 0:
+        slope, _ = sky_model_slope(gains, problem)
+        if not slope > 0:
             raise ValueError("prior sky-model: the calibrated data are not correlated with the sky model")
-        return float(np.sum(problem.weights * np.abs(sky_model) ** 2)) / overlap
+        return 1 / slope
     total, target = complex(np.sum(problem.weights * model)), problem.prior_target
     if problem.prior == "sum":
         scale = (total.conjugate() * target).real / abs(total) ** 2 if total else 0.0
@@ -83,6 +81,34 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
             "allow no positive scale between them"
         )
     return scale
+
+
+def sky_model_slope(gains: np.ndarray, problem: CalibrationProblem) -> tuple[float, np.ndarray]:
+    """Return the slope of the calibrated data on the sky model, and the slopes of single channels over it.
+
+    What they tell of a fit: the scale of g_a g_b*, and its band shape, which all antennas share. A fit of free
+    foregrounds determines the first not at all, and the second only where it is not smooth.
+
+    Parameters
+    ----------
+    gains
+        (Nants, Nfreqs), complex.
+    problem
+        What was fitted, with a sky model.
+
+    Returns
+    -------
+    slope
+        sum w Re m* V / (g_a g_b*) over sum w |m|^2, with the sky model m.
+    shape
+        The same of each channel, over `slope`, (Nfreqs,); NaN in channels without data.
+    """
+    sky_model: Any = problem.sky_model
+    calibrated = problem.visibilities / gain_products(gains, problem.structure.antennas)
+    overlap = np.sum(problem.weights * (sky_model.conj() * calibrated).real, axis=0)
+    power = np.sum(problem.weights * np.abs(sky_model) ** 2, axis=0)
+    slope = float(overlap.sum() / power.sum())
+    return slope, np.where(power > 0, overlap / np.where(power > 0, power, 1) / slope, np.nan)
 
 
 def fix_degeneracies(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import statistics
 import sys
 import time
 from dataclasses import asdict, dataclass, replace
@@ -202,6 +203,7 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
         shutil.rmtree(folder, ignore_errors=True)
     console.print(f"{len(written)} files in {request.output}, {time.perf_counter() - started:.1f} s", markup=False)
     _tell_distance(result, console)
+    _tell_scale(result, console)
     return _verdict(result)
 
 
@@ -349,6 +351,17 @@ def _tell_distance(result: CalibrationResult, console: Console) -> None:
         console.print(
             f"left by stopping: at most {100 * worst.newton_decrement:.2g} % of the residual's power "
             f"({worst.decrement_rms:.2g} {result.model.vis_units} rms)",
+            markup=False,
+        )
+
+
+def _tell_scale(result: CalibrationResult, console: Console) -> None:
+    """Say how the calibrated data compare with the sky model, if there is one: medians over the solves."""
+    known = [record.diagnostics for record in result.solutions if "sky_model_slope" in record.diagnostics]
+    if known:
+        slope, shape = (statistics.median([item[name] for item in known]) for name in ("sky_model_slope", "band_shape_rms"))
+        console.print(
+            f"calibrated data over the sky model: {slope:.4f}, and {100 * shape:.2g} % rms from channel to channel",
             markup=False,
         )
 

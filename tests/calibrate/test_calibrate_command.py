@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -88,6 +89,19 @@ def test_everything_is_written_and_readable(command, data, tmp_path):
     used = ~original.flag_array
     rebuilt = products * (model.data_array + residual.data_array)
     assert np.abs(rebuilt - original.data_array)[used].max() < 1e-5 * np.abs(original.data_array).max()
+
+
+def test_scale_and_band_shape_against_the_sky_model_are_told(command, data, tmp_path):
+    command(data, *OPTIONS, "--output", "first")
+    sky = UVData.from_file(str(tmp_path / "first" / "model.uvh5"))
+    sky.data_array *= 2 * np.linspace(0.9, 1.1, sky.Nfreqs)[:, None]
+    sky.write_uvh5(str(tmp_path / "sky.uvh5"))
+    code, error = command(data, *OPTIONS, "--output", "out", "--sky-model", "sky.uvh5", "--set", "prior=sky-model")
+    assert code == 0
+    # 0.9 to 1.1 times the truth: 5.8 % rms, whose mean the scale takes.
+    assert re.search(r"over the sky model: 1\.0000, and 5\.[6-9] % rms", error)
+    records = json.loads((tmp_path / "out" / "solution.json").read_text())["records"]
+    assert all(record["diagnostics"]["sky_model_slope"] == pytest.approx(1) for record in records)
 
 
 def test_the_log_tells_every_solve(command, data, tmp_path):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from test_calibration_loss import redundant_structure
 from toy import complex_normal, make_toy, scattered
 
-from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase
+from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase, sky_model_slope
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
@@ -216,6 +216,19 @@ def test_degeneracies_do_not_touch_data_and_are_always_fixed_alike(scale, phase,
     again = toy.visibilities / gain_products(again_gains, toy.antennas) - again_model
     assert np.abs(residual - again).max() < 1e-11 * np.abs(model).max()
     assert np.allclose(gains, again_gains, rtol=1e-11, atol=0)
+
+
+def test_scale_and_band_shape_of_the_gains_are_those_that_were_put_in(quiet):
+    """Gains too large by sqrt(1.2 b): the calibrated data are the sky over 1.2 b; a channel without data is unknown."""
+    band = 1 + 0.1 * np.cos(np.linspace(0, 3, 64))
+    problem = quiet.problem(sky_model=quiet.foregrounds)
+    problem.weights[:, 7] = 0
+    slope, shape = sky_model_slope(quiet.gains * np.sqrt(1.2 * band), problem)
+    power = np.sum(problem.weights * np.abs(quiet.foregrounds) ** 2, axis=0)
+    mean = np.sum(power / band) / np.sum(power)
+    assert slope == pytest.approx(mean / 1.2, rel=1e-12)
+    assert np.isnan(shape[7])
+    np.testing.assert_allclose(np.delete(shape, 7), np.delete(1 / band / mean, 7), rtol=1e-12)
 
 
 def test_residual_does_not_know_where_the_solver_drifted(converged):
