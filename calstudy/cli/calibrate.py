@@ -359,7 +359,9 @@ def _tell_scale(result: CalibrationResult, console: Console) -> None:
     """Say how the calibrated data compare with the sky model, if there is one: medians over the solves."""
     known = [record.diagnostics for record in result.solutions if "sky_model_slope" in record.diagnostics]
     if known:
-        slope, shape = (statistics.median([item[name] for item in known]) for name in ("sky_model_slope", "band_shape_rms"))
+        slope, shape = (
+            statistics.median([item[name] for item in known]) for name in ("sky_model_slope", "band_shape_rms")
+        )
         console.print(
             f"calibrated data over the sky model: {slope:.4f}, and {100 * shape:.2g} % rms from channel to channel",
             markup=False,
