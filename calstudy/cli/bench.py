@@ -82,6 +82,44 @@ def calibrate(
 
 
 @bench_app.command()
+def arrays(
+    names: Annotated[str, typer.Option("--arrays", help="Names, separated by commas; by default all.")] = "",
+    integrations: Annotated[int, typer.Option(min=2, help="Solved one from the other.")] = 6,
+    device: Annotated[str, typer.Option(help="cpu or gpu.")] = "cpu",
+    output: Output = None,
+) -> None:
+    """Time the default solver on arrays of every kind, each in a process of its own with one thread."""
+    from calstudy.base.quiet import load_tensorflow
+
+    if output is not None:
+        require_writable(output)
+    load_tensorflow(1)
+    from calstudy.bench.arrays import ARRAYS, HEADINGS, require_arrays, time_array
+    from calstudy.bench.calibration import unit_of
+
+    chosen = names.split(",") if names else list(ARRAYS)
+    require_arrays(chosen)
+    console, rows = Console(highlight=False), []
+    with console.status("") as status:
+        for name in chosen:
+            status.update(name)
+            found = time_array(name, integrations, device)
+            rows.append(
+                (
+                    name,
+                    f"{found.baselines}",
+                    f"{found.channels}",
+                    f"{found.first:.2f}",
+                    f"{found.cold:.2f}",
+                    f"{found.warm:.2f}",
+                    f"{found.cold_steps}, {found.warm_steps:g}" + ("" if found.converged else ", not converged"),
+                    f"{found.memory / 1e9:.1f} GB",
+                )
+            )
+    _publish(Table(HEADINGS, rows, f"default solver, {unit_of(device)}"), console, output)
+
+
+@bench_app.command()
 def memory(
     antennas: Annotated[str, typer.Option(help="Sizes, separated by commas.")] = "36,128",
     channels: Annotated[int, typer.Option(min=64)] = 384,

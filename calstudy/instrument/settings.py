@@ -145,7 +145,7 @@ class GolombLayout(ArrayLayout):
     """An east-west line at the marks of an optimal Golomb ruler: every baseline is unique."""
 
     kind: Literal["golomb"]
-    count: int = Field(8, ge=2, le=12, description="Number of antennas (marks of the ruler).")
+    count: int = Field(8, ge=2, le=16, description="Number of antennas (marks of the ruler).")
     spacing: Length = Field(4.0, ge=0.01, description="Length of one unit of the ruler.")
 
 

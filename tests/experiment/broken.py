@@ -187,7 +187,7 @@ IMPLAUSIBLE: list[tuple[str, Any, str]] = [
     ("instrument.layout", {"kind": "rectangular", "count": 10**6}, "at most 2000"),
     ("instrument.layout", {"kind": "rectangular", "max_baseline": "5 m"}, "must exceed the length of a row"),
     ("instrument.layout", {"kind": "hera-19", "count": 30}, "instrument.layout.count: 30 is more than the 19"),
-    ("instrument.layout", {"kind": "golomb", "count": 100}, "at most 12"),
+    ("instrument.layout", {"kind": "golomb", "count": 100}, "at most 16"),
     ("instrument.location", "mars", "'mars' is not a choice"),
     ("instrument.location", {"latitude": "-91 deg", "longitude": "0 deg"}, "at least -90 deg"),
     ("instrument.beam", {"kind": "hera", "model": "nic-cst"}, "is not within the beam file's 100 to 145 MHz"),

@@ -1,0 +1,35 @@
+"""Arrays of every kind are timed with the default solver."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calstudy.base.errors import InputError
+from calstudy.bench import arrays
+from calstudy.bench.calibration_case import Case
+
+
+def test_arrays_have_the_antennas_that_their_cases_say():
+    for array in arrays.ARRAYS.values():
+        positions = array.positions()
+        assert positions is None or positions.shape == (array.case.antennas, 3)
+    ruler = arrays.ARRAYS["golomb-15"].positions()
+    assert np.ptp(ruler[:, 0]) == pytest.approx(453)
+
+
+def test_an_array_is_solved_from_unity_and_then_warm(monkeypatch):
+    small = arrays.Array(Case(antennas=7, channels=64), {"kind": "hex", "side": 2, "spacing": "14 m"})
+    monkeypatch.setitem(arrays.ARRAYS, "hexagon-7", small)
+    found = arrays.Timing(**arrays.run_array({"name": "hexagon-7", "integrations": 3, "device": "cpu"}))
+    assert (found.baselines, found.channels) == (21, 64)
+    assert found.converged
+    # Compilation takes seconds, and the next integration is close to the one before.
+    assert found.first > found.cold > 0 < found.warm
+    assert 0 < found.warm_steps <= found.cold_steps
+    assert found.memory > 1e8
+
+
+def test_an_unknown_array_is_refused():
+    with pytest.raises(InputError, match="golom-15: not an array, did you mean 'golomb-15'"):
+        arrays.require_arrays(["paper", "golom-15"])
