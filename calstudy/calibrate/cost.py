@@ -13,7 +13,6 @@ from calstudy.calibrate.settings import (
     GainFit,
     GaussNewtonSettings,
     LbfgsSettings,
-    Solver,
 )
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
@@ -32,8 +31,13 @@ EXTRA_RANK = 14
 # Vectors of a basis beyond its time-bandwidth product, for the default eigenvalue cutoff.
 EXTRA_VECTORS = 14
 PAPER_SAMPLES = 630 * 384
-# Seconds of one core for the paper's samples. Gauss-Newton: a first solve, and one from the solution before.
-COLD_SECONDS, WARM_SECONDS = 1.5, 0.2
+# Seconds of one core for the paper's samples. Gauss-Newton: a first solve, and one from the solution before with the
+# sky model as foregrounds, and with foregrounds that are free or have a finite prior, at some tolerance. Free ones take
+# more the lower the tolerance, 0.4 s at 1e-3 and 6 s at 1e-5; those with a prior the wider it is: 0.4 s at 0.1, 5 at 1.
+COLD_SECONDS = 1.5
+FROZEN_SECONDS, FREE_SECONDS, FINITE_SECONDS = 0.1, 0.4, 0.4
+FREE_TOLERANCE, FREE_POWER = 1e-3, -0.6
+FINITE_DEVIATION = 0.1
 # Compilation, which pieces with the same baselines in one process share.
 START_SECONDS = 3.0
 # A step, and how many it takes to the minimum.
@@ -181,16 +185,29 @@ def solve_cost(settings: GainFit, size: Size) -> Cost:
     """
     together = settings.integrations_per_solve
     solves = size.times * size.polarizations / together
-    seconds = _seconds(settings.solver, solves, size.baselines * size.channels.count * together)
+    seconds = _seconds(settings, solves, size.baselines * size.channels.count * together)
     return Cost(seconds, solve_memory(dimensions_of(size, settings), settings))
 
 
-def _seconds(solver: Solver, solves: float, samples: int) -> float:
-    work = samples / PAPER_SAMPLES
+def _seconds(settings: GainFit, solves: float, samples: int) -> float:
+    work, solver = samples / PAPER_SAMPLES, settings.solver
     if isinstance(solver, GaussNewtonSettings):
         warm = max(solves - 1, 0) if solver.warm_start else 0
+        seconds = _warm_seconds(settings, solver.tolerance)
         # Cost of the normal matrices, baselines x channels x vectors^2, dominates.
-        return START_SECONDS + ((solves - warm) * COLD_SECONDS + warm * WARM_SECONDS) * work
+        return START_SECONDS + ((solves - warm) * max(COLD_SECONDS, seconds) + warm * seconds) * work
     if isinstance(solver, LbfgsSettings):
         return 6 + LBFGS_STEP * work * solves * min(LBFGS_STEPS, solver.max_steps)
     return 6 + FIRST_ORDER_STEP * work * solves * solver.max_steps
+
+
+def _warm_seconds(settings: GainFit, tolerance: float) -> float:
+    """Return the seconds of a Gauss-Newton solve of the paper's samples from the solution of the integration before."""
+    if not isinstance(settings, ForegroundFit) or settings.frozen:
+        return FROZEN_SECONDS
+    prior = settings.foreground_prior
+    if prior.finite:
+        widest = max(float(prior.deviation), float(prior.shared_deviation))
+        return FINITE_SECONDS * max(1.0, widest / FINITE_DEVIATION)
+    # No solve takes more than some hundred steps.
+    return FREE_SECONDS * max(1.0, (max(tolerance, 1e-6) / FREE_TOLERANCE) ** FREE_POWER)
