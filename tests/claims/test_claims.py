@@ -21,7 +21,8 @@ from calstudy.verdicts.tables import from_json
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 PAPER = PAPERS.make("calamity2022")
 LOW_SNR_FACTS = {"corruption": {"effects": [{"kind": "reflection-gains"}], "noise": {"kind": "times-foregrounds"}}}
-ADAMAX = {"calibration": {"solver": {"name": "adamax"}}}
+AUTHORS = {"name": "adamax", "learning_rate": 0.01, "tolerance": 0.0, "max_steps": 10_000, "keep": "last"}
+ADAMAX = {"calibration": {"solver": AUTHORS}}
 GROUPS = {"calibration": {"calibrator": "calamity-redundant"}}
 
 
@@ -356,6 +357,16 @@ def test_what_is_not_the_papers_study_plays_no_role_of_it(tmp_path, changes, rea
             "paper_solver",
             {"calibration.solver": {"name": "adamax", "learning_rate": 0.1}},
             "calibration.solver is not the paper's",
+        ),
+        *(
+            ("paper_solver", {"calibration.solver": AUTHORS | change}, f"calibration.solver.{reason}")
+            for change, reason in (
+                ({"keep": "best"}, "keep is 'best', not the paper's 'last'"),
+                ({"precision": "double"}, "precision is 'double'"),
+                ({"warm_start": True}, "warm_start is True"),
+                ({"max_steps": 2000}, "max_steps is 2000"),
+                ({"tolerance": 1e-14}, "tolerance is 1e-14: it takes a fixed number of steps"),
+            )
         ),
         ("run_time", {}, "an experiment measures no run times"),
     ],

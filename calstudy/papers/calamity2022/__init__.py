@@ -25,7 +25,7 @@ EOR_LEVEL = -40.0
 NOISE_FACTORS = {"times-eor": 10.0, "times-foregrounds": 0.1}
 SAME_NOISE = 0.1
 """A run of fewer integrations has the paper's noise if, averaged over all of them, it is that close to the paper's."""
-PAPER_RATE = 0.01
+PAPER_RATE, PAPER_STEPS = 0.01, 10_000
 LEAST_STEPS = 1000
 """First-order steps below which foregrounds are hardly fitted: the paper's solver takes thousands."""
 NOT_THE_METHOD = ("calibrator", "solver", "chunks", "models_at_once")
@@ -182,8 +182,19 @@ def _too_few_steps(role: str, experiment: Experiment) -> str | None:
 
 
 def _other_solver(experiment: Experiment) -> str | None:
+    """Return what is not as in the authors' code: fixed rate, last gains, and its steps or its rule to stop."""
     solver = _solver(experiment)
     papers = ("adamax", PAPER_RATE, "constant")
     if not isinstance(solver, FirstOrderSettings) or (solver.name, solver.learning_rate, solver.schedule) != papers:
         return f"calibration.solver is not the paper's (adamax at a constant rate of {PAPER_RATE})"
+    for name, wanted in (("keep", "last"), ("precision", "single"), ("warm_start", False)):
+        if getattr(solver, name) != wanted:
+            return f"calibration.solver.{name} is {getattr(solver, name)!r}, not the paper's {wanted!r}"
+    if solver.max_steps < PAPER_STEPS:
+        return f"calibration.solver.max_steps is {solver.max_steps}, not the paper's {PAPER_STEPS}"
+    if solver.stop != "published" and solver.tolerance > 0:
+        return (
+            f"calibration.solver.tolerance is {solver.tolerance:g}: it takes a fixed number of steps (0), or the "
+            "paper's rule (stop: published)"
+        )
     return None
