@@ -140,7 +140,7 @@ def _write(job: Job, found: Evaluation) -> dict[str, Any]:
     return {"verdicts": tally(found.verdicts), "failed": failed, "without_role": list(found.without_role)}
 
 
-EVALUATE = Stage(name="claims", version=9, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
+EVALUATE = Stage(name="claims", version=10, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
 EVALUATE_RUN_TIMES = Stage(
     name="runtime-claims", version=3, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
 )
