@@ -38,8 +38,8 @@ COLD_SECONDS = 1.5
 FROZEN_SECONDS, FREE_SECONDS, FINITE_SECONDS = 0.1, 0.4, 0.4
 FREE_TOLERANCE, FREE_POWER = 1e-3, -0.6
 FINITE_DEVIATION = 0.1
-# Compilation, which pieces with the same baselines in one process share.
-START_SECONDS = 3.0
+# Compilation takes 3 s and more; pieces with the same baselines in one process share it, so that most have none.
+START_SECONDS = 1.5
 # A step, and how many it takes to the minimum.
 LBFGS_STEP, LBFGS_STEPS = 0.06, 180
 FIRST_ORDER_STEP = 4e-3
