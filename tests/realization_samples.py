@@ -13,6 +13,8 @@ INPUT = 5000.0
 NOISE, SAMPLE = 0.06, 0.04
 """sigma_N and sigma_S of a bin, in units of the input power."""
 LOSS = np.linspace(0.6, 0.95, BINS)
+MODES = 100
+"""Of a bin, over which the product of noise and EoR is averaged."""
 
 
 def design_of(*blocks: tuple[tuple[str, ...], int]) -> Design:
@@ -40,7 +42,8 @@ def spectrum(power: np.ndarray, noise: float = 0.0, sample: float = 0.0) -> Sphe
 
 
 def transfer_function(values: np.ndarray, error: float) -> TransferFunction:
-    known = {"transfer": values, "bin_edges": 0.04 * np.arange(BINS + 1)}
+    """Return T and C with the same errors; C = T, as of a projection."""
+    known = {"transfer": values, "cross_transfer": values, "bin_edges": 0.04 * np.arange(BINS + 1)}
     return TransferFunction(
         **{
             item.name: known.get(item.name, np.full(BINS, error) if item.name.endswith("_error") else np.ones(BINS))
@@ -52,18 +55,24 @@ def transfer_function(values: np.ndarray, error: float) -> TransferFunction:
 def draw(design: Design, random: np.random.Generator, loss: np.ndarray = LOSS, scatter: float = 0.01) -> list[Sample]:
     """Draw what realizations measure: T with a part of its scatter from the sky, a part from gains and noise.
 
-    Noise and its product with the EoR pass through the calibration like the EoR, and lose a factor T.
+    Noise and its product with the EoR pass through the calibration like the EoR, and lose a factor T. The product is
+    the mean over modes of noise times EoR, another one for every pair of draws.
     """
-    difference = np.sqrt(NOISE**2 + np.sqrt(2) * NOISE * SAMPLE)
+    cross = np.sqrt(np.sqrt(2) * NOISE * SAMPLE / MODES)
     noises: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     skies: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    modes: dict[tuple[str, int], np.ndarray] = {}
     samples = []
     for draws in design.draws:
+        product = np.prod(
+            [modes.setdefault((part, draws[part]), random.standard_normal((MODES, BINS))) for part in ("eor", "noise")],
+            axis=0,
+        ).sum(axis=0)
         noise = noises.setdefault(draws["noise"], tuple(random.standard_normal((2, BINS))))
         sky = skies.setdefault(draws["eor"], tuple(random.standard_normal((2, BINS))))
         eor = INPUT * (1 + SAMPLE * sky[0])
         transfer = loss * (1 + scatter * (sky[1] + noise[1]))
-        residual = transfer * (eor + INPUT * difference * noise[0])
+        residual = transfer * (eor + INPUT * (NOISE * noise[0] + cross * product))
         samples.append(
             Sample(
                 residual=spectrum(residual, NOISE * INPUT, SAMPLE * INPUT),

@@ -246,7 +246,7 @@ def draw(job: Job) -> Mapping[str, Any]:
     return {"caption": shown.caption, **drawing.notes}
 
 
-DRAW = Stage(name="figure", version=3, make=draw, cost=lambda task: Cost(3, disk=1e6))
+DRAW = Stage(name="figure", version=4, make=draw, cost=lambda task: Cost(3, disk=1e6))
 
 
 def comparison_task(graphs: Mapping[str, Graph], figure: ComparisonFigure, stand_ins: Sequence[str]) -> Task:

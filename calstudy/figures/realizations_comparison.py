@@ -22,7 +22,8 @@ from calstudy.verdicts.tolerances import Measured
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from calstudy.power.realizations import Pooled, PooledRegion
+    from calstudy.power.blocks import Pooled
+    from calstudy.power.realizations import PooledRegion
 
 REGION = "outside-wedge"
 SERIES = (("o", style.BLUE), ("s", style.ORANGE))
@@ -109,14 +110,13 @@ class RealizationsComparison(ComparisonFigure):
 
 def _differences(first: PooledRegion, second: PooledRegion) -> dict[str, Pooled]:
     """Return the difference of every quantity, realization by realization, pooled over all blocks."""
-    from calstudy.power.realizations import pool, together
+    from calstudy.power.blocks import together
 
     found = {}
     for name in first.values:
         values = first.values[name] - second.values[name]
         quoted = np.hypot(first.quoted[name], second.quoted[name])
-        rows = [list(places) for _, places in first.design.blocks]
-        found[name] = together([pool(values[row], quoted[row]) for row in rows], values[0])
+        found[name] = together(values, quoted, [places for _, places in first.design.blocks])
     return found
 
 

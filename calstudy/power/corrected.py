@@ -8,14 +8,19 @@ its power, and hardly depends on it. T_r differs from that mean by
     sigma_T^2 = sum_b s_b^2 sum_g w_g^2
 
 (`calstudy.power.realizations` has the blocks b of what is drawn), where g are the draws of block b, w = 1 for the draw
-of r, less the share that each draw has in the mean. s_b^2 is the scatter of the other realizations. Noise and EoR pass
-through the same projection, which reduces the noise in P^R by about T as well; dividing by T restores it to that of the
-data. So with P = P^R / T,
+of r, less the share that each draw has in the mean. s_b^2 is the scatter of the other realizations. What depends on
+several blocks together is in each of their s_b^2, and so makes sigma_T too large rather than too small.
+
+Noise and EoR pass through the same projection, which reduces the noise in P^R by about T as well; dividing by T
+restores it to that of the data. So with P = P^R / T,
 
     sigma^2 (P - P^S) = sigma_{R-S}^2 + (P sigma_T / T)^2,
 
 where sigma_{R-S} is the error of P^R - P^S, of noise and its product with the EoR
 (`SphericalSpectrum.difference_error`); P less the input power has the sample variance sigma_S^2 besides.
+
+There is no result where too little of the EoR is left, or where what is left is power from elsewhere
+(`calstudy.power.correctable`).
 """
 
 from __future__ import annotations
@@ -25,15 +30,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from calstudy.power.correctable import correctable, why_not
 from calstudy.power.realizations import TRANSFER_QUANTITIES, Design, Sample
-
-LEAST_SIGNIFICANCE = 5.0
-"""P^R is divided by T where T is above so many times its error, as in `calstudy.power.transfer.correct`."""
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """P^R / T of K realizations in Nk bins, T of other realizations; NaN where T is too small to divide by.
+    """P^R / T of K realizations in Nk bins, T of other realizations; NaN where `correctable` forbids it.
 
     Attributes
     ----------
@@ -89,15 +92,13 @@ def transfer_of_others(values: np.ndarray, design: Design) -> tuple[np.ndarray, 
 def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected:
     """Divide P^R of every realization by T of others; every sample must have a transfer function.
 
-    Where T is not above `LEAST_SIGNIFICANCE` times its error, by scatter or as quoted, whichever is larger, there is no
-    result.
+    Where T and C of the others do not allow it (`calstudy.power.correctable`), there is no result. Their errors are
+    those by scatter, or those that are quoted, whichever are larger.
     """
-    transfer = TRANSFER_QUANTITIES["transfer"]
-    values = np.stack([transfer.value(sample) for sample in samples])
-    quoted = np.stack([transfer.error(sample) for sample in samples])
-    mean, error = transfer_of_others(values, design)
-    largest = np.fmax(error, np.sqrt(np.mean(quoted**2, axis=0)))
-    known = np.isfinite(error) & (mean > LEAST_SIGNIFICANCE * largest)
+    mean, error, largest = _of_others("transfer", samples, design)
+    cross, _, cross_error = _of_others("cross_transfer", samples, design)
+    judged = (mean, largest, cross, cross_error)
+    known = np.isfinite(error) & correctable(*judged)
     factor = np.where(known, mean, np.nan)
     power = np.stack([sample.residual.power.real for sample in samples]) / factor
     scale, scale_free = (
@@ -118,15 +119,32 @@ def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected
         shared=np.array(
             [max(design.shared(item, other) for other in design.others(item)) for item in range(len(samples))]
         ),
-        reasons=np.array([_reason(*column) for column in zip(known.T, mean.T, largest.T, error.T, strict=True)]),
+        reasons=np.array([_reason(*column) for column in zip(known.T, error.T, np.stack(judged).T, strict=True)]),
     )
 
 
-def _reason(known: np.ndarray, mean: np.ndarray, largest: np.ndarray, error: np.ndarray) -> str:
+def _of_others(name: str, samples: Sequence[Sample], design: Design) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `transfer_of_others` of T or C, and the larger of that error and the quoted one, (K, Nk) each."""
+    quantity = TRANSFER_QUANTITIES[name]
+    values, quoted = (np.stack([read(sample) for sample in samples]) for read in (quantity.value, quantity.error))
+    mean, error = transfer_of_others(values, design)
+    return mean, error, np.fmax(error, np.sqrt(np.mean(quoted**2, axis=0)))
+
+
+def _reason(known: np.ndarray, error: np.ndarray, judged: np.ndarray) -> str:
+    """Say why a bin is not corrected in any of K realizations, by the first of them with an error.
+
+    Parameters
+    ----------
+    known, error
+        Where it is corrected, and the error of T by scatter, (K,).
+    judged
+        T, C and their errors, as `why_not` takes them, (K, 4).
+    """
     if known.any():
         return ""
-    if np.isnan(mean).all():
+    if np.isnan(judged[:, 0]).all():
         return "no modes"
     if np.isnan(error).all():
         return "too few realizations for an error of T"
-    return f"T = {np.nanmean(mean):.2f} is not above {LEAST_SIGNIFICANCE:g} times its error, {np.nanmean(largest):.2g}"
+    return why_not(*judged[np.isfinite(error)][0])

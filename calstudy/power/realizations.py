@@ -1,18 +1,4 @@
-r"""Pool what many realizations measured: mean, scatter and covariance between bins, and coverage of error bars.
-
-A study draws its parts (EoR, gains, noise) again in blocks, each block its own parts, and the first realization is in
-every block. To first order a measured quantity is then
-
-    x = mu + sum_b d_b,
-
-where d_b depends on the draw of block b alone. The variance of d_b is the scatter s_b^2 within block b of K_b
-realizations, and for several blocks
-
-    mu = sum_b mean_b - (B - 1) x_0,   scatter^2 = sum_b s_b^2,   error of mu^2 = sum_b s_b^2 / K_b,
-
-with x_0 of the realization that all B blocks have in common, whose d_b cancels. This scatter and this error include
-everything that was drawn.
-"""
+"""What many realizations measured: quantities, their means and scatter (`calstudy.power.blocks`), and coverage."""
 
 from __future__ import annotations
 
@@ -21,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calstudy.power.blocks import Pooled, pool, together
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.transfer import TransferFunction
 from calstudy.verdicts.criterion import Finding
@@ -122,73 +109,6 @@ TRANSFER_QUANTITIES = {
 
 
 @dataclass(frozen=True)
-class Pooled:
-    """One quantity over the realizations of one block, or of all blocks, in Nk bins.
-
-    Attributes
-    ----------
-    mean, scatter, error
-        Mean, standard deviation of one realization, and standard error of the mean, (Nk,).
-    quoted
-        rms of the errors that the realizations quote, (Nk,).
-    covariance
-        Of one realization, between bins, (Nk, Nk). Its rank is below the number of realizations.
-    """
-
-    mean: np.ndarray
-    scatter: np.ndarray
-    error: np.ndarray
-    quoted: np.ndarray
-    covariance: np.ndarray
-
-    @property
-    def correlation(self) -> np.ndarray:
-        """Covariance over the product of the standard deviations, (Nk, Nk); NaN without scatter."""
-        return _pull(self.covariance, np.outer(self.scatter, self.scatter))
-
-
-def pool(values: np.ndarray, quoted: np.ndarray) -> Pooled:
-    """Pool one quantity over K realizations.
-
-    Parameters
-    ----------
-    values, quoted
-        Of each realization and its quoted error, (K, Nk).
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two realizations.
-    """
-    if len(values) < 2:
-        raise ValueError(f"{len(values)} realization to pool, expected at least two")
-    deviations = values - values.mean(axis=0)
-    covariance = deviations.T @ deviations / (len(values) - 1)
-    scatter = np.sqrt(np.diagonal(covariance))
-    rms = np.sqrt(np.mean(quoted**2, axis=0))
-    return Pooled(values.mean(axis=0), scatter, scatter / np.sqrt(len(values)), rms, covariance)
-
-
-def together(blocks: Sequence[Pooled], common: np.ndarray) -> Pooled:
-    """Return what blocks that draw different parts say together.
-
-    Parameters
-    ----------
-    blocks
-        The quantity, pooled over each block.
-    common
-        Its value in the realization that all blocks have in common, (Nk,).
-    """
-    return Pooled(
-        mean=np.sum([block.mean for block in blocks], axis=0) - (len(blocks) - 1) * common,
-        scatter=np.sqrt(np.sum([block.scatter**2 for block in blocks], axis=0)),
-        error=np.sqrt(np.sum([block.error**2 for block in blocks], axis=0)),
-        quoted=np.sqrt(np.mean([block.quoted**2 for block in blocks], axis=0)),
-        covariance=np.sum([block.covariance for block in blocks], axis=0),
-    )
-
-
-@dataclass(frozen=True)
 class Design:
     """Which realization has which draws.
 
@@ -280,7 +200,7 @@ def pool_region(samples: Sequence[Sample], design: Design) -> PooledRegion:
             quoted[name] = np.stack([quantity.error(sample) for sample in samples])
             rows = [list(places) for _, places in design.blocks]
             blocks[name] = tuple(pool(values[name][row], quoted[name][row]) for row in rows)
-            total[name] = together(blocks[name], values[name][0])
+            total[name] = together(values[name], quoted[name], rows)
     return PooledRegion(first.k, first.bin_edges, design, values, quoted, blocks, total)
 
 
@@ -330,8 +250,7 @@ def mean_over_bins(values: np.ndarray, design: Design) -> Finding:
     if not known.any():
         return Finding(np.nan, np.nan)
     each = values[:, known].mean(axis=1, keepdims=True)
-    pooled = [pool(each[list(places)], np.zeros((len(places), 1))) for _, places in design.blocks]
-    found = together(pooled, each[0])
+    found = together(each, np.zeros(each.shape), [places for _, places in design.blocks])
     return Finding(float(found.mean[0]), float(found.error[0]))
 
 

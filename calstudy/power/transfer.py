@@ -56,6 +56,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, clusters_in_k, linear_error
+from calstudy.power.correctable import correctable
 from calstudy.power.delay import horizon_delay
 
 if TYPE_CHECKING:
@@ -370,8 +371,8 @@ def _sum_present(values: np.ndarray) -> np.ndarray:
 def correct(spectrum: SphericalSpectrum, transfer: TransferFunction) -> tuple[np.ndarray, np.ndarray]:
     """Return P^R / T and its standard deviation, (Nk,) each, in the unit of the spectrum.
 
-    Errors of P^R and T are independent: (sigma / P)^2 adds. NaN where T is not above five times its error, for there is
-    nothing left to be corrected there.
+    Errors of P^R and T are independent: (sigma / P)^2 adds. NaN where too little is left to be corrected, or what is
+    left is not the EoR at this k (`calstudy.power.correctable`).
 
     Raises
     ------
@@ -380,7 +381,9 @@ def correct(spectrum: SphericalSpectrum, transfer: TransferFunction) -> tuple[np
     """
     if not np.array_equal(spectrum.bin_edges, transfer.bin_edges):
         raise ValueError("spectrum and transfer function have different bins, expected the same")
-    known = transfer.transfer > 5 * transfer.transfer_error
+    known = correctable(
+        transfer.transfer, transfer.transfer_error, transfer.cross_transfer, transfer.cross_transfer_error
+    )
     factor = np.where(known, transfer.transfer, np.nan)
     power = spectrum.power.real / factor
     error = np.hypot(spectrum.error, power * transfer.transfer_error) / factor

@@ -303,5 +303,5 @@ SIMULATE_EOR = Stage(name="observed-eor", version=1, make=simulate_eor, cost=_co
 SET_LEVEL = Stage(name="observed-level", version=1, make=set_level, cost=_cost_of_average)
 INJECT = Stage(name="inject", version=1, make=inject, cost=_cost_of_data)
 AVERAGE_EOR = Stage(name="observed-eor-average", version=1, make=average_eor, cost=_cost_of_average)
-OBSERVED_TRANSFER = Stage(name="observed-transfer", version=1, make=measure, cost=lambda task: Cost(4, disk=1e6))
+OBSERVED_TRANSFER = Stage(name="observed-transfer", version=2, make=measure, cost=lambda task: Cost(4, disk=1e6))
 EXPECT = Stage(name="observed-expected-loss", version=1, make=expect, cost=_cost_of_expectation)

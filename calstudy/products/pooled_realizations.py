@@ -97,8 +97,9 @@ def _markdown(results: Mapping[str, RegionResults], verdicts: Sequence[Verdict],
     summary = (
         f"{drawn}. The first realization, the experiment itself, is in every block. {tally(verdicts)}.\n\n"
         "Numbers with ± have their standard error over all that was drawn. Scatter is the standard deviation of one "
-        "bin of one realization. Coverage is that of the block that draws the noise (for P^S) or the EoR (for the "
-        "input). P^R0 is P^R of data without the EoR."
+        "bin of one realization, by all that was drawn; what depends on the draws of several blocks counts once. "
+        "Coverage is that of the block that draws the noise (for P^S) or the EoR (for the input). P^R0 is P^R of data "
+        "without the EoR."
     )
     text = [to_markdown(verdicts, f"Realizations: {settings['title']}", ("criterion", "wanted"), summary)]
     for region, found in results.items():
@@ -147,9 +148,10 @@ def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> 
         ]
         total = found.total["transfer"]
         squares = np.array([ratio.value**2 for ratio in ratios])
-        # The scatters of blocks add up in squares; so do their parts of the ratio's error.
-        ratio = float(np.sqrt(squares.sum()))
-        error = float(np.sqrt(sum((item.value * item.uncertainty) ** 2 for item in ratios)) / ratio)
+        # The scatters of blocks add up in squares, less what is in several; so do their parts of the ratio's error.
+        counted = 1 - total.counted_twice
+        ratio = float(np.sqrt(counted * squares.sum()))
+        error = counted * float(np.sqrt(sum((item.value * item.uncertainty) ** 2 for item in ratios)) / ratio)
         rows.append(
             (
                 name,
@@ -215,9 +217,9 @@ def _of_other_realizations(corrected: Corrected) -> str:
     same = "; the others by T of realizations some of which share a part, the EoR where gains and noise are drawn"
     return (
         f"P^R / T, T of other realizations: {np.sum(shared == 0)} of {shared.size} realizations are corrected by T of "
-        f"other EoR, gains and noise{same if (shared > 0).any() else ''}. Where T is not above five times its error, "
-        "there is no result; realizations.csv says why."
+        f"other EoR, gains and noise{same if (shared > 0).any() else ''}. There is no result where T or C is not above "
+        "five times its error, or C is not above half of T; realizations.csv says why."
     )
 
 
-POOL = Stage(name="pooled-realizations", version=2, make=make_tables, cost=lambda task: Cost(5, disk=1e6))
+POOL = Stage(name="pooled-realizations", version=3, make=make_tables, cost=lambda task: Cost(5, disk=1e6))

@@ -183,6 +183,8 @@ def write_corrected(folder: Path, residual: SphericalSpectrum, signal: Spherical
             f"residual error {unit}": residual.error,
             "transfer": found.transfer,
             "transfer error": found.transfer_error,
+            "cross transfer": found.cross_transfer,
+            "cross transfer error": found.cross_transfer_error,
             f"corrected {unit}": power,
             f"corrected error {unit}": error,
             f"eor {unit}": signal.power.real,
@@ -201,4 +203,4 @@ def _cost_of_flux_scale(task: Task) -> Cost:
 
 DIFFERENCE = Stage(name="difference", version=2, make=difference, cost=_cost_of_difference)
 FLUX_SCALE = Stage(name="flux-scale", version=1, make=measure_flux_scale, cost=_cost_of_flux_scale)
-TRANSFER_STAGE = Stage(name="transfer", version=3, make=measure, cost=lambda task: Cost(1, disk=1e6))
+TRANSFER_STAGE = Stage(name="transfer", version=4, make=measure, cost=lambda task: Cost(1, disk=1e6))

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 from realization_samples import BINS, INPUT, LOSS, design_of, draw, transfer_function
 
+from calstudy.power.blocks import pool, together
 from calstudy.power.corrected import correct_realizations, transfer_of_others
-from calstudy.power.realizations import (
-    coverage,
-    error_ratio,
-    inside_bars,
-    mean_over_bins,
-    pool,
-    pool_region,
-    together,
-)
+from calstudy.power.realizations import coverage, error_ratio, inside_bars, mean_over_bins, pool_region
 
 EVERYTHING = design_of((("eor", "gains", "noise"), 8))
 TWO_BLOCKS = design_of((("gains", "noise"), 7), (("eor",), 6))
@@ -39,22 +32,91 @@ def test_pooling_finds_mean_scatter_and_covariance(random):
     assert found.correlation[0, 1] == pytest.approx(0.6 / np.sqrt(2), abs=0.03)
 
 
-def test_two_blocks_together_have_the_scatter_and_the_error_of_everything_that_was_drawn(random):
-    """x = 1 + a + b, a drawn in one block and b in the other, both fixed at their first draw elsewhere."""
-    errors, deviations, scatters = [], [], []
-    for _ in range(3000):
-        a, b = 0.3 * random.standard_normal(5), 0.2 * random.standard_normal(4)
-        blocks = [pool((1 + values)[:, None], np.ones((values.size, 1))) for values in (a + b[0], b + a[0])]
-        found = together(blocks, np.array([1 + a[0] + b[0]]))
-        deviations.append(found.mean[0] - 1)
-        errors.append(found.error[0] ** 2)
-        scatters.append(found.scatter[0] ** 2)
-    expected = 0.3**2 / 5 + 0.2**2 / 4
-    assert np.mean(deviations) == pytest.approx(0, abs=4 * np.sqrt(expected / 3000))
-    # 3000 draws of few degrees of freedom: 2 to 3 per cent.
-    assert np.var(deviations) == pytest.approx(expected, rel=0.12)
-    assert np.mean(errors) == pytest.approx(expected, rel=0.06)
-    assert np.mean(scatters) == pytest.approx(0.3**2 + 0.2**2, rel=0.06)
+def draw_terms(shape: tuple[int, ...], variances: dict[tuple[int, ...], float], random: np.random.Generator):
+    """Return x = 1 + sum_S f_S of the realizations of blocks that share the first one, and which belong to each block.
+
+    Parameters
+    ----------
+    shape
+        Draws of each block, then bins.
+    variances
+        Of f_S, by the blocks in S.
+    """
+    *counts, bins = shape
+    numbers = [tuple(0 for _ in counts)]
+    members = []
+    for block, count in enumerate(counts):
+        members.append([0, *range(len(numbers), len(numbers) + count - 1)])
+        numbers += [tuple(draw if place == block else 0 for place in range(len(counts))) for draw in range(1, count)]
+    values = np.ones((len(numbers), bins))
+    for blocks, variance in variances.items():
+        drawn: dict[tuple[int, ...], np.ndarray] = {}
+        for row, number in enumerate(numbers):
+            draws = tuple(number[block] for block in blocks)
+            values[row] += drawn.setdefault(draws, np.sqrt(variance) * random.standard_normal(bins))
+    return values, members
+
+
+TERMS = {
+    "sum": ((10, 4), {(0,): 1.0, (1,): 1.0}),
+    "product": ((10, 4), {(0, 1): 1.0}),
+    "both": ((10, 4), {(0,): 0.2, (1,): 0.5, (0, 1): 1.0}),
+    "one block has all": ((10, 4), {(0,): 1.0}),
+    "product of three": ((6, 5, 4), {(0, 1, 2): 1.0, (1,): 0.5}),
+}
+
+
+@pytest.mark.parametrize(("shape", "variances"), TERMS.values(), ids=TERMS)
+def test_blocks_together_have_the_error_and_the_scatter_of_what_was_drawn_in_sum_and_product(shape, variances, random):
+    """A product of ten and four draws had an error of 0.59 by sum_b s_b^2 / K_b; its mean was off by 0.84."""
+    found = []
+    for _ in range(300):
+        values, members = draw_terms((*shape, 60), variances, random)
+        found.append(together(values, np.ones(values.shape), members))
+    deviations = np.array([item.mean - 1 for item in found])
+    squares = np.mean([item.error**2 for item in found])
+    # 18,000 trials, and s^2 from three degrees of freedom or more in each: a per cent.
+    assert deviations.mean() == pytest.approx(0, abs=4 * np.sqrt(squares / deviations.size))
+    assert deviations.var() == pytest.approx(squares, rel=0.04)
+    # What is counted twice is known to 0.1 from sixty bins, and cut at its limits: this moves the mean by up to 0.05.
+    assert np.mean([item.scatter**2 for item in found]) == pytest.approx(sum(variances.values()), rel=0.12)
+    assert found[0].covariance.shape == (60, 60)
+    assert np.linalg.eigvalsh(found[0].covariance).min() > -1e-9
+
+
+def test_products_of_two_of_three_blocks_are_not_taken_for_less(random):
+    """Their error and scatter are too large, by sqrt(0.507 / 0.174) = 1.7 and sqrt(4/3)."""
+    deviations, squares, scatters = [], [], []
+    for _ in range(300):
+        values, members = draw_terms((6, 5, 4, 60), {(0, 1): 1.0}, random)
+        found = together(values, np.ones(values.shape), members)
+        deviations.append(found.mean - 1)
+        squares.append(found.error**2)
+        scatters.append(found.scatter**2)
+    assert np.mean(squares) / np.var(deviations) == pytest.approx(0.507 / 0.174, rel=0.06)
+    assert np.mean(scatters) == pytest.approx(4 / 3, rel=0.08)
+
+
+def test_one_block_has_mean_and_error_of_its_realizations(random):
+    values = random.standard_normal((7, BINS))
+    found, alone = together(values, values, [range(7)]), pool(values, values)
+    for name in ("mean", "scatter", "error", "quoted", "covariance"):
+        assert getattr(found, name) == pytest.approx(getattr(alone, name))
+
+
+def test_bars_of_the_right_size_have_pulls_that_scatter_by_one_with_an_error_that_is_right(random):
+    """Half of the variance of (P^R - P^S) / sigma is the product of noise and EoR, which every block draws again."""
+    design = design_of((("gains", "noise"), 10), (("eor",), 4))
+    scatters, means = [], []
+    for _ in range(150):
+        pooled = pool_region(draw(design, random, np.ones(BINS), 0.0), design)
+        scatters.append(np.mean(pooled.total["pull_eor"].scatter ** 2))
+        means.append(mean_over_bins(pooled.values["pull_eor"], design))
+    values, errors = np.transpose(means)
+    # What is counted twice is known to 0.15 from twenty bins. With it the variance is 1.49.
+    assert np.mean(scatters) == pytest.approx(1, abs=0.12)
+    # An error of an error from 150 trials: 6 per cent. That of a model without interaction is 25 per cent too small.
+    assert values.std() == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.15)
 
 
 @pytest.mark.parametrize("design", [EVERYTHING, TWO_BLOCKS], ids=["one block", "two blocks"])
@@ -170,6 +232,23 @@ def test_where_t_is_too_small_there_is_a_reason_and_no_number(random):
         assert np.isnan(array[:, :5]).all()
         assert np.isfinite(array[:, 5:]).all()
     assert corrected.reasons[0] == "T = 0.01 is not above 5 times its error, 0.02"
+    assert set(corrected.reasons[5:]) == {""}
+
+
+def test_where_what_is_left_is_not_the_eor_there_is_a_reason_and_no_number(random):
+    """T of 0.6 and more is ten times its error everywhere; C is nothing in two bins, and a fifth of T in three."""
+    samples = draw(EVERYTHING, random)
+    part = np.where(np.arange(BINS) < 2, 0.0, np.where(np.arange(BINS) < 5, 0.2, 1.0))
+    others = [
+        replace(sample, transfer=replace(sample.transfer, cross_transfer=part * sample.transfer.transfer))
+        for sample in samples
+    ]
+    corrected = correct_realizations(others, EVERYTHING)
+    for array in (corrected.power, corrected.error, corrected.error_with_sample, corrected.power_known_scale):
+        assert np.isnan(array[:, :5]).all()
+        assert np.isfinite(array[:, 5:]).all()
+    assert corrected.reasons[0].startswith("C = 0 is not above 5 times its error, 0.014: ")
+    assert "is not above 0.5 T, T = 0.6" in corrected.reasons[4]
     assert set(corrected.reasons[5:]) == {""}
 
 

@@ -227,8 +227,9 @@ def spectrum(power: list[float], error: float, edges: np.ndarray) -> SphericalSp
 def test_corrected_power_is_unbiased_with_both_errors_and_unknown_where_all_is_lost():
     edges = np.array([0.0, 1.0, 2.0, 3.0])
     ones = np.ones(3)
+    kept = np.array([0.5, 1.0, 0.01])
     transfer = TransferFunction(
-        (edges[1:] + edges[:-1]) / 2, edges, np.array([0.5, 1.0, 0.01]), 0.01 * ones, *(8 * [ones]), 1.0
+        (edges[1:] + edges[:-1]) / 2, edges, kept, 0.01 * ones, kept, 0.01 * ones, *(6 * [ones]), 1.0
     )
     power, error = correct(spectrum([50.0, 100.0, 1.0], 3.0, edges), transfer)
     assert power[:2] == pytest.approx([100.0, 100.0])
@@ -236,6 +237,56 @@ def test_corrected_power_is_unbiased_with_both_errors_and_unknown_where_all_is_l
     assert np.isnan([power[2], error[2]]).all()
     with pytest.raises(ValueError, match="different bins"):
         correct(spectrum([1.0], 1.0, edges[:2]), transfer)
+
+
+def low_delays_fitted(spectra: np.ndarray, weights: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """Subtract the fit of each baseline's delays up to its edge (Nbls,), with weights (Nbls, Nfreqs)."""
+    left = spectra.copy()
+    modes = np.fft.ifft(np.eye(CHANNELS), axis=0)
+    for row, (one, weight, limit) in enumerate(zip(spectra, weights, edge, strict=True)):
+        basis = modes[:, np.abs(np.fft.fftfreq(CHANNELS, WIDTH)) <= limit]
+        weighted = weight[:, None] * basis
+        left[row] -= basis @ np.linalg.solve(basis.conj().T @ weighted, weighted.conj().T @ one)
+    return left
+
+
+def test_power_that_leaked_from_other_delays_is_not_taken_for_the_eor(rng):
+    """Foregrounds are fitted with weights that gains of 20 % make uneven: EoR beyond the wedge leaks into it.
+
+    T is 0.12 there and known to 8 %, but it is that of a flat power spectrum. One that falls as the square of the delay
+    has less to leak and more to be measured: P^R / T is sixty times too low.
+    """
+    edge = LENGTHS / 299792458.0 + BUFFER
+    weights = np.abs(1 + 0.2 * noise(rng)) ** 2
+    falling = 1 / np.maximum(np.abs(np.fft.fftfreq(CHANNELS, WIDTH)), 1 / WIDTH / CHANNELS)
+    transfers = {}
+    for name, shape in {"flat": np.ones(CHANNELS), "steep": falling}.items():
+        signal = np.fft.ifft(np.fft.fft(noise(rng), axis=1) * shape, axis=1)
+        left = low_delays_fitted(signal, weights, edge)
+        for inside in (True, False):
+            transfers[name, inside] = spherical_transfer(inject(signal, left, left), ONE_BIN, BUFFER, inside)
+    found = transfers["flat", True]
+    assert found.transfer > 5 * found.transfer_error
+    assert np.abs(found.cross_transfer) < 4 * found.cross_transfer_error
+    assert transfers["steep", True].transfer / found.transfer < 0.05
+    for inside, expected in ((True, np.nan), (False, 100.0)):
+        residual = 100.0 * transfers["steep", inside].transfer
+        power, error = correct(spectrum(residual, 1.0, np.array(ONE_BIN)), transfers["flat", inside])
+        # The fit changes no delay beyond the wedge.
+        assert power == pytest.approx([expected], nan_ok=True)
+        assert np.isfinite(error) == np.isfinite(expected)
+
+
+def test_a_leak_is_not_taken_for_the_eor_however_well_it_is_known():
+    """Of many pooled injections a C of a tenth of T is significant; the leak is nine tenths of T all the same."""
+    edges, ones = np.array([0.0, 1.0, 2.0]), np.ones(2)
+    transfer = TransferFunction(
+        (edges[1:] + edges[:-1]) / 2, edges, 0.1 * ones, 1e-4 * ones, np.array([0.01, 0.09]), 1e-4 * ones,
+        *(6 * [ones]), 1.0,
+    )  # fmt: skip
+    power, error = correct(spectrum([10.0, 10.0], 1.0, edges), transfer)
+    assert power == pytest.approx([np.nan, 100.0], nan_ok=True)
+    assert np.isfinite(error).tolist() == [False, True]
 
 
 def test_tables_read_back(tmp_path, rng):
