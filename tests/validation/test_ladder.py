@@ -76,7 +76,13 @@ def test_a_second_run_measures_nothing_and_finds_the_same(ladder):
     assert again.outcomes == ladder.outcomes
 
 
-@pytest.mark.slow
-def test_the_full_ladder_has_been_run_and_its_table_is_in_the_docs(tmp_path):
-    table = (Path(__file__).parents[2] / "docs" / "validation.md").read_text()
-    assert all(f"| {name} |" in table for name in STEPS)
+def test_the_table_in_the_docs_has_the_criteria_of_today():
+    lines = (Path(__file__).parents[2] / "docs" / "validation.md").read_text().splitlines()
+    steps = load_ladder()
+    for step in steps:
+        rows = [line for line in lines if line.startswith(f"| {step.name} |")]
+        written = [row.split(" | ")[-3] for row in rows]
+        assert written == [str(item.threshold) for item in step.criteria.values()], step.name
+    count = sum(len(step.criteria) for step in steps)
+    passed = sum(line.endswith("| PASS |") for line in lines)
+    assert f"{len(steps)} steps pass, {passed} of {count} criteria" in "\n".join(lines)
