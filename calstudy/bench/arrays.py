@@ -113,6 +113,11 @@ def time_array(name: str, integrations: int, device: str = "cpu") -> Timing:
         Solved one from the other, at least two.
     device
         ``cpu`` or ``gpu``.
+
+    Raises
+    ------
+    InputError
+        If the process fails, as where there is no such device.
     """
     request = {"name": name, "integrations": integrations, "device": device}
     return Timing(**run_module("calstudy.bench.arrays", request))

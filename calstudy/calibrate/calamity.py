@@ -110,12 +110,11 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
     for p in range(n_polarizations):
         warm: WarmStart | None = None
         for index, times in enumerate(groups):
-            diagnostics: dict[str, float]
+            diagnostics: dict[str, float] = {}
             with Usage() as usage:
                 problem = make_problem(prepared, settings, times, p)
                 if isinstance(problem, str):
                     solution = _skipped(repeat_structure(prepared.structure, times.stop - times.start), problem)
-                    diagnostics = {}
                 else:
                     solution, warm = _solve(problem, solver, warm if settings.solver.warm_start else None)
                     diagnostics = _diagnostics(solution, problem)
@@ -143,9 +142,11 @@ def _skipped(structure: FitStructure, message: str) -> Solution:
 
 def _diagnostics(solution: Solution, problem: CalibrationProblem) -> dict[str, float]:
     """Return what a solution tells of the scale and the band shape of g_a g_b*, as far as there is a sky model."""
-    if problem.sky_model is None or not solution.usable or not np.any(problem.weights * np.abs(problem.sky_model)):
+    if problem.sky_model is None or not solution.usable:
         return {}
     slope, shape = sky_model_slope(solution.gains, problem)
+    if slope == 0:
+        return {}
     return {"sky_model_slope": slope, "band_shape_rms": float(np.sqrt(np.nanmean((shape - 1) ** 2)))}
 
 

@@ -99,16 +99,16 @@ def sky_model_slope(gains: np.ndarray, problem: CalibrationProblem) -> tuple[flo
     Returns
     -------
     slope
-        sum w Re m* V / (g_a g_b*) over sum w |m|^2, with the sky model m.
+        sum w Re m* V / (g_a g_b*) over sum w |m|^2, with the sky model m; zero if that is zero where there are data.
     shape
-        The same of each channel, over `slope`, (Nfreqs,); NaN in channels without data.
+        The same of each channel, over `slope`, (Nfreqs,); NaN in channels without data, and in all if `slope` is zero.
     """
     sky_model: Any = problem.sky_model
     calibrated = problem.visibilities / gain_products(gains, problem.structure.antennas)
     overlap = np.sum(problem.weights * (sky_model.conj() * calibrated).real, axis=0)
     power = np.sum(problem.weights * np.abs(sky_model) ** 2, axis=0)
-    slope = float(overlap.sum() / power.sum())
-    return slope, np.where(power > 0, overlap / np.where(power > 0, power, 1) / slope, np.nan)
+    slope = float(overlap.sum() / power.sum()) if power.any() else 0.0
+    return slope, np.divide(overlap, slope * power, out=np.full(power.shape, np.nan), where=slope * power != 0)
 
 
 def fix_degeneracies(

@@ -231,6 +231,15 @@ def test_scale_and_band_shape_of_the_gains_are_those_that_were_put_in(quiet):
     np.testing.assert_allclose(np.delete(shape, 7), np.delete(1 / band / mean, 7), rtol=1e-12)
 
 
+def test_a_sky_model_of_zero_has_no_slope_and_no_scale(quiet):
+    problem = quiet.problem(sky_model=np.zeros_like(quiet.foregrounds), prior="sky-model")
+    slope, shape = sky_model_slope(quiet.gains, problem)
+    assert slope == 0
+    assert np.isnan(shape).all()
+    with pytest.raises(ValueError, match="not correlated with the sky model"):
+        fix_degeneracies(quiet.gains, quiet.foregrounds, problem)
+
+
 def test_residual_does_not_know_where_the_solver_drifted(converged):
     """Gains of the solver before fixing, moved along the nulls, give the same loss."""
     problem, solution = converged

@@ -206,7 +206,6 @@ def _draw_panel(axes: Axes, misfit: np.ndarray, converged: np.ndarray) -> QuadMe
         colour = "white" if value < LARGEST**0.5 else style.BLACK
         marker = "o" if converged[row, column] else "x"
         axes.plot(column + 0.5, row + 0.62, marker, color=colour, markersize=4, fillstyle="none")
-        axes.text(
-            column + 0.5, row + 0.3, f"{value:.2f}", color=colour, fontsize=style.NOTE_SIZE, ha="center", va="center"
-        )
+        label = f"{value:.2f}" if value < 100 else f"{value:.0f}"
+        axes.text(column + 0.5, row + 0.3, label, color=colour, fontsize=style.NOTE_SIZE, ha="center", va="center")
     return mesh
