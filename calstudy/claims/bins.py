@@ -167,15 +167,48 @@ def _last_biased(biased: np.ndarray) -> int | None:
     return last
 
 
-def bias(run: RunResults, k_min: float, k_max: float) -> Finding:
-    """Return s^2 P^R0 / P^S outside the wedge: the residual without EoR over the EoR, free of the flux scale s.
+def power_without_eor(run: RunResults, used: np.ndarray, weights: np.ndarray) -> Finding:
+    """Return a mean of P^R0 over bins outside the wedge, mK^2 h^-3 Mpc^3: the residual of data without EoR.
 
-    Bins are weighted with their modes. The uncertainty is that of the thermal noise.
+    Errors come from leaving out antennas (`calstudy.power.score`), for power that foregrounds leave is not noise. The
+    part of them that thermal noise explains is independent from bin to bin; the rest is taken as common to all bins,
+    which share the gains. The error of a bin with a single baseline or group, whose scatter is not known, is its power.
 
     Parameters
     ----------
     run
-        With the variants `eor` and `residual_without_eor`, and a transfer function.
+        With the variants `eor` and `residual_without_eor`, and scores.
+    used
+        Bins, (Nk,) bool.
+    weights
+        Of the bins that are used, of any sum.
+
+    Raises
+    ------
+    Unevaluated
+        If it lacks one of them.
+    """
+    eor, residual = (run.spherical(variant, "outside-wedge") for variant in ("eor", "residual_without_eor"))
+    score = run.score
+    if not np.array_equal(score.bin_edges, residual.bin_edges):
+        raise Unevaluated("the scores of the run have other bins than its spectra")
+    share, noise = weights / np.sum(weights), residual.noise_error[used]
+    power = residual.power.real[used]
+    error = (score.bias_error * eor.power.real)[used] / score.flux_scale**2
+    common = np.where(np.isfinite(error), np.sqrt(np.maximum(error**2 - noise**2, 0)), np.abs(power))
+    uncertainty = np.hypot(np.sqrt(np.sum((share * noise) ** 2)), np.sum(share * common))
+    return Finding(float(np.sum(share * power)), float(uncertainty))
+
+
+def bias(run: RunResults, k_min: float, k_max: float) -> Finding:
+    """Return s^2 P^R0 / P^S outside the wedge: the residual without EoR over the EoR, free of the flux scale s.
+
+    Bins are weighted with their modes. For the uncertainty see `power_without_eor`.
+
+    Parameters
+    ----------
+    run
+        With the variants `eor` and `residual_without_eor`, and scores.
     k_min, k_max
         h/Mpc.
 
@@ -185,10 +218,8 @@ def bias(run: RunResults, k_min: float, k_max: float) -> Finding:
         If it lacks one of them, or has no modes there.
     """
     eor, residual = (run.spherical(variant, "outside-wedge") for variant in ("eor", "residual_without_eor"))
-    scale = run.transfer("outside-wedge").flux_scale
     used = used_bins(eor, residual, k_min=k_min, k_max=k_max)
     modes = eor.n_modes[used]
-    signal = float(np.sum(modes * eor.power.real[used]))
-    left = float(np.sum(modes * residual.power.real[used]))
-    noise = float(np.sqrt(np.sum((modes * residual.noise_error[used]) ** 2)))
-    return Finding(scale**2 * left / signal, scale**2 * noise / signal)
+    left = power_without_eor(run, used, modes)
+    unit = run.score.flux_scale**2 / float(np.sum(modes * eor.power.real[used]) / np.sum(modes))
+    return Finding(unit * left.value, unit * left.uncertainty)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 from calstudy.base.resources import Cost
 from calstudy.claims.paper import Paper
 from calstudy.experiment.model import Experiment
-from calstudy.products import agreement, signal_loss, sky_model, spectra
+from calstudy.products import agreement, score, signal_loss, sky_model, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
     from calstudy.claims.evaluation import Evaluation
 
-TABLES = ("spectra", "agreement", "transfer", "sky_model")
+TABLES = ("spectra", "agreement", "transfer", "score", "sky_model")
 
 
 def _facts(experiment: Experiment) -> Experiment:
@@ -28,6 +28,7 @@ def _inputs(graph: Graph) -> dict[str, Task]:
         "spectra": spectra.spectra(graph),
         "agreement": agreement.agreement(graph),
         "transfer": signal_loss.transfer(graph),
+        "score": score.score(graph),
         "sky_model": sky_model.error(graph),
     }
     return {name: task for name, task in inputs.items() if task is not None}
@@ -140,7 +141,7 @@ def _write(job: Job, found: Evaluation) -> dict[str, Any]:
     return {"verdicts": tally(found.verdicts), "failed": failed, "without_role": list(found.without_role)}
 
 
-EVALUATE = Stage(name="claims", version=10, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
+EVALUATE = Stage(name="claims", version=11, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
 EVALUATE_RUN_TIMES = Stage(
     name="runtime-claims", version=3, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
 )

@@ -11,12 +11,14 @@ from typing import Any, TypeVar
 from calstudy.calibrate.agreement import Statistic, from_json
 from calstudy.experiment.assumed import assumed_changes
 from calstudy.experiment.model import Experiment
+from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction
 from calstudy.products import sky_model
 from calstudy.products.agreement import AGREEMENT
 from calstudy.products.files import spectrum_file
+from calstudy.products.score import BINS
 from calstudy.products.signal_loss import TRANSFER
 from calstudy.verdicts.statement import Unevaluated
 
@@ -32,8 +34,8 @@ class RunResults:
     experiment
         What was run.
     folders
-        Where tables are looked for: spectra as ``<variant>.<kind>.h5``, ``transfer.<region>.h5``, agreement.json
-        and sky-model.json.
+        Where tables are looked for: spectra as ``<variant>.<kind>.h5``, ``transfer.<region>.h5``, score-bins.h5,
+        agreement.json and sky-model.json.
     """
 
     experiment: Experiment
@@ -77,6 +79,14 @@ class RunResults:
         if path is None:
             raise Unevaluated("the run does not calibrate the same data with the EoR and without")
         return load_spectrum(path, TransferFunction)
+
+    @property
+    def score(self) -> Score:
+        """The scores of the calibration in bins of k, with errors by leaving out antennas."""
+        path = self._find(BINS)
+        if path is None:
+            raise Unevaluated("the run has no scores of its calibration, or is of a version that wrote none")
+        return load_spectrum(path, Score)
 
     def measured(self, name: str) -> Statistic:
         """Return a comparison of the calibration with the truth (`calstudy.calibrate.agreement`)."""

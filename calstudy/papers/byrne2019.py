@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 CRUCIAL = (0.1, 0.2)
-"""h/Mpc, where thermal noise allows a detection first."""
+"""h/Mpc, where the noise allows a detection first."""
 MISSING = Source("Abstract", ("redundant_incomplete",))
 
 

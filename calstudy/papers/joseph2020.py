@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from calstudy.claims.bins import used_bins
+from calstudy.claims.bins import power_without_eor, used_bins
 from calstudy.claims.paper import Paper
 from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
 from calstudy.verdicts.criterion import AtLeast, Finding, Within
@@ -29,12 +27,10 @@ DEAD = Source("Abstract", ("dead_dipoles",))
 
 
 def residual_power(run: RunResults) -> Finding:
-    """Return P^R0 outside the wedge, mK^2 h^-3 Mpc^3, with the error of the thermal noise; bins weighted with modes."""
+    """Return P^R0 outside the wedge, mK^2 h^-3 Mpc^3; bins are weighted with their modes."""
     spectrum = run.spherical("residual_without_eor", "outside-wedge")
     used = used_bins(spectrum, k_min=MODES[0], k_max=MODES[1])
-    weights = spectrum.n_modes[used] / np.sum(spectrum.n_modes[used])
-    error = np.sqrt(np.sum((weights * spectrum.noise_error[used]) ** 2))
-    return Finding(float(np.sum(weights * spectrum.power.real[used])), float(error))
+    return power_without_eor(run, used, spectrum.n_modes[used])
 
 
 @DEAD.states(
@@ -51,7 +47,7 @@ def bias_is_a_thousand(run: RunResults) -> Finding:
     "this is above the expected signal, by two orders of magnitude",
     "the same over the 10 mK² h⁻³ Mpc³ that the paper expects",
     AtLeast(1, sigmas=2),
-    "above it at all, beyond the noise",
+    "above it at all, beyond the errors",
 )
 def bias_exceeds_expected_signal(run: RunResults) -> Finding:
     power = residual_power(run)

@@ -19,6 +19,7 @@ from calstudy.instrument.layouts import make_layout
 from calstudy.products import sky_model
 from calstudy.products.agreement import agreement
 from calstudy.products.graph import Graph
+from calstudy.products.score import score
 from calstudy.products.signal_loss import transfer
 from calstudy.products.spectra import spectra
 from calstudy.run.provenance import seeds
@@ -89,7 +90,8 @@ class ExperimentStudy(Study):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        found = (spectra(self.graph), agreement(self.graph), transfer(self.graph), self._sky_model_error)
+        graph = self.graph
+        found = (spectra(graph), agreement(graph), transfer(graph), score(graph), self._sky_model_error)
         return [task for task in found if task is not None]
 
     @cached_property

@@ -13,6 +13,7 @@ import pytest
 
 from calstudy.claims.results import RunResults
 from calstudy.experiment.files import validate
+from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
@@ -35,6 +36,7 @@ class World:
     biased_below: float = 0.28
     noise: float = 0.03
     without_eor_bias: float = 0.0
+    without_eor_error: float = 0.0
     leakage: float = 1e6
     foregrounds: float = 3e8
     sidelobes: float = 10.0
@@ -134,7 +136,7 @@ def transfer(world: World) -> TransferFunction:
         bin_edges=EDGES,
         transfer=value,
         transfer_error=0.01 * ones,
-        cross_transfer=value,
+        cross_transfer=scale_free / world.flux_scale,
         cross_transfer_error=0.01 * ones,
         scale_free_transfer=scale_free,
         scale_free_transfer_error=0.01 * ones,
@@ -142,6 +144,23 @@ def transfer(world: World) -> TransferFunction:
         squared_coherence_error=0.01 * ones,
         signal=SIGNAL * ones,
         n_samples=100 * np.ones(K.size, int),
+        flux_scale=world.flux_scale,
+    )
+
+
+def score(world: World) -> Score:
+    ones = np.ones(K.size)
+    # Of noise, and of what foregrounds leave: as in the spectra.
+    error = np.hypot(world.noise, np.where(K < 0.5, world.without_eor_error, 0))
+    return Score(
+        k=K,
+        bin_edges=EDGES,
+        transfer=world.scale_free_transfer * ones,
+        transfer_error=0.01 * ones,
+        bias=world.flux_scale**2 * np.where(K < 0.5, world.without_eor_bias, 0),
+        bias_error=world.flux_scale**2 * error,
+        recovered=world.recovered * ones,
+        recovered_error=0.01 * ones,
         flux_scale=world.flux_scale,
     )
 
@@ -163,6 +182,7 @@ def make_study(tmp_path) -> Callable[..., RunResults]:
                 save_spectrum(folder / f"{kind}.{modes}.h5", spherical(world, rng, kind, modes))
             save_spectrum(folder / f"{kind}.wedge.h5", wedge(world, rng, kind))
         save_spectrum(folder / "transfer.outside-wedge.h5", transfer(world))
+        save_spectrum(folder / "score-bins.h5", score(world))
         values = PAPERS_AGREEMENT | world.agreement
         measurements = {
             key: {"value": value, "scatter": 0.1 * value, "count": 100, "over": "baselines"}

@@ -37,8 +37,8 @@ def spectrum(power, error=0.0):
     return SphericalSpectrum(k, edges, values, modes, modes, modes, modes, errors, np.zeros(k.shape), True)
 
 
-def run(fraction=0.0, error=0.0, product=1e-3, name="run", experiment=None, sky_model_error=0.1):
-    """A run whose residual has a fraction of the EoR's power, with noise that is another fraction."""
+def run(fraction=0.0, error=0.0, leftover=0.0, product=1e-3, name="run", experiment=None, sky_model_error=0.1):
+    """A run whose residual has parts of the power of the EoR: itself, its noise, and the error of what is left."""
     spectra = {
         "eor": spectrum(SIGNAL),
         "residual_without_eor": spectrum(fraction * SIGNAL / SCALE**2, error * SIGNAL / SCALE**2),
@@ -48,7 +48,11 @@ def run(fraction=0.0, error=0.0, product=1e-3, name="run", experiment=None, sky_
         experiment=experiment or load(EXPERIMENTS / "hexagon.yaml"),
         sky_model_error=sky_model_error,
         spherical=lambda variant, modes: spectra[variant],
-        transfer=lambda region: SimpleNamespace(flux_scale=SCALE),
+        score=SimpleNamespace(
+            flux_scale=SCALE,
+            bin_edges=spectra["eor"].bin_edges,
+            bias_error=np.full(spectra["eor"].k.size, np.hypot(error, leftover)),
+        ),
         measured=lambda quantity: SimpleNamespace(value=product, scatter=0.1 * product),
     )
 
@@ -64,6 +68,17 @@ def test_the_bias_is_free_of_the_flux_scale_and_has_the_error_of_the_noise():
     modes = spectrum(0).n_modes[(used >= 0.2) & (used <= 0.5)]
     assert found.value == pytest.approx(0.3)
     assert found.uncertainty == pytest.approx(0.1 * np.sqrt(np.sum(modes**2)) / np.sum(modes))
+
+
+def test_the_error_of_what_foregrounds_leave_does_not_average_down_over_bins():
+    # All bins share the gains.
+    assert bias(run(50, leftover=5), 0.2, 0.5).uncertainty == pytest.approx(5)
+
+
+def test_a_bin_of_one_baseline_is_known_to_its_own_power():
+    single = run(50, leftover=5)
+    single.score.bias_error[:] = np.nan
+    assert bias(single, 0.2, 0.5).uncertainty == pytest.approx(50)
 
 
 def test_every_statement_has_the_runs_that_it_needs(members):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calstudy.claims.bins import used_bins
+from calstudy.claims.bins import power_without_eor, used_bins
 from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS
 from calstudy.papers.calamity2022.window import K_AGREEMENT, K_SMALL, POSITIVE
@@ -30,9 +30,9 @@ def _over_eor(run: RunResults, k_min: float, k_max: float) -> Finding:
     """Return the mean over bins of P^R without EoR over that of P^S."""
     residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
     used = used_bins(residual, signal, k_min=k_min, k_max=k_max)
-    level = np.mean(signal.power.real[used])
-    error = np.sqrt(np.sum(residual.noise_error[used] ** 2)) / used.sum()
-    return Finding(float(np.mean(residual.power.real[used]) / level), float(error / level))
+    level = float(np.mean(signal.power.real[used]))
+    left = power_without_eor(run, used, np.ones(used.sum()))
+    return Finding(left.value / level, left.uncertainty / level)
 
 
 @RESULTS.states(

@@ -7,6 +7,7 @@ import numpy as np
 from calstudy.claims.bins import (
     bias_extent,
     fraction_within,
+    power_without_eor,
     ratio,
     recovered,
     rms_power,
@@ -268,17 +269,16 @@ def _positive_bias(run: RunResults) -> Finding:
     residual = run.spherical("residual_without_eor", "outside-wedge")
     signal = run.spherical("eor", "outside-wedge")
     used = used_bins(residual, signal, k_max=K_SMALL)
-    weights = residual.noise_error[used] ** -2.0
     level = float(np.mean(signal.power.real[used]))
-    mean = np.sum(weights * residual.power.real[used]) / np.sum(weights)
-    return Finding(float(mean) / level, float(np.sum(weights) ** -0.5) / level)
+    left = power_without_eor(run, used, residual.noise_error[used] ** -2.0)
+    return Finding(left.value / level, left.uncertainty / level)
 
 
 @RESULTS.states(
     POSITIVE,
     "mean P^R without EoR at k <= 0.5 outside the wedge, in units of P^S; the run's own solver",
     AtLeast(0, 2),
-    "positive beyond the noise",
+    "positive beyond the errors",
 )
 def positive_bias_at_small_k(run: RunResults) -> Finding:
     return _positive_bias(run)
@@ -288,7 +288,7 @@ def positive_bias_at_small_k(run: RunResults) -> Finding:
     POSITIVE,
     "mean P^R without EoR at k <= 0.5 outside the wedge, in units of P^S; the paper's solver",
     AtLeast(0, 2),
-    "positive beyond the noise",
+    "positive beyond the errors",
     roles=("paper_solver",),
 )
 def positive_bias_at_small_k_with_papers_solver(run: RunResults) -> Finding:
