@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.instrument.size import Size
 from calstudy.products import calibration, corruption, simulation
 from calstudy.products.files import DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
 from calstudy.products.graph import Graph, once, size_of
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 AGREEMENT = "agreement.json"
-MOST_INTEGRATIONS = 112
-"""Integrations that are compared at most, spread over the run: twice the paper's. More would need ever more memory."""
+MOST_SAMPLES = 112 * 630 * 384
+"""Visibilities that are compared at most, twice the paper's: more would need ever more memory."""
 
 
 @once
@@ -34,8 +35,9 @@ def agreement(graph: Graph) -> Task | None:
         return None
     power = graph.experiment.power
     settings: dict[str, Any] = {"buffer": power.wedge_buffer, "redundancy_tolerance": power.redundancy_tolerance}
-    if graph.experiment.instrument.times.count > MOST_INTEGRATIONS:
-        settings["integrations"] = MOST_INTEGRATIONS
+    size = Size.of(graph.experiment.instrument)
+    if (compared := integrations_compared(size)) < size.times:
+        settings["integrations"] = compared
     inputs = {
         "data": corruption.data(graph, residual, "even"),
         "noise": corruption.data(graph, noise, "even"),
@@ -60,7 +62,8 @@ def measure(job: Job) -> Mapping[str, Any]:
     calibrated = read_visibilities(job.inputs["calibration"] / RESIDUAL)
     flags = flag_cube(calibrated)[..., 0]
     solved, observed = ~flags.all(axis=(1, 2)), ~flags.all(axis=(0, 2))
-    chosen = spread(np.flatnonzero(solved), MOST_INTEGRATIONS)
+    places = np.flatnonzero(solved)
+    chosen = spread(places, job.settings.get("integrations", len(places)))
     if not chosen.size:
         raise InputError("calibration against truth: no integration was calibrated")
     vectors = baseline_vectors(data)
@@ -99,6 +102,11 @@ def measure(job: Job) -> Mapping[str, Any]:
     return {}
 
 
+def integrations_compared(size: Size) -> int:
+    """Return how many integrations are compared, spread over the run: all, if they have few enough visibilities."""
+    return min(size.times, max(1, MOST_SAMPLES // (size.baselines * size.channels.count)))
+
+
 def spread(places: np.ndarray, most: int) -> np.ndarray:
     """Return places, (N,), or `most` of them from the first to the last at equal distances if there are more."""
     import numpy as np
@@ -118,7 +126,7 @@ def _redundant_fraction(vectors: np.ndarray, tolerance: float) -> float:
 
 def _cost(task: Task) -> Cost:
     size = size_of(task)
-    compared = size.samples * min(1.0, MOST_INTEGRATIONS / size.times)
+    compared = integrations_compared(size) * size.baselines * size.channels.count
     memory = LIBRARIES_MEMORY + (3 * size.samples + 8 * compared) * COMPLEX128
     return Cost(1 + size.samples * 1e-7 + compared * 9e-7, memory, 1e4)
 

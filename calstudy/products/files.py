@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,6 +52,32 @@ def read_visibilities(path: Path) -> UVData:
 
     keep_compiled_pyuvdata()
     return UVData.from_file(path, file_type="uvh5", run_check=False)
+
+
+def read_in_parts(paths: Sequence[Path], samples: int) -> Iterator[tuple[range, list[UVData]]]:
+    """Read UVH5 products of the same times side by side, consecutive integrations at a time.
+
+    Parameters
+    ----------
+    paths
+        Of the files.
+    samples
+        Visibilities of one file that are read at a time, at most; one integration at least.
+
+    Yields
+    ------
+    Places of the integrations in the run, and the data of each file.
+    """
+    from pyuvdata import UVData
+
+    keep_compiled_pyuvdata()
+    header = UVData.from_file(paths[0], file_type="uvh5", run_check=False, read_data=False)
+    times = np.unique(header.time_array)
+    step = max(1, samples // (header.Nbls * header.Nfreqs * header.Npols))
+    for first in range(0, times.size, step):
+        part = range(first, min(first + step, times.size))
+        options = {"file_type": "uvh5", "run_check": False, "times": times[part.start : part.stop]}
+        yield part, [UVData.from_file(path, **options) for path in paths]
 
 
 def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:

@@ -11,7 +11,7 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.products import calibration, corruption, signal_loss, sky_model, spectra
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import DATA, MODEL, SOLUTION, read_json, read_visibilities, write_json
+from calstudy.products.files import DATA, MODEL, SOLUTION, read_in_parts, read_json, write_json
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from calstudy.products.selection import Gains
 
 BINS, BANDS, SUMMARY = "score-bins.h5", "score-bands.h5", "score.json"
+SAMPLES_AT_A_TIME = 14 * 630 * 384
+"""Visibilities of each data set that are in memory at a time."""
 
 
 @once
@@ -135,21 +137,23 @@ def _held_out_chi_squared(job: Job) -> float | None:
     from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
 
     fitted, _ = _known_gains(job, PARITIES[0])
-    even, odd = (read_visibilities(job.inputs[f"data:{parity}"] / DATA) for parity in PARITIES)
-    model = read_visibilities(job.inputs[f"calibration:{PARITIES[0]}"] / MODEL)
-    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(even).tolist())}
-    rows = [places[tuple(pair)] for pair in antenna_pairs(model).tolist()]
-    first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
+    paths = [job.inputs[f"data:{parity}"] / DATA for parity in PARITIES]
+    paths.append(job.inputs[f"calibration:{PARITIES[0]}"] / MODEL)
     misfit = noise = 0.0
-    cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
-    flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
-    unsolved = flag_cube(model)[..., 0]
-    for time, gains in enumerate(fitted.values):
-        lacking = fitted.flags[time][first] | fitted.flags[time][second]
-        used = ~(flags[time][rows] | unsolved[time] | lacking)
-        predicted = gains[first] * gains[second].conj() * cubes[2][time]
-        misfit += float(np.sum(np.abs(cubes[1][time][rows] - predicted)[used] ** 2))
-        noise += float(np.sum(np.abs(cubes[1][time][rows] - cubes[0][time][rows])[used] ** 2)) / 2
+    for part, (even, odd, model) in read_in_parts(paths, SAMPLES_AT_A_TIME):
+        places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(even).tolist())}
+        rows = [places[tuple(pair)] for pair in antenna_pairs(model).tolist()]
+        first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
+        cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
+        flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
+        unsolved = flag_cube(model)[..., 0]
+        for place, time in enumerate(part):
+            gains = fitted.values[time]
+            lacking = fitted.flags[time][first] | fitted.flags[time][second]
+            used = ~(flags[place][rows] | unsolved[place] | lacking)
+            predicted = gains[first] * gains[second].conj() * cubes[2][place]
+            misfit += float(np.sum(np.abs(cubes[1][place][rows] - predicted)[used] ** 2))
+            noise += float(np.sum(np.abs(cubes[1][place][rows] - cubes[0][place][rows])[used] ** 2)) / 2
     return misfit / noise if noise > 0 else None
 
 
@@ -191,8 +195,9 @@ def cpu_seconds_per_integration(records: Sequence[Mapping[str, Any]]) -> float |
 
 
 def _cost(task: Task) -> Cost:
-    samples = size_of(task).samples
-    return Cost(0.5 + samples * 1.5e-7, LIBRARIES_MEMORY + 8 * samples * COMPLEX128, 1e6)
+    size = size_of(task)
+    part = min(size.samples, max(SAMPLES_AT_A_TIME, size.samples // size.times))
+    return Cost(0.5 + size.samples * 1.5e-7, LIBRARIES_MEMORY + 8 * part * COMPLEX128, 1e6)
 
 
 SCORE = Stage(name="score", version=2, make=make_score, cost=_cost)
