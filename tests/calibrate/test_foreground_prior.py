@@ -10,11 +10,18 @@ import tensorflow as tf
 from hera_cal.datacontainer import DataContainer
 from hera_cal.redcal import RedundantCalibrator
 from hera_cal.skycal import refine_gains
+from test_calamity import make_uvdata
 from test_calibration_loss import redundant_structure
-from toy import BASIS, FREQUENCIES, complex_normal, make_toy, scattered
+from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
+from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis
+from calstudy.calibrate.calibrators.delay_weighted import DelayWeighted
+from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.calibrators.unified import Unified
+from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
@@ -304,3 +311,33 @@ def test_wide_priors_converge_to_the_minimum(hexagon, prior, own, shared):
     assert found.status == "converged", found.message
     further = solve(problem, GaussNewton(tolerance=1e-8, max_steps=300, precision="double"))
     assert found.loss_history[-1] < 1.01 * further.loss_history[-1]
+
+
+NOISE, ROUNDING = 1e-3, 3e-8
+"""Noise over the foregrounds that the prior is told, and the residual at which a fit is at rounding."""
+
+
+@pytest.mark.parametrize(
+    ("calibrator", "positions", "exact"),
+    [
+        (SkyBased(), scattered(8), 10 * ROUNDING),
+        # Smooth gains are known to the residual times deviation over noise.
+        (DelayWeighted(), scattered(8), 10 * ROUNDING * 0.1 / NOISE),
+        (Unified(), HEX, 10 * ROUNDING * 0.1 / NOISE),
+    ],
+    ids=["sky-based", "delay-weighted", "unified"],
+)
+def test_noiseless_gains_are_exact_with_the_true_sky_model(calibrator, positions, exact):
+    """The calibrators as they are by default, on data that their sky model explains."""
+    toy = make_toy(positions, noise=0.0)
+    if not isinstance(calibrator, SkyBased):
+        rms = float(np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2)))
+        prior = calibrator.foreground_prior.model_copy(update={"noise": NOISE * rms})
+        calibrator = calibrator.model_copy(update={"foreground_prior": prior})
+    uvd = make_uvdata(toy, n_times=1, polarizations=(-5,))
+    sky = from_cube(uvd, np.broadcast_to(toy.foregrounds[None, :, :, None], to_cube(uvd).shape))
+    result = run_calibrator(calibrator, uvd, sky)
+    assert [record.status for record in result.solutions] == ["converged"]
+    # The data that are made of a toy differ from it in amplitude.
+    true = np.sqrt(np.abs(to_cube(uvd)[0, ..., 0] / toy.visibilities).mean()) * toy.gains
+    assert np.abs(fix_phase(result.gains.gain_array[..., 0, 0], true) - true).max() < exact
