@@ -2,7 +2,7 @@
 
 A folder of one experiment has `MANIFEST`, data sets ``data-1``, ``data-2``, ... and, once they are calibrated, a file
 of gains for each, and perhaps a model. Data sets are told by the digest that the manifest has of each: their names and
-order say nothing.
+order say nothing. Worlds that differ in what is assumed alone have the same data; they are told by the sky model.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ class Manifest(Section):
         The data sets.
     sky_model
         File of the assumed visibilities of the foregrounds; None if nothing is assumed.
+    sky_model_digest
+        Of all that they were made from.
     noise
         Standard deviation of the complex noise of a sample, Jy; None if the data have none.
     """
@@ -50,6 +52,7 @@ class Manifest(Section):
     digest: str
     data: tuple[DataSet, ...]
     sky_model: str | None = None
+    sky_model_digest: str | None = None
     noise: float | None = None
 
 
@@ -75,28 +78,37 @@ def read_manifest(path: Path) -> Manifest:
         ) from None
 
 
-def find_returned(folder: Path, digest: str) -> Returned:
-    """Return what came back for the data set with a digest.
+def find_returned(folder: Path, digest: str, sky_model: str | None) -> Returned:
+    """Return what came back for the data set with a digest, of the world with a sky model.
 
     Parameters
     ----------
     folder
         Of one experiment; or of several such folders, one for each world of a comparison.
-    digest
-        As in the manifest.
+    digest, sky_model
+        Digests of the data and of the sky model, as in the manifest.
 
     Raises
     ------
     InputError
-        If there is no manifest, none that has these data, no gains for them, or more than one file of them.
+        If there is no manifest, none that has these data and this sky model, no gains for them, or several files.
     """
     manifests = [folder / MANIFEST] if (folder / MANIFEST).exists() else sorted(folder.glob(f"*/{MANIFEST}"))
     if not manifests:
         raise InputError(f"{folder}: has no {MANIFEST}, nor has a folder in it; copy it from the export")
+    others = []
     for path in manifests:
-        for data in read_manifest(path).data:
-            if data.digest == digest:
+        manifest = read_manifest(path)
+        for data in manifest.data:
+            if data.digest == digest and manifest.sky_model_digest == sky_model:
                 return _returned_for(path.parent, data.name)
+            if data.digest == digest:
+                others.append(path)
+    if others:
+        raise InputError(
+            f"{others[0].parent}: its gains are of these data, but of a world with another sky model ({MANIFEST} has "
+            "another digest); each world that 'calstudy export' writes needs gains in its own folder"
+        )
     raise InputError(
         f"{folder}: its gains are not of these data ({MANIFEST} has other digests); they must be of data that "
         "'calstudy export' wrote for the same experiment, with the same scale and --set, and the same version"

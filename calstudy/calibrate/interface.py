@@ -295,7 +295,7 @@ class Calibrator(Plugin):
             To be called after each solve with the number done and the total; None for no progress reports.
         """
 
-    def for_data(self, digest: str) -> Self:
+    def for_data(self, digest: str, sky_model: str | None = None) -> Self:
         """Return the calibrator of one data set of a run; the same for all, unless files say what to do with each.
 
         Asked by plans. May raise InputError.
@@ -304,8 +304,10 @@ class Calibrator(Plugin):
         ----------
         digest
             Of all that the data set is made from.
+        sky_model
+            Of all that the sky model is made from; None if there is none.
         """
-        del digest
+        del digest, sky_model
         return self
 
     def solves(self, n_times: int) -> list[slice]:

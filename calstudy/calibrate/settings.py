@@ -44,8 +44,9 @@ class GaussNewtonSettings(Section):
     max_steps: int = Field(100, ge=1)
     precision: Literal["single", "double"] = Field(
         "single",
-        description="Of the inner products of the iteration. `double` goes on with less damping where the noise is "
-        "below about 3e-4 of the data, in directions that single precision does not resolve.",
+        description="Of the inner products of the iteration. Where the noise is below about 3e-4 of the data, some "
+        "directions are not resolved by single precision: `double` goes on with less damping, and `single` is "
+        "`stalled` if more than 1e-3 of the loss (or `tolerance`, if that is larger) is predicted to go there.",
     )
     warm_start: bool = Field(True, description="Start each integration from the solution of the one before.")
 

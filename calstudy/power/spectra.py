@@ -6,18 +6,22 @@ each other. The pairs of a unit share the signal; their noise products are indep
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.errors import InputError
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.delay import horizon_delay
 from calstudy.power.settings import PowerSettings
 
 if TYPE_CHECKING:
     from hera_pspec import UVPSpec
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,29 @@ class DelaySpectra:
     def n_baselines(self) -> np.ndarray:
         """Baselines of each unit, (Nu,): one that is crossed with itself, or n with n (n - 1) pairs."""
         return np.where(self.n_pairs == 1, 1.0, (1 + np.sqrt(1 + 4 * self.n_pairs)) / 2)
+
+    def pairs_of_units(self) -> list[tuple[object, ...]]:
+        """Return what tells each unit: its vector to a mm, and in how many of its pairs each antenna is."""
+        members: list[list[tuple[int, int]]] = [[] for _ in self.n_pairs]
+        for unit, antenna, count in zip(self.share_unit, self.share_antenna, self.share_pairs, strict=True):
+            members[unit].append((int(antenna), int(count)))
+        places = np.rint(1e3 * self.vectors).astype(int).tolist()
+        return [(*place, *sorted(found)) for place, found in zip(places, members, strict=True)]
+
+    def of_units(self, units: np.ndarray) -> DelaySpectra:
+        """Return the spectra of some units, by their numbers, ascending."""
+        shares = np.isin(self.share_unit, units)
+        return replace(
+            self,
+            power=self.power[units],
+            vectors=self.vectors[units],
+            n_pairs=self.n_pairs[units],
+            k_perp=self.k_perp[units],
+            share_unit=np.searchsorted(units, self.share_unit[shares]),
+            share_antenna=self.share_antenna[shares],
+            share_pairs=self.share_pairs[shares],
+            share_power=self.share_power[shares],
+        )
 
 
 @dataclass(frozen=True)
@@ -190,6 +217,36 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
     """Return which modes lie outside the wedge: |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool."""
     horizon = horizon_delay(modes.length)
     return np.abs(modes.delay) > horizon[:, None] + buffer
+
+
+def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:
+    """Return spectra of the units that all have, made of the same pairs of baselines in each, in the same order.
+
+    Baselines that are flagged altogether have no spectra. Where an antenna has no gains, that makes baselines of the
+    residual which the EoR has.
+
+    Raises
+    ------
+    InputError
+        If they have nothing in common.
+    """
+    first, *others = keys = [one.pairs_of_units() for one in spectra.values()]
+    if all(other == first for other in others):
+        return dict(spectra)
+    places = {name: {key: unit for unit, key in enumerate(found)} for name, found in zip(spectra, keys, strict=True)}
+    common = set.intersection(*(set(found) for found in places.values()))
+    if not common:
+        raise InputError("no baseline has data in all of " + ", ".join(spectra))
+    most = max(map(len, keys))
+    logger.warning("%d of %d baselines or redundant groups are left out: flagged", most - len(common), most)
+    order = [key for key in first if key in common]
+    found = {}
+    for name, one in spectra.items():
+        units = np.array([places[name][key] for key in order])
+        if (np.diff(units) <= 0).any():
+            raise ValueError(f"the units of {name} are in another order, expected the same")
+        found[name] = one.of_units(units)
+    return found
 
 
 def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelaySpectra:

@@ -46,9 +46,10 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     """
     # What is assumed decides the sky model, which is an input, and nothing else.
     inputs = {"data": corruption.data(graph, variant, parity)}
-    settings = graph.experiment.calibration.for_data(inputs["data"].key).reset("assumed")
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
+    calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model and model.key)
+    settings = calibrator.reset("assumed")
     if settings.needs_noise:
         inputs["levels"] = corruption.levels(graph)
     return calibration_of(settings, inputs, temporary=not graph.keep_visibilities)

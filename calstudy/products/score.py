@@ -41,6 +41,9 @@ def score(graph: Graph) -> Task | None:
     for parity in PARITIES:
         inputs[f"calibration:{parity}"] = calibration.calibration(graph, variant, parity)
         inputs[f"data:{parity}"] = corruption.data(graph, variant, parity)
+        inputs[f"calibration_without_eor:{parity}"] = calibration.calibration(
+            graph, graph.experiment.variants[without], parity
+        )
     if variant.effects:
         inputs["gains"] = corruption.gains(graph)
     if (error := sky_model.error(graph)) is not None:
@@ -53,11 +56,13 @@ def make_score(job: Job) -> Mapping[str, Any]:
     from calstudy.power.score import BANDS as EDGES
     from calstudy.power.score import CalibratedSpectra
     from calstudy.power.score import score as measure
+    from calstudy.power.spectra import of_common_units
     from calstudy.power.spherical import make_bin_edges
     from calstudy.power.tables import save_spectrum
 
     names = ("signal", "response", "residual", "residual_without_eor")
-    measured = CalibratedSpectra(**{name: spectra.read_delay_spectra(job.inputs[name]) for name in names})
+    delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in names}
+    measured = CalibratedSpectra(**of_common_units(delays))
     known = read_json(job.inputs["scale"] / signal_loss.SCALE)["flux_scale"]
     scale, power = math.nan if known is None else known, job.settings["power"]
     save_spectrum(job.output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
@@ -158,9 +163,12 @@ def _held_out_chi_squared(job: Job) -> float | None:
 
 
 def _solves(job: Job) -> dict[str, Any]:
-    """Return how the solves of the data with the EoR ended, and what they took, None if nobody knows."""
+    """Return how all solves ended, of data with the EoR and without, and what they took, None if nobody knows."""
     records = [
-        record for parity in PARITIES for record in read_json(job.inputs[f"calibration:{parity}"] / SOLUTION)["records"]
+        record
+        for kind in ("calibration", "calibration_without_eor")
+        for parity in PARITIES
+        for record in read_json(job.inputs[f"{kind}:{parity}"] / SOLUTION)["records"]
     ]
     statuses = [record["status"] for record in records]
     by_status = {status: statuses.count(status) for status in sorted(set(statuses))}

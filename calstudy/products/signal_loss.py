@@ -81,7 +81,7 @@ def difference(job: Job) -> Mapping[str, Any]:
 
 def measure(job: Job) -> Mapping[str, Any]:
     """Write T per k outside and inside the wedge and per (|b|, tau), and the residual's power corrected by it."""
-    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.spectra import SphericalSpectrum, of_common_units
     from calstudy.power.tables import load_spectrum
     from calstudy.power.transfer import Injection
 
@@ -89,7 +89,7 @@ def measure(job: Job) -> Mapping[str, Any]:
     delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
     known = read_json(job.inputs["scale"] / SCALE)["flux_scale"]
     scale = math.nan if known is None else known
-    summary = write_transfer(job.output, Injection(**delays), settings, scale)
+    summary = write_transfer(job.output, Injection(**of_common_units(delays)), settings, scale)
     residual, signal = (
         load_spectrum(job.inputs["spectra"] / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
         for name in ("residual", "eor")

@@ -13,6 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from astropy import units
+
+from calstudy.base.errors import InputError
 
 LIMIT = 0.1
 """Bias over the EoR that is tolerated."""
@@ -52,14 +55,21 @@ class Fault:
 
 
 def faults(worlds: Sequence[str]) -> list[Fault]:
-    """Return the faults that the labels of worlds name, in their order."""
+    """Return the faults that the labels of worlds name, in their order; each in the unit of its first label.
+
+    Raises
+    ------
+    InputError
+        If the units of one fault cannot be converted into each other.
+    """
     without = [(0.0, world, "") for world in worlds if ":" not in world]
     found: dict[str, list[tuple[float, str, str]]] = {}
     for world in worlds:
         name, colon, severity = world.partition(":")
         if colon and (number := _NUMBER.search(severity)):
-            entry = (float(number.group()), world, severity[number.end() :].strip())
-            found.setdefault(name.strip(), []).append(entry)
+            unit, entries = severity[number.end() :].strip(), found.setdefault(name.strip(), [])
+            wanted = entries[0][2] if entries else unit
+            entries.append((_converted(float(number.group()), unit, wanted, world), world, wanted))
     result = []
     for name, entries in found.items():
         own_zero = any(severity == 0 for severity, *_ in entries)
@@ -67,6 +77,16 @@ def faults(worlds: Sequence[str]) -> list[Fault]:
         severities, labels, _ = zip(*ordered, strict=True)
         result.append(Fault(name, entries[0][2], labels, severities))
     return result
+
+
+def _converted(severity: float, unit: str, wanted: str, world: str) -> float:
+    """Return a severity in another unit."""
+    if unit == wanted:
+        return severity
+    try:
+        return severity * float(units.Unit(unit).to(wanted))
+    except (ValueError, units.UnitConversionError):
+        raise InputError(f"{world!r} has the unit {unit!r}, and others of this fault have {wanted!r}") from None
 
 
 @dataclass(frozen=True)

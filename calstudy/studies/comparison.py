@@ -23,6 +23,7 @@ from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import FIGURES, Experiment, Outputs, StudyName
 from calstudy.experiment.yaml_files import read_mapping
 from calstudy.figures import CasesFigure, cases_task
+from calstudy.products import tolerances
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
@@ -67,7 +68,7 @@ class ComparisonFile(Section):
         {"ideal": {}},
         min_length=1,
         description="Changes of the experiment by a label (dotted path: value): of what is true, or of what is assumed "
-        "(`calibration.assumed`).",
+        "(`calibration.assumed`). Neither the calibrator nor `power` may differ between worlds.",
     )
     figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] = Field(
         default_factory=lambda: tuple(FIGURES.make(name) for name in ("comparison-matrix", "comparison-spectra")),
@@ -83,6 +84,25 @@ class ComparisonFile(Section):
         for label in value:
             if not 0 < len(label.strip()) <= LONGEST_LABEL or not re.search(r"\w", label):
                 raise fault("", f"the label {label!r} must have 1 to {LONGEST_LABEL} characters, one a letter or digit")
+        return value
+
+    @field_validator("worlds")
+    @classmethod
+    def _has_one_yardstick(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        for label, changes in value.items():
+            for path, new in changes.items():
+                block, _, rest = path.partition(".")
+                if path in ("calibration", "calibration.calibrator"):
+                    raise fault("", f"{label!r} changes the calibrator, which each entry of calibrators names")
+                if block == "power":
+                    raise fault("", f"{label!r} changes {path}; all cases are measured alike, use overrides")
+                if not rest and isinstance(new, dict):
+                    fields = ", ".join(f"{path}.{name}" for name in new)
+                    raise fault("", f"{label!r} replaces all of {path}; give the fields that change ({fields})")
+        try:
+            tolerances.faults(list(value))
+        except InputError as error:
+            raise fault("", str(error)) from None
         return value
 
 

@@ -207,6 +207,7 @@ def _write_world(content: Contents, products: Mapping[str, Product], folder: Pat
         digest=content.digest,
         data=tuple(sets),
         sky_model=None if model is None else f"{SKY_MODEL}.{file_format}",
+        sky_model_digest=None if model is None else model.key,
         noise=None if levels is None else read_json(products[levels.key].path / LEVELS)["noise_std"],
     )
     write(folder / README, _readme(manifest, template, file_format))

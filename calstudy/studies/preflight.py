@@ -19,6 +19,7 @@ from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.size import Size
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
+from calstudy.products.sky_model import sky_model
 from calstudy.sky.counts import expected_sources
 from calstudy.sky.settings import Foregrounds, SyntheticSources
 
@@ -109,7 +110,8 @@ def _require_calibrators(experiment: Experiment) -> None:
     asked: list[Calibrator] = []
     for variant in experiment.variants.values():
         for parity in PARITIES if variant.calibrate else ():
-            calibrator = experiment.calibration.for_data(data(graph, variant, parity).key)
+            model = sky_model(graph)
+            calibrator = experiment.calibration.for_data(data(graph, variant, parity).key, model and model.key)
             if not any(calibrator is other for other in asked):
                 asked.append(calibrator)
                 frame = frame_of(experiment.instrument)

@@ -7,16 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import ValidationError, field_validator
 from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
+from calstudy.base.identity import digest_json, identity
 from calstudy.base.schema import Section
+from calstudy.experiment.model import Experiment
 from calstudy.products.comparison import score_table
 from calstudy.products.files import read_json
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import SUMMARY
+from calstudy.products.score import SCORE, SUMMARY
 from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import upper_limit
 from calstudy.run.execution import Workers
@@ -41,6 +43,8 @@ class Row(Section):
         Their labels.
     digest
         Of the data and the sky model of the world, as in the manifest of an export.
+    yardstick
+        Digest of how spectra and scores are measured (`yardstick_of`).
     scores
         As in score.json.
     """
@@ -48,7 +52,17 @@ class Row(Section):
     world: str
     calibrator: str
     digest: str
+    yardstick: str
     scores: dict[str, Any]
+
+    @field_validator("scores")
+    @classmethod
+    def _has_bands(cls, value: dict[str, Any]) -> dict[str, Any]:
+        needed = {"transfer", "bias", "bias_error"}
+        bands = value.get("bands")
+        if not isinstance(bands, list) or not bands or any(not needed <= set(band) for band in bands):
+            raise ValueError("has no bands of k with transfer, bias and bias_error")
+        return value
 
 
 class Scores(Section):
@@ -70,6 +84,11 @@ class Scores(Section):
     name: str
     rows: tuple[Row, ...]
     refusals: tuple[tuple[str, str, str], ...] = ()
+
+
+def yardstick_of(experiment: Experiment) -> str:
+    """Return a digest of how a calibrator is measured: the settings of the power spectra, and the version of scores."""
+    return digest_json([identity(experiment.power), SCORE.version])
 
 
 def measure_scores(study: Comparison, budget: Budget, console: Console) -> Scores:
@@ -95,6 +114,7 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
             world=case.world,
             calibrator=case.calibrator,
             digest=Contents.of(case.experiment).digest,
+            yardstick=yardstick_of(case.experiment),
             scores=read_json(made.products[task.key].path / SUMMARY),
         )
         for case, task in zip(cases, tasks, strict=True)
@@ -167,6 +187,8 @@ def leaderboard(folder: Path) -> str:
         If there are none, or they do not belong together: other data under the same name of a world, or a calibrator
         that occurs twice in a world.
     """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
     paths = sorted(folder.glob("*.json"))
     if not paths:
         raise InputError(f"{folder}: has no files of scores (*.json, from 'calstudy score --output')")
@@ -177,6 +199,8 @@ def leaderboard(folder: Path) -> str:
             rows = worlds.setdefault(row.world, {})
             _require_fitting(path, row, rows)
             rows[row.calibrator] = row
+    if not worlds:
+        raise InputError(f"{folder}: its files of scores have no rows")
     names = ", ".join(dict.fromkeys(scores.name for scores in found.values()))
     lines = [f"# Leaderboard: {names}", "", *_explanation(), "", _overview(worlds).markdown()]
     for world, rows in worlds.items():
@@ -207,6 +231,11 @@ def _require_fitting(path: Path, row: Row, rows: Mapping[str, Row]) -> None:
         raise InputError(
             f"{path}: {row.calibrator!r} was scored on other data than {others[0].calibrator!r} in the world "
             f"{row.world!r} (their digests differ); score it again with the same experiment and version"
+        )
+    if any(other.yardstick != row.yardstick for other in rows.values()):
+        raise InputError(
+            f"{path}: {row.calibrator!r} was measured otherwise than others in the world {row.world!r} (settings of "
+            "'power', or another version of scores); score it again with the same experiment and version"
         )
     if row.calibrator in rows:
         raise InputError(f"{path}: {row.calibrator!r} has scores in the world {row.world!r} twice; use another --name")

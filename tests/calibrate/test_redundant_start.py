@@ -50,7 +50,8 @@ def test_gains_are_right_up_to_what_redundancy_cannot_know(hexagon):
 def test_long_cables_are_within_reach_of_the_fit_from_there_but_not_from_unity(hexagon):
     data, settings, _ = start_of(hexagon, delays=True)
     near, far = run_calibrator(settings, data).solutions[0], run_calibrator(SETTINGS, data).solutions[0]
-    assert near.status == "converged"
+    # Without noise the minimum is zero, which single precision does not reach.
+    assert near.status in ("converged", "stalled")
     assert near.loss_history[0] < 0.1 * far.loss_history[0]
     assert near.loss_history[-1] < 0.1 * far.loss_history[-1]
 

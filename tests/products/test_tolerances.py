@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from calstudy.base.errors import InputError
 from calstudy.products.tolerances import LIMIT, Tolerance, faults, tolerance
 
 SEVERITIES = (0.0, 0.1, 1.0, 10.0)
@@ -18,6 +19,14 @@ def test_worlds_are_grouped_by_fault_and_ordered_by_severity():
 def test_a_severity_of_zero_of_its_own_takes_the_place_of_the_ideal_world():
     [found] = faults(["ideal", "drift: 0 %", "drift: 1 %"])
     assert (found.worlds, found.severities) == (("drift: 0 %", "drift: 1 %"), (0.0, 1.0))
+
+
+def test_severities_are_compared_in_one_unit():
+    [found] = faults(["ideal", "positions: 5 mm", "positions: 2 cm", "positions: 0.1 cm"])
+    assert found.severities == pytest.approx((0.0, 1.0, 5.0, 20.0))
+    assert found.unit == "mm"
+    with pytest.raises(InputError, match=r"'positions: 2 tiles' has the unit 'tiles', and others .* have 'mm'"):
+        faults(["positions: 5 mm", "positions: 2 tiles"])
 
 
 @pytest.mark.parametrize("power", [1, 2, 4])

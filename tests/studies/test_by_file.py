@@ -28,7 +28,7 @@ from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.studies.export import CARRIER, Contents
 from calstudy.studies.load import load_study
-from calstudy.studies.scores import Row, Scores, leaderboard, read_scores
+from calstudy.studies.scores import Row, Scores, leaderboard, read_scores, yardstick_of
 from calstudy.studies.study import Budget, run_study
 from calstudy.studies.worlds import load_worlds
 
@@ -188,20 +188,32 @@ def test_data_sets_are_told_by_their_digests_and_not_by_their_names(skycal, home
     assert scores_of(home, other, "renamed").rows[0].scores == scores_of(home, skycal).rows[0].scores
 
 
-def test_the_true_gains_and_foregrounds_leave_all_of_the_signal_and_nothing_else(exported, home, tmp_path):
-    """With V = g_a g_b* (F + S + N), division by g_a g_b* and subtraction of F leave S and N: T = s = 1, no bias."""
-    experiment = load(home / "secret.yaml")
+HEXAGON = ("instrument.layout={kind: hex, side: 3, spacing: 14 m}", "power.pairs=redundant-group")
+
+
+@pytest.mark.parametrize(
+    ("changes", "flagged"), [((), None), ((), 2), (HEXAGON, 0)], ids=["all", "one antenna flagged", "in groups"]
+)
+def test_the_true_gains_and_foregrounds_leave_all_of_the_signal_and_nothing_else(home, tmp_path, changes, flagged):
+    """With V = g_a g_b* (F + S + N), division by g_a g_b* and subtraction of F leave S and N: T = s = 1, no bias.
+
+    Baselines of an antenna without gains have no part in any of the powers that are compared.
+    """
+    experiment = load(home / "secret.yaml", overrides=list(changes))
     template = make_template(experiment.instrument)
     from calstudy.base.gains import make_uvcal
     from calstudy.base.observation import Observation
     from calstudy.corrupt.interface import draw_truth
 
     gains = draw_truth(experiment.corruption.effects[0], Observation(template))["gains"]
-    make_uvcal(template, gains).write_calh5(tmp_path / "true.calh5")
+    cal = make_uvcal(template, gains)
+    if flagged is not None:
+        cal.flag_array[flagged] = True
+    cal.write_calh5(tmp_path / "true.calh5")
     change = json.dumps({"calibrator": "by-file", "gains": str(tmp_path / "true.calh5"), "assumed": {}})
     path = tmp_path / "true.json"
     command("score", home / "secret.yaml", "--set", f"calibration={change}", "--set", "instrument.as_built={}",
-            "--output", path, "--workers", 1)  # fmt: skip
+            *(part for change in changes for part in ("--set", change)), "--output", path, "--workers", 1)  # fmt: skip
     [row] = read_scores(path).rows
     assert row.scores["flux_scale"] == pytest.approx(1, abs=1e-9)
     assert row.scores["gain_error_as_fitted"] < 1e-9
@@ -293,9 +305,10 @@ def test_gains_of_the_other_convention_are_inverted(skycal, home, tmp_path):
     calibrator = ByFile(folder=change_gains(skycal, tmp_path / "inverted", inverted))
     data = UVData.from_file(home / "out" / "data-1.uvh5")
     sky = UVData.from_file(home / "out" / "sky-model.uvh5")
-    digest = read_manifest(skycal / MANIFEST).data[0].digest
+    manifest = read_manifest(skycal / MANIFEST)
+    which = manifest.data[0].digest, manifest.sky_model_digest
     found, expected = (
-        run_calibrator(found.for_data(digest), data, sky) for found in (calibrator, ByFile(folder=skycal))
+        run_calibrator(found.for_data(*which), data, sky) for found in (calibrator, ByFile(folder=skycal))
     )
     assert np.allclose(found.gains.gain_array, expected.gains.gain_array, rtol=1e-12)
     assert np.array_equal(found.gains.flag_array, expected.gains.flag_array)
@@ -320,7 +333,7 @@ def test_a_folder_takes_part_in_a_comparison_beside_the_built_in_ones(skycal, ho
     assert_same_bands(found["first"]["mine"], found["first"]["built in"])
     text = (run.folder / "tables" / "comparison.md").read_text()
     assert "mine cannot work here" in text
-    assert re.search(r"\| mine \|.*4 by-file \| - \| - \|", text)
+    assert re.search(r"\| mine \|.*8 by-file \| - \| - \|", text)
 
 
 def test_the_content_of_gains_decides_the_key(skycal, home, tmp_path):
@@ -350,7 +363,35 @@ def test_worlds_of_a_comparison_get_folders_without_their_names(home, tmp_path, 
     assert first == read_manifest(exported / MANIFEST)
     assert first.digest != second.digest
     with pytest.raises(InputError, match="no gains for data-"):
-        find_returned(tmp_path / "worlds", second.data[0].digest)
+        find_returned(tmp_path / "worlds", second.data[0].digest, second.sky_model_digest)
+
+
+def test_gains_of_a_world_are_not_taken_for_those_of_one_with_the_same_data_and_another_sky_model(
+    skycal, home, tmp_path
+):
+    data = {
+        "name": "compared",
+        "experiment": str(home / "secret.yaml"),
+        "calibrators": {"mine": {"calibrator": "by-file", "folder": str(tmp_path / "back")}},
+        "worlds": {"as assumed": {"calibration.assumed": ASSUMED}, "all known": {"calibration.assumed": {}}},
+    }
+    path = tmp_path / "comparison.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    shutil.copytree(skycal, tmp_path / "back" / "world-1")
+    first, second = load_study(path).cases
+    of_both = [{task.key for task in Contents.of(case.experiment).data} for case in (first, second)]
+    assert of_both[0] == of_both[1]
+    assert first.refusal == ""
+    assert "of a world with another sky model" in second.refusal
+    # With a folder of its own, each world has its own gains.
+    own = tmp_path / "back" / "world-2"
+    change_gains(skycal, own, larger)
+    manifest = json.loads((own / MANIFEST).read_text())
+    manifest["sky_model_digest"] = Contents.of(second.experiment).sky_model.key
+    (own / MANIFEST).write_text(json.dumps(manifest))
+    first, second = load_study(path).cases
+    assert (first.refusal, second.refusal) == ("", "")
+    assert score(Graph(first.experiment)).key != score(Graph(second.experiment)).key
 
 
 # pyuvdata 3.2 leaves the SIGMA of samples without weight undefined.
@@ -385,8 +426,8 @@ def test_gains_come_back_as_casa_tables(skycal, exported, tmp_path):
     for item in manifest.data:
         UVCal.from_file(skycal / f"{item.name}.calh5").write_ms_cal(str(folder / f"{item.name}.cal"))
     data, sky = (UVData.from_file(exported / name) for name in ("data-1.uvh5", "sky-model.uvh5"))
-    digest = manifest.data[0].digest
-    found, own = (run_calibrator(ByFile(folder=place).for_data(digest), data, sky).gains for place in (folder, skycal))
+    which = manifest.data[0].digest, manifest.sky_model_digest
+    found, own = (run_calibrator(ByFile(folder=place).for_data(*which), data, sky).gains for place in (folder, skycal))
     assert np.array_equal(found.flag_array, own.flag_array)
     assert np.abs(found.gain_array - own.gain_array).max() < 1e-6 * np.abs(own.gain_array).max()
 
@@ -433,13 +474,15 @@ def test_the_leaderboard_is_up_to_date_and_its_scores_are_of_the_challenge():
     page = (ROOT / "docs" / "leaderboard.md").read_text()
     assert page == leaderboard(folder), "run: python -m calstudy leaderboard docs/challenge > docs/leaderboard.md"
     worlds = load_worlds(ROOT / "experiments" / "challenge.yaml", None, (), CARRIER)
-    digests = {case.world: Contents.of(case.experiment).digest for case in worlds.cases}
+    digests = {
+        case.world: (Contents.of(case.experiment).digest, yardstick_of(case.experiment)) for case in worlds.cases
+    }
     for path in folder.glob("*.json"):
         for item in read_scores(path).rows:
-            assert item.digest == digests[item.world], f"{path.name}: {item.world}"
+            assert (item.digest, item.yardstick) == digests[item.world], f"{path.name}: {item.world}"
 
 
-def row(world, calibrator, bias, error, transfer, digest="d"):
+def row(world, calibrator, bias, error, transfer, digest="d", yardstick="y"):
     bands = [
         {"k": [0.1, 0.2], "transfer": kept, "transfer_error": 0.1, "bias": off, "bias_error": error}
         for kept, off in zip(transfer, bias, strict=True)
@@ -454,7 +497,7 @@ def row(world, calibrator, bias, error, transfer, digest="d"):
         "cpu_seconds_per_integration": None,
         "peak_memory": None,
     }
-    return Row(world=world, calibrator=calibrator, digest=digest, scores=scores)
+    return Row(world=world, calibrator=calibrator, digest=digest, yardstick=yardstick, scores=scores)
 
 
 def test_a_leaderboard_ranks_by_what_is_unbiased_first_and_then_by_what_is_left(tmp_path):
@@ -475,8 +518,19 @@ def test_a_leaderboard_ranks_by_what_is_unbiased_first_and_then_by_what_is_left(
     store("c", row("1", "other", (0, 0), 0.1, (0.9, 0.9), digest="e"))
     with pytest.raises(InputError, match=r"'other' was scored on other data"):
         leaderboard(tmp_path)
+    store("c", row("1", "other", (0, 0), 0.1, (0.9, 0.9), yardstick="z"))
+    with pytest.raises(InputError, match=r"'other' was measured otherwise than others in the world '1'"):
+        leaderboard(tmp_path)
+    content = Scores(calstudy="0", name="c", rows=(row("1", "other", (0, 0), 0.1, (0.9, 0.9)),)).model_dump()
+    content["rows"][0]["scores"] = {}
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="has no bands of k with transfer, bias and bias_error"):
+        leaderboard(tmp_path)
     (tmp_path / "c.json").write_text("{}")
     with pytest.raises(InputError, match="is not a file of 'calstudy score --output'"):
         leaderboard(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        leaderboard(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="has no files of scores"):
         leaderboard(tmp_path / "empty")

@@ -154,6 +154,16 @@ def test_faults_name_the_case_and_the_field(tmp_path):
         load_study(comparison_file(tmp_path, figures=["wedge"]))
     with pytest.raises(ExperimentError, match="wrlds: unknown key, did you mean 'worlds'"):
         load_study(comparison_file(tmp_path, wrlds={}))
+    # Every case is held to the same yardstick, with the calibrator of its label, and no block is lost.
+    for changes, sentence in {
+        "calibration.calibrator: none": "'a' changes the calibrator",
+        "power.taper: none": "'a' changes power.taper; all cases are measured alike",
+        "instrument: {as_built: {}}": r"'a' replaces all of instrument; .* \(instrument.as_built\)",
+    }.items():
+        with pytest.raises(ExperimentError, match=sentence):
+            load_study(comparison_file(tmp_path, worlds={"a": yaml.safe_load(changes)}))
+    with pytest.raises(ExperimentError, match="'x: 2 kg' has the unit 'kg'"):
+        load_study(comparison_file(tmp_path, worlds={"x: 1 cm": {}, "x: 2 kg": {}}))
     with pytest.raises(InputError, match="--scale large"):
         load_study(comparison_file(tmp_path), "large")
 

@@ -51,11 +51,11 @@ class ByFile(Calibrator):
             raise fault("model", "goes with gains; models for data of a folder are in the folder")
         return self
 
-    def for_data(self, digest: str) -> Self:
+    def for_data(self, digest: str, sky_model: str | None = None) -> Self:
         """Return the calibrator with the files of one data set; raises InputError if the folder has none for it."""
         if self.folder is None:
             return self
-        found = find_returned(self.folder, digest)
+        found = find_returned(self.folder, digest, sky_model)
         return self.model_copy(update={"folder": None, "gains": found.gains, "model": found.model})
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
