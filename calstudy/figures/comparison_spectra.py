@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,10 +31,12 @@ ROW_HEIGHT, LARGEST_K = 1.7, 1.0
 def look(place: int) -> dict[str, Any]:
     """Return colour, marker and line of one of several calibrators or worlds."""
     lines = ("-", "--", ":")
+    again, place = divmod(place, len(COLOURS))
     return {
-        "color": COLOURS[place % len(COLOURS)],
-        "marker": MARKERS[place % len(MARKERS)],
-        "linestyle": lines[place // len(COLOURS) % len(lines)],
+        "color": COLOURS[place],
+        # A colour that comes again has another marker.
+        "marker": MARKERS[(place + 3 * again) % len(MARKERS)],
+        "linestyle": lines[again % len(lines)],
     }
 
 
@@ -63,8 +65,8 @@ def draw_spectra(
             shift = 0.15 * (place - (len(calibrators) - 1) / 2) / len(calibrators)
             _draw_points(left, case, "recovered", place, shift)
             _draw_points(right, case, "bias", place, shift)
-        _scale(left, "recovered")
-        _scale(right, "bias")
+        _scale(left, "recovered", found.values())
+        _scale(right, "bias", found.values())
         left.axhline(REFERENCE["recovered"], color=style.GREY, linewidth=0.7, zorder=0)
         right.axhline(REFERENCE["bias"], color=style.GREY, linewidth=0.7, zorder=0)
         left.set_title(world, loc="left")
@@ -81,16 +83,25 @@ def draw_spectra(
 def _draw_points(axes: Axes, case: Case, name: str, place: int, shift: float) -> None:
     bins = case.bins
     values, errors = getattr(bins, name), getattr(bins, f"{name}_error")
-    used = np.isfinite(values) & (bins.k <= LARGEST_K)
+    used = _used(case, name)
     k = bins.k + shift * np.diff(bins.bin_edges)
     bars = SIGMAS_95 * np.nan_to_num(errors[used])
     axes.errorbar(k[used], values[used], yerr=bars, elinewidth=0.5, linewidth=0.6, markersize=2.5, **look(place))
 
 
-def _scale(axes: Axes, name: str) -> None:
-    """Make an axis logarithmic where its values are large, with limits just beyond them, zero and the reference."""
-    low, high = axes.dataLim.intervaly
-    low, high = min(low, 0.0), max(high, REFERENCE[name])
+def _used(case: Case, name: str) -> np.ndarray:
+    return np.isfinite(getattr(case.bins, name)) & (case.bins.k <= LARGEST_K)
+
+
+def _scale(axes: Axes, name: str, cases: Iterable[Case]) -> None:
+    """Make an axis logarithmic where its values are large, with limits just beyond them, zero and the reference.
+
+    Bars may reach beyond the limits: those of what is known worst would make the rest too small to read.
+    """
+    values = np.concatenate([getattr(case.bins, name)[_used(case, name)] for case in cases])
+    if not values.size:
+        return
+    low, high = min(values.min(), 0.0), max(values.max(), REFERENCE[name])
     if max(-low, high) <= 2 * LINEAR[name]:
         return
     axes.set_yscale("symlog", linthresh=LINEAR[name], linscale=DECADES[name])
