@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gc
 import os
 from collections.abc import Iterator
 from typing import IO, Any
@@ -24,7 +25,8 @@ from pyuvdata import UVData
 from calstudy.instrument.telescope import make_template
 
 # How long an example takes is the machine's affair: a busy one fails hypothesis' deadline of 0.2 s, and no property.
-settings.register_profile("any-machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# Fifty examples, other ones in every run.
+settings.register_profile("any-machine", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any-machine")
 
 
@@ -33,13 +35,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--notebook-outputs", metavar="FOLDER", help="write notebooks that were run to this folder")
 
 
-LONGEST = {"test_ladder.py"}
-"""Files that take minutes: begun last, they would run alone, on one core, when all others are done."""
+LONGEST = {"test_ladder.py", "test_comparison.py", "test_signal_loss.py", "test_observed.py", "test_regression.py"}
+"""Files that take longest: begun last, one would run alone, on one core, when all others are done."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first; the processes of pytest-xdist take files in the order of collection."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+def pytest_collection_finish() -> None:
+    """Take what is imported by now out of garbage collections, which would look at all objects of all libraries."""
+    gc.collect()
+    gc.freeze()
 
 
 PNG = base64.b64decode(

@@ -83,7 +83,8 @@ def test_what_is_left_is_orthogonal_to_the_minimum(pair):
 
 def test_every_solver_tells_how_far_it_is(pair):
     problem = pair[0].problem()
-    for solver in (GaussNewton(), Lbfgs(), FirstOrder(Optimizer(max_steps=300))):
+    # L-BFGS would take a thousand steps to the minimum, and is stopped on its way like Adamax.
+    for solver in (GaussNewton(), Lbfgs(max_steps=100), FirstOrder(Optimizer(max_steps=300))):
         solution = solve(problem, solver)
         # Gauss-Newton judges with the blocks of an earlier step, whose prediction is a little off.
         assert solution.newton_decrement == pytest.approx(min(newton_decrement_at(problem, solution.gains), 1), rel=0.1)

@@ -184,7 +184,9 @@ def dense_residual_power(problem, gains, model):
     return found
 
 
-@pytest.mark.parametrize("prior", ["own", "shared", "both"])
+@pytest.mark.parametrize(
+    "prior", [*(pytest.param(prior, marks=pytest.mark.slow) for prior in ("own", "shared")), "both"]
+)
 def test_a_finite_prior_leaves_what_the_dense_posterior_mean_leaves(prior):
     problem, gains, model = prior_case(prior)
     found = expected_transfer(problem, gains, model, MODES)

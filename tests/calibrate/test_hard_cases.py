@@ -108,6 +108,16 @@ CASES = {
     "3 km, 500 ns": Hard(150 * scattered(10), channels=192, width=20e3, cables=500e-9, delay_step="1 us"),
 }
 
+EASIER_OR_LARGER = {
+    "golomb, 60 ns",
+    "golomb, 300 ns",
+    "random, 60 ns",
+    "random, 300 ns",
+    "1536 channels, 300 ns",
+    "3 km, 500 ns",
+}
+"""With shorter cables than cases of the same array, or more data: left to ``pytest -m slow``."""
+
 
 @pytest.fixture(scope="module")
 def floors():
@@ -125,7 +135,9 @@ def floors():
 
 
 @pytest.mark.parametrize("with_sky", [True, False], ids=["sky model", "no sky model"])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in EASIER_OR_LARGER else []) for name in CASES]
+)
 def test_the_minimum_is_found_from_delays(name, with_sky, floors):
     simulation, problem, floor = floors(name, CASES[name])
     sky = simulation.foregrounds(0) if with_sky else None

@@ -83,15 +83,14 @@ def test_schedules_start_and_end_where_they_should(schedule):
     assert rates == pytest.approx([0.02, middle, last], rel=1e-9)
 
 
-@pytest.mark.parametrize("schedule", ["cosine", "exponential"])
-def test_a_falling_rate_reaches_the_minimum_where_the_constant_one_jitters(converged, schedule):
+def test_falling_rates_reach_the_minimum_where_the_constant_one_jitters(converged):
     problem, best = converged
     losses = {}
-    for name in (schedule, "constant"):
+    for name in ("cosine", "exponential", "constant"):
         optimizer = Optimizer(learning_rate=0.03, schedule=name, final_rate=1e-3, max_steps=8000)
         solution = solve(problem, FirstOrder(optimizer, precision="double", tolerance=0.0))
         losses[name] = np.median(solution.loss_history[-50:])
-    assert losses[schedule] < 1.2 * best.loss_history[-1] < losses["constant"]
+    assert max(losses["cosine"], losses["exponential"]) < 1.2 * best.loss_history[-1] < losses["constant"]
 
 
 def smooth_toy(delay=400e-9):
@@ -117,7 +116,12 @@ def test_coordinates_of_smooth_gains_are_adjoint():
 
 @pytest.mark.parametrize(
     "solver",
-    [GaussNewton(tolerance=1e-4), Lbfgs(tolerance=3e-4), FirstOrder(Optimizer("adamax", 0.02, "cosine", 1e-3, 8000))],
+    [
+        GaussNewton(tolerance=1e-4),
+        # It takes many steps to the minimum.
+        pytest.param(Lbfgs(tolerance=3e-4), marks=pytest.mark.slow),
+        FirstOrder(Optimizer("adamax", 0.02, "cosine", 1e-3, 8000)),
+    ],
     ids=lambda solver: type(solver).__name__,
 )
 def test_smooth_gains_stay_smooth_and_fit_as_well(solver):
@@ -175,7 +179,9 @@ def test_joint_solves_share_gains_and_lose_less_of_the_noise():
     assert joint > 1.2 * np.mean(alone)
 
 
-def test_pieces_of_any_size_give_the_same_projection(toy):
+def test_pieces_of_any_size_give_the_same_projection():
+    # Ten baselines: each piece is a part of the graph that has to be compiled.
+    toy = make_toy(scattered(5))
     structure = toy.structure
     gains = pairs.to_pair(toy.gains, tf.float64)
     eta = pairs.to_pair(toy.gains - 1, tf.float32)

@@ -39,6 +39,7 @@ def commands(text: str) -> list[str]:
     return [match["rest"] for part in parts if (match := COMMAND.match(part))]
 
 
+CALSTUDY = get_command(app)
 FOUND = sorted({(path.relative_to(ROOT).as_posix(), command) for path in PAGES for command in commands(text_of(path))})
 
 
@@ -50,7 +51,7 @@ def test_there_are_commands():
 def test_a_printed_command_is_understood(page, command):
     """Arguments in capitals, such as FILE, stand for any; what is in brackets or after | is a choice."""
     words = shlex.split(re.sub(r"\[[^\]]*\]|\s\|.*|…|\.\.\.", "", command), comments=True)
-    group: click.Command = get_command(app)
+    group: click.Command = CALSTUDY
     while isinstance(group, click.Group):
         name = words.pop(0)
         assert name in group.commands, f"{page}: calstudy has no command {name!r}"

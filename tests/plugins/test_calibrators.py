@@ -120,7 +120,8 @@ def test_a_plan_has_its_cost_and_its_refusal(reference, tmp_path, capsys):
     assert told == "calstudy: calibration.max_length: is exceeded by a baseline of 28 m\n"
 
 
-def test_a_run_uses_it_and_tells_its_status(reference, tmp_path):
+def test_a_run_uses_it_and_tells_its_status(reference, tmp_path, shared_store):
+    (tmp_path / "store").symlink_to(shared_store)
     settings = {"calibrator": reference, "factor": 2.0, "status": "max-steps"}
     run = run_study(load_study(experiment(tmp_path, settings)), Budget(workers=1))
     told = [text for text in run.warnings if text.startswith("calibrate (")]

@@ -45,7 +45,7 @@ def test_the_page_shows_something():
 
 
 @pytest.mark.parametrize("title", sections())
-def test_an_example_is_short_and_runs(title, tmp_path):
+def test_an_example_is_short_and_runs(title, tmp_path, shared_store):
     blocks = sections()[title]
     lines = blocks["python"].splitlines()
     assert len(lines) < MOST_LINES
@@ -55,7 +55,7 @@ def test_an_example_is_short_and_runs(title, tmp_path):
     assert name[1] in plugin_reference(tmp_path / name[1])
     path = tmp_path / "experiment.yaml"
     experiment = merged(tiny(tmp_path), {"simulation": {"chunks": 1}, "calibration": {"chunks": 1}})
-    experiment["outputs"]["figures"] = ["layout", "spherical"]
+    experiment["outputs"] |= {"store": str(shared_store), "figures": ["layout", "spherical"]}
     path.write_text(yaml.safe_dump(merged(experiment, yaml.safe_load(blocks["yaml"]))))
     run = run_study(load_study(path), Budget(workers=1))
     assert (run.folder / "report.html").is_file()

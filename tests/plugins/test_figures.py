@@ -60,9 +60,11 @@ class Sizes(ComparisonFigure):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory, shared_store) -> Path:
     """Where all runs of this file go: they share the products of the tiny experiment."""
-    return tmp_path_factory.mktemp("figures")
+    folder = tmp_path_factory.mktemp("figures")
+    (folder / "store").symlink_to(shared_store)
+    return folder
 
 
 def study_of(folder: Path, *figures: Any, **changes: Any):

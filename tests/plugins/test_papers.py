@@ -30,9 +30,11 @@ BROKEN = CODE.replace('run.measured("gains_aligned")', "run.gains")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory, shared_store) -> Path:
     """Where all runs of this file go: they share the products of the tiny experiment."""
-    return tmp_path_factory.mktemp("papers")
+    folder = tmp_path_factory.mktemp("papers")
+    (folder / "store").symlink_to(shared_store)
+    return folder
 
 
 def run_of(folder: Path, *papers: str, **changes) -> tuple[Run, str]:
