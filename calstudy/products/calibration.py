@@ -48,7 +48,7 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     inputs = {"data": corruption.data(graph, variant, parity)}
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
-    calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model and model.key)
+    calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model.key if model else None)
     settings = calibrator.reset("assumed")
     if settings.needs_noise:
         inputs["levels"] = corruption.levels(graph)

@@ -111,7 +111,7 @@ def _require_calibrators(experiment: Experiment) -> None:
     for variant in experiment.variants.values():
         for parity in PARITIES if variant.calibrate else ():
             model = sky_model(graph)
-            calibrator = experiment.calibration.for_data(data(graph, variant, parity).key, model and model.key)
+            calibrator = experiment.calibration.for_data(data(graph, variant, parity).key, model.key if model else None)
             if not any(calibrator is other for other in asked):
                 asked.append(calibrator)
                 frame = frame_of(experiment.instrument)

@@ -160,13 +160,7 @@ def test_data_are_those_of_the_run_and_the_sky_model_is_what_is_assumed(exported
     assert 0.01 < np.linalg.norm(sky - truth) / np.linalg.norm(truth) < 0.2
 
 
-@pytest.mark.parametrize(
-    ("block", "models"),
-    [
-        pytest.param("skycal", False, id="skycal"),
-        pytest.param(CALAMITY, True, id="calamity", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("block", "models"), [("skycal", False), (CALAMITY, True)], ids=["skycal", "calamity"])
 def test_a_built_in_calibrator_through_files_gives_its_own_row(exported, home, block, models, tmp_path):
     """Gains, and models of double precision, come back as they went: what is left is the order of sums."""
     own = home / "own.json"
