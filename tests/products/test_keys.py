@@ -33,7 +33,7 @@ def changed_stages(path: str, value: object) -> set[str]:
     return {stage for (stage, label), key in after.items() if before.get((stage, label)) != key}
 
 
-AVERAGED = {"power", "spectra", "figure", "claims", "transfer"}
+AVERAGED = {"power", "spectra", "figure", "claims", "transfer", "score"}
 DOWNSTREAM = {
     "levels",
     "corrupt",
@@ -53,8 +53,8 @@ DOWNSTREAM = {
         ("description", "words", set()),
         ("outputs.store", "elsewhere", set()),
         ("outputs.figures", ["layout"], set()),
-        ("power.wedge_buffer", "200 ns", {"spectra", "figure", "agreement", "claims", "transfer"}),
-        ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure", "claims", "transfer"}),
+        ("power.wedge_buffer", "200 ns", {"spectra", "figure", "agreement", "claims", "transfer", "score"}),
+        ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure", "claims", "transfer", "score"}),
         ("power.taper", "hann", AVERAGED | {"flux-scale"}),
         ("calibration.basis.buffer", "80 ns", DOWNSTREAM - {"levels", "corrupt"}),
         ("corruption.effects.0.seed", 99, {"effect", "gains"} | DOWNSTREAM - {"levels"}),
