@@ -46,7 +46,7 @@ class GaussNewtonSettings(Section):
         "single",
         description="Of the inner products of the iteration. Where the noise is below about 3e-4 of the data, some "
         "directions are not resolved by single precision: `double` goes on with less damping, and `single` is "
-        "`stalled` if more than 1e-3 of the loss (or `tolerance`, if that is larger) is predicted to go there.",
+        "`stalled` if more than 1 % of the loss (or `tolerance`, if that is larger) is predicted to go there.",
     )
     warm_start: bool = Field(True, description="Start each integration from the solution of the one before.")
 

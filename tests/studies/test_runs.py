@@ -143,7 +143,7 @@ def test_a_complete_store_is_only_read(finished, folder, monkeypatch):
 
 def test_a_changed_field_makes_only_what_reads_it_in_another_run_folder(finished, folder):
     result, _ = run_here(override(tiny(folder), "power.bins.width", "0.2 h/Mpc"), folder)
-    assert stages_made(result) == {"spectra", "figure", "claims", "transfer"}
+    assert stages_made(result) == {"spectra", "figure", "claims", "transfer", "score"}
     figures = {task.label for task in result.made.tasks if task.stage.name == "figure"}
     assert figures == {"wedge", "spherical", "signal-loss"}
     assert result.folder != finished.folder
