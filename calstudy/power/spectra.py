@@ -220,15 +220,22 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
 
 
 def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:
-    """Return spectra of the units that all have, made of the same pairs of baselines in each, in the same order.
+    """Return the spectra of the units that all have in common, each averaged over the same pairs of baselines.
 
-    Baselines that are flagged altogether have no spectra. Where an antenna has no gains, that makes baselines of the
-    residual which the EoR has.
+    Baselines that are flagged altogether have no spectra. Those of an antenna without gains are missing in the spectra
+    of the residual, but not in those of the EoR.
+
+    Parameters
+    ----------
+    spectra
+        By name, of the same delays; their units are in the same order.
 
     Raises
     ------
     InputError
-        If they have nothing in common.
+        If they have no unit in common.
+    ValueError
+        If their units are in different orders.
     """
     first, *others = keys = [one.pairs_of_units() for one in spectra.values()]
     if all(other == first for other in others):

@@ -88,7 +88,7 @@ class ComparisonFile(Section):
 
     @field_validator("worlds")
     @classmethod
-    def _has_one_yardstick(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    def _change_no_measurement(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         for label, changes in value.items():
             for path, new in changes.items():
                 block, _, rest = path.partition(".")

@@ -43,8 +43,8 @@ class Row(Section):
         Their labels.
     digest
         Of the data and the sky model of the world, as in the manifest of an export.
-    yardstick
-        Digest of how spectra and scores are measured (`yardstick_of`).
+    scoring
+        Digest of how spectra and scores are measured (`scoring_of`).
     scores
         As in score.json.
     """
@@ -52,7 +52,7 @@ class Row(Section):
     world: str
     calibrator: str
     digest: str
-    yardstick: str
+    scoring: str
     scores: dict[str, Any]
 
     @field_validator("scores")
@@ -86,7 +86,7 @@ class Scores(Section):
     refusals: tuple[tuple[str, str, str], ...] = ()
 
 
-def yardstick_of(experiment: Experiment) -> str:
+def scoring_of(experiment: Experiment) -> str:
     """Return a digest of how a calibrator is measured: the settings of the power spectra, and the version of scores."""
     return digest_json([identity(experiment.power), SCORE.version])
 
@@ -114,7 +114,7 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
             world=case.world,
             calibrator=case.calibrator,
             digest=Contents.of(case.experiment).digest,
-            yardstick=yardstick_of(case.experiment),
+            scoring=scoring_of(case.experiment),
             scores=read_json(made.products[task.key].path / SUMMARY),
         )
         for case, task in zip(cases, tasks, strict=True)
@@ -232,7 +232,7 @@ def _require_fitting(path: Path, row: Row, rows: Mapping[str, Row]) -> None:
             f"{path}: {row.calibrator!r} was scored on other data than {others[0].calibrator!r} in the world "
             f"{row.world!r} (their digests differ); score it again with the same experiment and version"
         )
-    if any(other.yardstick != row.yardstick for other in rows.values()):
+    if any(other.scoring != row.scoring for other in rows.values()):
         raise InputError(
             f"{path}: {row.calibrator!r} was measured otherwise than others in the world {row.world!r} (settings of "
             "'power', or another version of scores); score it again with the same experiment and version"

@@ -28,7 +28,7 @@ from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.studies.export import CARRIER, Contents
 from calstudy.studies.load import load_study
-from calstudy.studies.scores import Row, Scores, leaderboard, read_scores, yardstick_of
+from calstudy.studies.scores import Row, Scores, leaderboard, read_scores, scoring_of
 from calstudy.studies.study import Budget, run_study
 from calstudy.studies.worlds import load_worlds
 
@@ -474,15 +474,13 @@ def test_the_leaderboard_is_up_to_date_and_its_scores_are_of_the_challenge():
     page = (ROOT / "docs" / "leaderboard.md").read_text()
     assert page == leaderboard(folder), "run: python -m calstudy leaderboard docs/challenge > docs/leaderboard.md"
     worlds = load_worlds(ROOT / "experiments" / "challenge.yaml", None, (), CARRIER)
-    digests = {
-        case.world: (Contents.of(case.experiment).digest, yardstick_of(case.experiment)) for case in worlds.cases
-    }
+    digests = {case.world: (Contents.of(case.experiment).digest, scoring_of(case.experiment)) for case in worlds.cases}
     for path in folder.glob("*.json"):
         for item in read_scores(path).rows:
-            assert (item.digest, item.yardstick) == digests[item.world], f"{path.name}: {item.world}"
+            assert (item.digest, item.scoring) == digests[item.world], f"{path.name}: {item.world}"
 
 
-def row(world, calibrator, bias, error, transfer, digest="d", yardstick="y"):
+def row(world, calibrator, bias, error, transfer, digest="d", scoring="y"):
     bands = [
         {"k": [0.1, 0.2], "transfer": kept, "transfer_error": 0.1, "bias": off, "bias_error": error}
         for kept, off in zip(transfer, bias, strict=True)
@@ -497,7 +495,7 @@ def row(world, calibrator, bias, error, transfer, digest="d", yardstick="y"):
         "cpu_seconds_per_integration": None,
         "peak_memory": None,
     }
-    return Row(world=world, calibrator=calibrator, digest=digest, yardstick=yardstick, scores=scores)
+    return Row(world=world, calibrator=calibrator, digest=digest, scoring=scoring, scores=scores)
 
 
 def test_a_leaderboard_ranks_by_what_is_unbiased_first_and_then_by_what_is_left(tmp_path):
@@ -518,7 +516,7 @@ def test_a_leaderboard_ranks_by_what_is_unbiased_first_and_then_by_what_is_left(
     store("c", row("1", "other", (0, 0), 0.1, (0.9, 0.9), digest="e"))
     with pytest.raises(InputError, match=r"'other' was scored on other data"):
         leaderboard(tmp_path)
-    store("c", row("1", "other", (0, 0), 0.1, (0.9, 0.9), yardstick="z"))
+    store("c", row("1", "other", (0, 0), 0.1, (0.9, 0.9), scoring="z"))
     with pytest.raises(InputError, match=r"'other' was measured otherwise than others in the world '1'"):
         leaderboard(tmp_path)
     content = Scores(calstudy="0", name="c", rows=(row("1", "other", (0, 0), 0.1, (0.9, 0.9)),)).model_dump()

@@ -10,9 +10,9 @@ Smooth gains that foregrounds can nearly follow have eigenvalues of any size dow
 that are smaller. They matter where the noise is far below the foregrounds. Once the loss is so small that single
 precision does not resolve the damping, convergence is checked in double precision, with a hundredth of the damping and
 a solution of the normal equations. If more is predicted to go, the iteration is stalled, or goes on in double precision
-if that is asked for. In such directions steps are long and valleys curved: the damping then
-remembers what it was raised to, gains change by the exponential of a step, along which a phase is only a phase, and
-steps are bent by their geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885).
+if that is asked for. In such directions steps are long and valleys curved: the damping then remembers what it was
+raised to, gains change by the exponential of a step, along which a phase is only a phase, and steps are bent by their
+geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885).
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ CHECK = 1e-2
 RAISE = 4.0
 TOO_CURVED = 0.6
 POOR, GOOD = 0.25, 0.75
-# What of the loss may be predicted to go in directions that single precision does not resolve. Small arrays with little
-# noise are often short of the minimum by some parts in a thousand, which changes no result.
+# What of the loss may be predicted to go in directions that single precision does not resolve: small arrays with little
+# noise often stop some parts in a thousand above the minimum.
 UNRESOLVED = 1e-2
 # Antenna blocks that need more iterations than this are out of date.
 CG_REFRESH = 15
