@@ -204,10 +204,14 @@ def test_a_vanishing_deviation_is_sky_based_calibration_by_hera_cal(toy):
     assert np.abs(difference).max() < 1e-6
 
 
-def test_a_huge_deviation_is_calamity(toy):
+@pytest.mark.parametrize("part", [0, 0.7], ids=["no mean", "mean"])
+def test_a_huge_deviation_is_calamity(toy, part):
     """The loss at any gains is that of free foregrounds, if the sky model has nothing beyond the modelled delays."""
     structure = free_structure(toy)
-    problem = noisy(toy, structure, np.zeros_like(toy.foregrounds), (1e12, 1e12))
+    sky_model = np.empty_like(toy.foregrounds)
+    for bucket in toy.basis.buckets:
+        sky_model[bucket.members] = part * toy.foregrounds[bucket.members] @ bucket.vectors @ bucket.vectors.T
+    problem = noisy(toy, structure, sky_model, (1e12, 1e12))
     free = replace(problem, structure=toy.structure, deviations=(np.inf, np.inf))
     at = 1 + 0.1 * complex_normal(np.random.default_rng(2), toy.gains.shape)
     losses = []
