@@ -101,8 +101,7 @@ class Vectors:
         # One where coefficients are not padding, zero where they are.
         self.filled = np.arange(self.n_vectors) < widths[index][:, None]
         # Rows of one basis, or, if there are few of each, the basis of every row.
-        edges = np.searchsorted(index, np.arange(len(bases) + 1))
-        self._alike = list(pairwise(edges.tolist()))
+        self._alike = np.bincount(index, minlength=len(bases)).tolist()
         self._by_basis = len(index) >= ALIKE * len(bases) or len(bases) == 1
         self._bases = [tf.constant(basis.T) for basis in bases] if self._by_basis else []
         self._overlaps = [tf.constant(overlap) for overlap in overlaps] if self._by_basis else []
@@ -115,8 +114,8 @@ class Vectors:
             stacked = tf.gather(self._stack, self._index)
             return tf.matmul(curvature[:, None, :] * stacked, stacked, transpose_b=True)
         found = []
-        for (start, end), basis in zip(self._alike, self._bases, strict=True):
-            weighted = tf.reshape(curvature[start:end, None, :] * tf.transpose(basis), [-1, self.length])
+        for rows, basis in zip(tf.split(curvature, self._alike), self._bases, strict=True):
+            weighted = tf.reshape(tf.expand_dims(rows, 1) * tf.transpose(basis), [-1, self.length])
             found.append(tf.reshape(weighted @ basis, [-1, self.n_vectors, self.n_vectors]))
         return _joined(found, 0)
 
@@ -125,8 +124,8 @@ class Vectors:
         if not self._by_basis:
             return tf.matmul(tf.gather(self._stack, self._index), tf.transpose(values, [1, 2, 0]))
         found = []
-        for (start, end), basis in zip(self._alike, self._bases, strict=True):
-            product = tf.reshape(values[:, start:end], [-1, self.length]) @ basis
+        for rows, basis in zip(tf.split(values, self._alike, axis=1), self._bases, strict=True):
+            product = tf.reshape(rows, [-1, self.length]) @ basis
             found.append(tf.reshape(product, [2, -1, self.n_vectors]))
         return tf.transpose(_joined(found, 1), [1, 2, 0])
 
@@ -136,9 +135,10 @@ class Vectors:
             product = tf.matmul(tf.gather(self._stack, self._index), coefficients, transpose_a=True)
             return tf.transpose(product, [2, 0, 1])
         found = []
-        for (start, end), basis in zip(self._alike, self._bases, strict=True):
-            rows = tf.reshape(tf.transpose(coefficients[start:end], [2, 0, 1]), [-1, self.n_vectors])
-            found.append(tf.reshape(tf.matmul(rows, basis, transpose_b=True), [2, -1, self.length]))
+        columns = tf.transpose(coefficients, [2, 0, 1])
+        for rows, basis in zip(tf.split(columns, self._alike, axis=1), self._bases, strict=True):
+            product = tf.matmul(tf.reshape(rows, [-1, self.n_vectors]), basis, transpose_b=True)
+            found.append(tf.reshape(product, [2, -1, self.length]))
         return _joined(found, 1)
 
     def overlap(self, root: tf.Tensor) -> tf.Tensor:
@@ -146,8 +146,8 @@ class Vectors:
         if not self._by_basis:
             return root @ tf.gather(self._stacked_overlaps, self._index)
         found = []
-        for (start, end), overlap in zip(self._alike, self._overlaps, strict=True):
-            product = tf.reshape(root[start:end], [-1, self.n_vectors]) @ overlap
+        for rows, overlap in zip(tf.split(root, self._alike), self._overlaps, strict=True):
+            product = tf.reshape(rows, [-1, self.n_vectors]) @ overlap
             found.append(tf.reshape(product, [-1, root.shape[1], overlap.shape[1]]))
         return _joined(found, 0)
 

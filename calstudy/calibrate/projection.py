@@ -129,9 +129,10 @@ class Projector:
         self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
         self._level = 0 if structure.prior == "own" else 1
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
-        left, singular, _ = np.linalg.svd(
-            np.concatenate([_side_by_side(basis) for basis in distinct], axis=1), full_matrices=False
-        )
+        vectors = np.concatenate([_side_by_side(basis) for basis in distinct], axis=1)
+        # R of a QR decomposition has the same left singular vectors; the right ones, of no use, would take most time.
+        triangle = np.asarray(np.linalg.qr(vectors.T, mode="r"))
+        left, singular, _ = np.linalg.svd(triangle.T, full_matrices=False)
         common = left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
         self.common = tf.constant(common, dtype)
         self.rank = common.shape[1]

@@ -138,7 +138,7 @@ class FitTensors:
         """`sum_over_group` for (2, Nbls, Nfreqs)."""
         if self.model_index is None:
             return values
-        return tf.stack([self.sum_over_group(values[0]), self.sum_over_group(values[1])])
+        return tf.stack([self.sum_over_group(part) for part in tf.unstack(values)])
 
     def gain_products(self, gains: tf.Tensor, start: int = 0, end: int | None = None) -> tf.Tensor:
         """Return g_a g_b* of a range of baselines, (2, end - start, Nfreqs).
@@ -156,8 +156,10 @@ class FitTensors:
 
     def relative_change(self, eta: tf.Tensor) -> tf.Tensor:
         """Return eta_a + eta_b*: the first-order relative change of g_a g_b* when g becomes g (1 + eta)."""
-        first, second = tf.gather(eta, self.first, axis=1), tf.gather(eta, self.second, axis=1)
-        return tf.stack([first[0] + second[0], first[1] - second[1]])
+        (a_real, a_imaginary), (b_real, b_imaginary) = (
+            tf.unstack(tf.gather(eta, index, axis=1)) for index in (self.first, self.second)
+        )
+        return tf.stack([a_real + b_real, a_imaginary - b_imaginary])
 
     def sum_over_antenna(self, values: tf.Tensor, baselines: tuple[int, int] | None = None) -> tf.Tensor:
         """Add each baseline to a and its conjugate to b, the transpose of `relative_change`; (2, Nants, ...).
@@ -173,6 +175,10 @@ class FitTensors:
         def scatter(part: tf.Tensor, index: tf.Tensor) -> tf.Tensor:
             return tf.math.unsorted_segment_sum(part, index, self.n_antennas)
 
-        real = scatter(values[0], first) + scatter(values[0], second)
-        imaginary = scatter(values[1], first) - scatter(values[1], second)
-        return tf.stack([real, imaginary])
+        real, imaginary = tf.unstack(values)
+        return tf.stack(
+            [
+                scatter(real, first) + scatter(real, second),
+                scatter(imaginary, first) - scatter(imaginary, second),
+            ]
+        )
