@@ -6,8 +6,6 @@ a visibility is V_xx = ½ ∫ A I exp(−2πi ν b·s/c) dΩ.
 
 from __future__ import annotations
 
-import pickle
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,25 +77,15 @@ class ExactBeam:
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
         """Return Ω_p and Ω_pp in sr, each of shape (Nfreqs,); see `Beam`."""
-        # The power spectra of a run, and of all runs of a study, ask for the same ones.
-        omega_p, omega_pp = _solid_angles(pickle.dumps(self._analytic), tuple(frequencies.tolist()), polarization)
-        return np.array(omega_p), np.array(omega_pp)
-
-
-@lru_cache(maxsize=32)
-def _solid_angles(
-    pickled_beam: bytes, frequencies: tuple[float, ...], polarization: str
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the solid angles of an analytic beam; pickled, because beams have no hash."""
-    beam = pickle.loads(pickled_beam)
-    azimuth, zenith_angle = (grid.ravel() for grid in np.meshgrid(AZIMUTHS, ZENITH_ANGLES))
-    angles = []
-    for frequency in frequencies:
-        jones = beam.efield_eval(az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency]))
-        power = (np.abs(jones[:, FEEDS[polarization], 0]) ** 2).sum(axis=0)
-        angles.append(integrate_power(power.reshape(len(ZENITH_ANGLES), len(AZIMUTHS)), ZENITH_ANGLES))
-    omega_p, omega_pp = zip(*angles, strict=True)
-    return omega_p, omega_pp
+        azimuth, zenith_angle = (grid.ravel() for grid in np.meshgrid(AZIMUTHS, ZENITH_ANGLES))
+        angles = []
+        for frequency in frequencies:
+            jones = self._analytic.efield_eval(
+                az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency], dtype=float)
+            )
+            power = (np.abs(jones[:, FEEDS[polarization], 0]) ** 2).sum(axis=0)
+            angles.append(integrate_power(power.reshape(len(ZENITH_ANGLES), len(AZIMUTHS)), ZENITH_ANGLES))
+        return tuple(np.array(angles).T)
 
 
 class GriddedBeam:
