@@ -100,8 +100,8 @@ class Vectors:
         self.n_vectors, self.length = bases.shape[1:]
         # One where coefficients are not padding, zero where they are.
         self.filled = np.arange(self.n_vectors) < widths[index][:, None]
-        # Rows of one basis, or, if there are few of each, the basis of every row.
-        self._alike = np.bincount(index, minlength=len(bases)).tolist()
+        # How many rows each basis has, or, if there are few of each, the basis of every row.
+        self._rows_of_basis = np.bincount(index, minlength=len(bases)).tolist()
         self._by_basis = len(index) >= ALIKE * len(bases) or len(bases) == 1
         self._bases = [tf.constant(basis.T) for basis in bases] if self._by_basis else []
         self._overlaps = [tf.constant(overlap) for overlap in overlaps] if self._by_basis else []
@@ -114,7 +114,7 @@ class Vectors:
             stacked = tf.gather(self._stack, self._index)
             return tf.matmul(curvature[:, None, :] * stacked, stacked, transpose_b=True)
         found = []
-        for rows, basis in zip(tf.split(curvature, self._alike), self._bases, strict=True):
+        for rows, basis in zip(tf.split(curvature, self._rows_of_basis), self._bases, strict=True):
             weighted = tf.reshape(tf.expand_dims(rows, 1) * tf.transpose(basis), [-1, self.length])
             found.append(tf.reshape(weighted @ basis, [-1, self.n_vectors, self.n_vectors]))
         return _joined(found, 0)
@@ -124,7 +124,7 @@ class Vectors:
         if not self._by_basis:
             return tf.matmul(tf.gather(self._stack, self._index), tf.transpose(values, [1, 2, 0]))
         found = []
-        for rows, basis in zip(tf.split(values, self._alike, axis=1), self._bases, strict=True):
+        for rows, basis in zip(tf.split(values, self._rows_of_basis, axis=1), self._bases, strict=True):
             product = tf.reshape(rows, [-1, self.length]) @ basis
             found.append(tf.reshape(product, [2, -1, self.n_vectors]))
         return tf.transpose(_joined(found, 1), [1, 2, 0])
@@ -136,7 +136,7 @@ class Vectors:
             return tf.transpose(product, [2, 0, 1])
         found = []
         columns = tf.transpose(coefficients, [2, 0, 1])
-        for rows, basis in zip(tf.split(columns, self._alike, axis=1), self._bases, strict=True):
+        for rows, basis in zip(tf.split(columns, self._rows_of_basis, axis=1), self._bases, strict=True):
             product = tf.matmul(tf.reshape(rows, [-1, self.n_vectors]), basis, transpose_b=True)
             found.append(tf.reshape(product, [2, -1, self.length]))
         return _joined(found, 1)
@@ -146,7 +146,7 @@ class Vectors:
         if not self._by_basis:
             return root @ tf.gather(self._stacked_overlaps, self._index)
         found = []
-        for rows, overlap in zip(tf.split(root, self._alike), self._overlaps, strict=True):
+        for rows, overlap in zip(tf.split(root, self._rows_of_basis), self._overlaps, strict=True):
             product = tf.reshape(rows, [-1, self.n_vectors]) @ overlap
             found.append(tf.reshape(product, [-1, root.shape[1], overlap.shape[1]]))
         return _joined(found, 0)

@@ -19,7 +19,7 @@ def to_complex(pair: tf.Tensor) -> np.ndarray:
 
 def multiply(a: tf.Tensor, b: tf.Tensor) -> tf.Tensor:
     """Return a b."""
-    # Each unstacking is one node of a graph; an index is four, and takes as many times as long to trace.
+    # Unstacking adds one node to a graph. Each index would add four, and tracing would take longer.
     (a_real, a_imaginary), (b_real, b_imaginary) = tf.unstack(a), tf.unstack(b)
     return tf.stack([a_real * b_real - a_imaginary * b_imaginary, a_real * b_imaginary + a_imaginary * b_real])
 

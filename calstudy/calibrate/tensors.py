@@ -176,9 +176,6 @@ class FitTensors:
             return tf.math.unsorted_segment_sum(part, index, self.n_antennas)
 
         real, imaginary = tf.unstack(values)
-        return tf.stack(
-            [
-                scatter(real, first) + scatter(real, second),
-                scatter(imaginary, first) - scatter(imaginary, second),
-            ]
-        )
+        of_real = scatter(real, first) + scatter(real, second)
+        of_imaginary = scatter(imaginary, first) - scatter(imaginary, second)
+        return tf.stack([of_real, of_imaginary])
