@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 from rich.console import Console
@@ -12,14 +14,11 @@ from rich.console import Console
 from calstudy.base.errors import InputError
 from calstudy.verdicts.tables import Table, require_writable
 
+Item = TypeVar("Item")
+
 bench_app = typer.Typer(help="Measure what the parts cost on this machine.", no_args_is_help=True)
 
 Output = Annotated[Path | None, typer.Option(help="Also write the table here, as .csv or .md.")]
-
-
-@bench_app.callback()
-def _group() -> None:
-    """Keep `simulate` a subcommand, even while it is the only one."""
 
 
 @bench_app.command()
@@ -99,24 +98,21 @@ def arrays(
 
     chosen = names.split(",") if names else list(ARRAYS)
     require_arrays(chosen)
-    console, rows = Console(highlight=False), []
-    with console.status("") as status:
-        for name in chosen:
-            status.update(name)
-            found = time_array(name, integrations, device)
-            rows.append(
-                (
-                    name,
-                    f"{found.baselines}",
-                    f"{found.channels}",
-                    f"{found.first:.2f}",
-                    f"{found.cold:.2f}",
-                    f"{found.warm:.2f}",
-                    f"{found.cold_steps}, {found.warm_steps:g}" + ("" if found.converged else ", not converged"),
-                    f"{found.memory / 1e9:.1f} GB",
-                )
-            )
-    _publish(Table(HEADINGS, rows, f"default solver, {unit_of(device)}"), console, output)
+
+    def row(name: str) -> Sequence[str]:
+        found = time_array(name, integrations, device)
+        return (
+            name,
+            f"{found.baselines}",
+            f"{found.channels}",
+            f"{found.first:.2f}",
+            f"{found.cold:.2f}",
+            f"{found.warm:.2f}",
+            f"{found.cold_steps}, {found.warm_steps:g}" + ("" if found.converged else ", not converged"),
+            f"{found.memory / 1e9:.1f} GB",
+        )
+
+    _publish_rows(Table(HEADINGS, [], f"default solver, {unit_of(device)}"), chosen, row, output)
 
 
 @bench_app.command()
@@ -134,23 +130,21 @@ def memory(
     if output is not None:
         require_writable(output)
     budget, sizes = parse_memory(max_memory), _sizes(antennas)
-    console, rows = Console(highlight=False), []
-    with console.status("") as status:
-        for size in sizes:
-            status.update(f"{size} antennas")
-            found = measure_solve(size, channels, budget, max_steps)
-            rows.append(
-                (
-                    f"{found.antennas}",
-                    f"{found.baselines}",
-                    f"{found.models_at_once}",
-                    f"{found.planned / 1e9:.1f} GB",
-                    f"{found.measured / 1e9:.1f} GB",
-                    f"{found.cpu_seconds:.0f}",
-                    f"{found.n_steps}, {found.status}",
-                )
-            )
-    _publish(Table(HEADINGS, rows, f"one cold solve, {channels} channels, one core"), console, output)
+
+    def row(size: int) -> Sequence[str]:
+        found = measure_solve(size, channels, budget, max_steps)
+        return (
+            f"{found.antennas}",
+            f"{found.baselines}",
+            f"{found.models_at_once}",
+            f"{found.planned / 1e9:.1f} GB",
+            f"{found.measured / 1e9:.1f} GB",
+            f"{found.cpu_seconds:.0f}",
+            f"{found.n_steps}, {found.status}",
+        )
+
+    title = f"one cold solve, {channels} channels, one core"
+    _publish_rows(Table(HEADINGS, [], title), sizes, row, output)
 
 
 def _publish(table: Table, console: Console, output: Path | None) -> None:
@@ -158,6 +152,34 @@ def _publish(table: Table, console: Console, output: Path | None) -> None:
     table.show(console)
     if output is not None:
         table.write(output)
+
+
+def _publish_rows(
+    table: Table, items: Sequence[Item], measure: Callable[[Item], Sequence[str]], output: Path | None
+) -> None:
+    """Measure and publish row by row: the file gets each row at once, and an interrupted run prints its rows.
+
+    Parameters
+    ----------
+    table
+        Its headings and title.
+    items
+        What is measured, in order; shown meanwhile.
+    measure
+        Returns the cells of a row.
+    output
+        File for the table, if one is wanted.
+    """
+    console = Console(highlight=False)
+    try:
+        for item in items:
+            with console.status(f"{item}"):
+                table = replace(table, rows=[*table.rows, measure(item)])
+            if output is not None:
+                table.write(output)
+    finally:
+        if table.rows:
+            table.show(console)
 
 
 def _sizes(text: str) -> list[int]:

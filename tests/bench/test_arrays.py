@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import csv
+
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from calstudy.base.errors import InputError
 from calstudy.bench import arrays
 from calstudy.bench.calibration_case import Case
+from calstudy.cli.bench import bench_app
 
 
 def test_arrays_have_the_antennas_that_their_cases_say():
@@ -34,3 +38,20 @@ def test_an_array_is_solved_from_unity_and_then_warm(monkeypatch):
 def test_an_unknown_array_is_refused():
     with pytest.raises(InputError, match="golom-15: not an array, did you mean 'golomb-15'"):
         arrays.require_arrays(["paper", "golom-15"])
+
+
+def test_an_interrupted_benchmark_keeps_the_rows_that_it_has(monkeypatch, tmp_path):
+    def stopped_at_the_second(name: str, *_: object) -> arrays.Timing:
+        if name == "golomb-15":
+            raise KeyboardInterrupt
+        return arrays.Timing(630, 384, 3.5, 0.94, 0.19, 5, 1, True, 10**9)
+
+    monkeypatch.setattr(arrays, "time_array", stopped_at_the_second)
+    table = tmp_path / "table.csv"
+    result = CliRunner().invoke(bench_app, ["arrays", "--arrays", "paper,golomb-15", "--output", str(table)])
+    assert result.exit_code != 0
+    assert "paper" in result.output
+    with table.open(newline="") as file:
+        heading, row = csv.reader(file)
+    assert heading == list(arrays.HEADINGS)
+    assert row[:4] == ["paper", "630", "384", "3.50"]
