@@ -37,8 +37,9 @@ known, the *squared coherence* of response and signal,
     C^2 / T = (Re <S* D>)^2 / (<S* S> <D* D>),
 
 does not depend on the scale either: it is 1 if only the scale was changed. If each baseline is crossed with itself, it
-is the fraction of the power that remains after a projection of white S, and equals T s^2. Between different baselines
-of a redundant group it is not such a fraction.
+is the fraction of the power that remains after an orthogonal projection of white S, and equals T s^2. Weights that are
+not flat make the projection oblique: it moves power between modes, which T has and <S* D> has not, and C^2 / T is
+smaller than T s^2. Between different baselines of a redundant group it is not such a fraction.
 
 Numerator and denominator contain the same sky, so that most of the sample variance cancels. The rest is estimated from
 the scatter of independent samples within a bin, where each baseline or redundant group is one sample (one patch of the

@@ -93,6 +93,10 @@ def test_phase_and_scale_of_a_fit_count_as_fitted_but_not_when_aligned(truth):
     turned = truth.gains * np.exp(1j * rng.uniform(0, 6, FREQUENCY.size)) * 1.2
     found = values(truth, fit(truth, turned, truth.foregrounds / 1.44))
     assert found["gains_raw"] > 0.5
+    # By delay, too, gains as fitted differ by a phase that no data know, and aligned ones do not.
+    assert found["gains_raw_by_delay"] > 0.5
+    assert found["gains_raw_worst_delay"] >= found["gains_raw_by_delay"]
+    assert found["gains_by_delay"] == pytest.approx(0, abs=1e-10)
     assert found["model_raw"] == pytest.approx(1 - 1 / 1.44)
     assert found["gains_aligned"] == pytest.approx(0, abs=1e-12)
     assert found["model_aligned"] == pytest.approx(0, abs=1e-12)
