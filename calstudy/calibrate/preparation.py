@@ -17,7 +17,7 @@ from calstudy.calibrate.settings import ForegroundFit, GainFit
 from calstudy.calibrate.standard_formats import require_parallel_hands
 from calstudy.calibrate.starts import redundant_start, starting_gains
 from calstudy.calibrate.structure import make_structure, repeat_structure
-from calstudy.calibrate.weights import inverse_variance, make_weights
+from calstudy.calibrate.weights import inverse_variances, make_weights
 
 NOTHING = Assumed()
 
@@ -71,7 +71,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     fitted = fitted_baselines(observation, settings.autos)
     weights = make_weights(observation, fitted, settings.weights)
     if isinstance(settings, ForegroundFit) and settings.foreground_prior.finite:
-        weights = weights * inverse_variance(observation, fitted, settings, assumed.noise)
+        weights = inverse_variances(observation, fitted, weights, settings, assumed.noise)
     data = observation.baselines(fitted)
     sky = None if assumed.sky_model is None else assumed.sky_model.baselines(fitted).visibilities
     _require_finite(data)
@@ -116,6 +116,9 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
     if not np.any(visibilities, where=weights > 0):
         return "the data are zero"
     sky = None if prepared.sky is None else rows(prepared.sky)
+    deviations = _deviations(sky, weights, settings)
+    if deviations == (0, 0):
+        return "the sky model is zero, and the deviations of the foregrounds' prior are fractions of it"
     return CalibrationProblem(
         structure,
         visibilities,
@@ -124,7 +127,7 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         sky,
         settings.prior if isinstance(settings, ForegroundFit) else "sum",
         frozen=settings.frozen,
-        deviations=_deviations(sky, weights, settings),
+        deviations=deviations,
     )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from calstudy.base.schema import UNKEYED, Section, choice, fault
 from calstudy.base.units import Delay, FluxDensity, Length
@@ -13,8 +14,8 @@ from calstudy.calibrate.interface import Calibrator
 
 MODELS_AT_ONCE = 512
 NOISE_UNKNOWN = (
-    "foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; give the "
-    "standard deviation of a sample, such as '1 Jy', or use `weights: autos`"
+    "calibration.foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; "
+    "give the standard deviation of a sample, such as '1 Jy', or use `weights: autos`"
 )
 
 
@@ -169,7 +170,16 @@ class JointBasisSettings(Section):
     path: Path = Field(strict=False)
 
 
-Deviation = Annotated[float, Field(ge=0)] | Literal["infinite"]
+def _deviation(value: Any) -> Any:
+    """Refuse what is no deviation in one sentence, where a union of types would have one for each."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
+        return float(value)
+    if value != "infinite":
+        raise fault("", f"{value!r} is neither a number of at least 0 nor 'infinite'")
+    return value
+
+
+Deviation = Annotated[Annotated[float, Field(ge=0)] | Literal["infinite"], BeforeValidator(_deviation)]
 
 
 class ForegroundPrior(Section):
@@ -198,6 +208,8 @@ class ForegroundPrior(Section):
             raise fault("shared_deviation", "must be 0 where deviation is infinite, which leaves nothing to share")
         if shared == "infinite" and own != 0:
             raise fault("deviation", "must be 0 where shared_deviation is infinite, or both must be finite")
+        if self.mean == "sky-model" and "infinite" in (own, shared):
+            raise fault("mean", "must be none beside an infinite deviation, which leaves it without meaning")
         if self.mean == "none" and "infinite" not in (own, shared):
             raise fault(
                 "mean",
@@ -213,7 +225,10 @@ class ForegroundPrior(Section):
 
 
 class GainFit(Calibrator):
-    """Settings of calibrators that fit gains by weighted least squares, w |V - g_a g_b* F|^2."""
+    """Settings of calibrators that fit gains by weighted least squares, w |V - g_a g_b* F|^2.
+
+    Fields of `solver` that a file leaves out are those of the calibrator's own solver, if it has the same name.
+    """
 
     solver: Solver = GaussNewtonSettings()
     weights: Weights = FlagWeights()
@@ -233,6 +248,18 @@ class GainFit(Calibrator):
         "rounding only. A run chooses fewer by itself where memory is short.",
         json_schema_extra=UNKEYED,
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete_solver(cls, data: Any) -> Any:
+        """Fill in the fields of `solver` that are not given."""
+        given = data.get("solver") if isinstance(data, dict) else None
+        preset = cls.model_fields["solver"].default
+        if given == preset.name:
+            given = {"name": given}
+        if not isinstance(given, dict) or given.get("name") != preset.name:
+            return data
+        return {**data, "solver": {**preset.model_dump(), **given}}
 
     @property
     def frozen(self) -> bool:

@@ -53,39 +53,39 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     return weights * (count / size / np.where(total > 0, total, 1))
 
 
-def inverse_variance(data: Observation, fitted: np.ndarray, settings: ForegroundFit, noise: float | None) -> np.ndarray:
-    """Return what weights are multiplied by to be 1 / sigma^2 in the mean over unflagged samples.
+def inverse_variances(
+    data: Observation, fitted: np.ndarray, weights: np.ndarray, settings: ForegroundFit, noise: float | None
+) -> np.ndarray:
+    """Return weights that are 1 / sigma^2 in the mean over the samples that have any, the shape of `weights`.
 
     Parameters
     ----------
     data, fitted
         As for `make_weights`.
+    weights
+        What that returns.
     settings
         Whose `foreground_prior.noise` comes first.
     noise
         What is known of it otherwise (see `calstudy.calibrate.interface.Assumed`); None: the radiometer equation,
         sigma^2 = V_aa V_bb / (channel width x integration time x nsamples), for weights from autocorrelations.
 
-    Returns
-    -------
-    ndarray, float64, (Ntimes, 1, 1, Npols)
-
     Raises
     ------
     InputError
         If nothing says what the noise is, or it is zero.
     """
-    used = ~data.flags[:, fitted]
-    count = np.sum(used, axis=(1, 2), keepdims=True)
+    used = weights > 0
     sigma = settings.foreground_prior.noise or noise
     if sigma is None and settings.weights.kind == "autos":
         samples = abs(float(np.mean(data.uvd.channel_width))) * float(np.mean(data.uvd.integration_time))
-        precision = np.sum(_from_autos(data, fitted) * used, axis=(1, 2), keepdims=True) * samples
+        precision = _from_autos(data, fitted) * samples
     elif sigma:
-        precision = np.sum(data.nsamples[:, fitted] * used, axis=(1, 2), keepdims=True) / sigma**2
+        precision = data.nsamples[:, fitted] / sigma**2
     else:
         raise InputError(NOISE_UNKNOWN)
-    return precision / np.where(count > 0, count, 1) * (used.shape[1] * used.shape[2])
+    wanted, found = (np.sum(values * used, axis=(1, 2), keepdims=True) for values in (precision, weights))
+    return weights * (wanted / np.where(found > 0, found, 1))
 
 
 def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:

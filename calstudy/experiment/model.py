@@ -221,6 +221,16 @@ class Experiment(Section):
         return self
 
     @model_validator(mode="after")
+    def _a_finite_prior_has_noise(self) -> Experiment:
+        if self.corruption.noise.kind == "none" and self.calibration.needs_noise:
+            raise fault(
+                "corruption.noise",
+                "is 'none', and the finite deviations of calibration.foreground_prior are weighed against noise: give "
+                "calibration.foreground_prior.noise, or let there be noise",
+            )
+        return self
+
+    @model_validator(mode="after")
     def _antennas_and_effects_are_independent(self) -> Experiment:
         # Both are drawn by NumPy's default generator from the seed alone: equal seeds draw the same numbers.
         effects = enumerate(self.corruption.effects)

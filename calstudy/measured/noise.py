@@ -61,6 +61,31 @@ def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> n
     return np.where(valid, product / np.where(valid, samples, 1), np.nan)
 
 
+def sample_noise(data: UVData) -> float | None:
+    """Return the rms of sigma of a cross-correlation that was measured once (nsamples of 1), in the unit of the data.
+
+    It is that of all polarizations together; None where no autocorrelations tell.
+
+    Parameters
+    ----------
+    data
+        Flags and numbers of samples count.
+    """
+    all_pairs = antenna_pairs(data)
+    crosses = all_pairs[:, 0] != all_pairs[:, 1]
+    flags = flag_cube(data)[:, crosses]
+    counts = data.nsample_array.reshape(flag_cube(data).shape)[:, crosses]
+    found = []
+    for polarization in range(data.Npols):
+        variance = radiometer_variance(data, all_pairs[crosses], polarization)
+        if variance is None:
+            return None
+        single = (variance * counts[..., polarization])[~flags[..., polarization]]
+        found.append(single[np.isfinite(single)])
+    values = np.concatenate(found)
+    return float(np.sqrt(np.mean(values))) if values.size else None
+
+
 def half_difference(even: UVData, odd: UVData) -> UVData:
     """Return the difference of two averages, with the power P_N of the noise of their product.
 

@@ -238,15 +238,11 @@ def _factor(job: Job, data: UVData) -> float:
 
 def _write_level(job: Job, data: UVData) -> None:
     """Write the rms of the noise as the calibrators that need it find it, if the autocorrelations tell."""
-    import numpy as np
+    from calstudy.measured.noise import sample_noise
 
-    from calstudy.base.visibilities import antenna_pairs
-    from calstudy.measured.noise import radiometer_variance
-
-    pairs = antenna_pairs(data)
-    variance = radiometer_variance(data, pairs[pairs[:, 0] != pairs[:, 1]], 0)
-    if variance is not None and np.isfinite(variance).any():
-        write_json(job.output / LEVELS, {"noise_std": float(np.sqrt(np.nanmean(variance)))})
+    noise = sample_noise(data)
+    if noise is not None:
+        write_json(job.output / LEVELS, {"noise_std": noise})
 
 
 def make_average(job: Job) -> Mapping[str, Any]:
@@ -357,6 +353,7 @@ def _cost_of_noise(task: Task) -> Cost:
     return Cost(2, LIBRARIES_MEMORY, disk)
 
 
-OBSERVE = Stage(name="observe", version=1, make=observe, cost=_cost_of_reading)
+# Since 2 the noise is that of a sample with nsamples of one.
+OBSERVE = Stage(name="observe", version=2, make=observe, cost=_cost_of_reading)
 OBSERVED_AVERAGE = Stage(name="observed-average", version=1, make=make_average, cost=_cost_of_average)
 NOISE_STAGE = Stage(name="observed-noise", version=1, make=make_noise, cost=_cost_of_noise)

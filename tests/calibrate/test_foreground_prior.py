@@ -17,15 +17,18 @@ from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis
+from calstudy.calibrate.calibrators.calamity import Calamity
 from calstudy.calibrate.calibrators.delay_weighted import DelayWeighted
 from calstudy.calibrate.calibrators.sky_based import SkyBased
 from calstudy.calibrate.calibrators.unified import Unified
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
+from calstudy.calibrate.settings import ForegroundPrior
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.solvers.reduced import ReducedKernels
+from calstudy.measured.defaults import defaults
 
 SIGMA = 0.05
 OWN, SHARED = 0.7, 1.9
@@ -345,3 +348,25 @@ def test_noiseless_gains_are_exact_with_the_true_sky_model(calibrator, positions
     # The data that are made of a toy differ from it in amplitude.
     true = np.sqrt(np.abs(to_cube(uvd)[0, ..., 0] / toy.visibilities).mean()) * toy.gains
     assert np.abs(fix_phase(result.gains.gain_array[..., 0, 0], true) - true).max() < exact
+
+
+def test_a_partial_solver_block_keeps_what_the_calibrator_has_of_its_own():
+    """A tolerance of 1e-3 leaves more than the EoR near the wedge with a finite prior."""
+    for given in ("gauss-newton", {"name": "gauss-newton", "max_steps": 500}, defaults(True)["solver"]):
+        assert DelayWeighted.model_validate({"solver": given}).solver.tolerance == 1e-5
+        assert Unified.model_validate({"solver": given}).solver.tolerance == 1e-5
+        assert Calamity.model_validate({"solver": given}).solver.tolerance == 1e-3
+    assert (
+        DelayWeighted.model_validate({"solver": {"name": "gauss-newton", "tolerance": 1e-6}}).solver.tolerance == 1e-6
+    )
+    assert DelayWeighted.model_validate({"solver": "lbfgs"}).solver.tolerance == 1e-3
+
+
+def test_a_solve_whose_sky_model_is_zero_is_skipped_with_the_reason():
+    data = make_uvdata(make_toy(scattered(5)), 2)
+    sky = data.copy()
+    sky.data_array[sky.time_array == sky.time_array[0]] = 0
+    calibrator = DelayWeighted(foreground_prior=ForegroundPrior(mean="sky-model", deviation=0.1))
+    first, second = run_calibrator(calibrator, data, sky, noise=1e-3).solutions
+    assert (first.status, second.status) == ("skipped", "converged")
+    assert "the sky model is zero" in first.message

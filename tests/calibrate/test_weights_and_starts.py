@@ -11,11 +11,13 @@ from toy import make_toy, scattered
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_pairs, to_cube
+from calstudy.calibrate.calibrators.delay_weighted import DelayWeighted
 from calstudy.calibrate.calibrators.sky_based import SkyBased
 from calstudy.calibrate.execution import run_calibrator
-from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, SampleWeights
+from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, FlagWeights, ForegroundPrior, SampleWeights
 from calstudy.calibrate.starts import starting_gains
-from calstudy.calibrate.weights import make_weights
+from calstudy.calibrate.weights import inverse_variances, make_weights
+from calstudy.measured.noise import radiometer_variance, sample_noise
 
 
 def everything(data):
@@ -59,6 +61,55 @@ def test_auto_weights_are_inverse_variances():
     lacking = make_uvdata(make_toy(scattered(5)), 1)
     with pytest.raises(InputError, match="'autos' needs autocorrelations, which the data lack for antenna"):
         run_calibrator(settings, lacking)
+
+
+@pytest.fixture
+def measured():
+    """Data with autocorrelations, uneven numbers of samples, none in places, and half an autocorrelation flagged."""
+    data = make_uvdata(make_toy(scattered(5), autos=True), 2)
+    pairs = antenna_pairs(data)
+    rng = np.random.default_rng(12)
+    shape = (2, data.Nbls, data.Nfreqs, 1)
+    counts, flags = rng.integers(1, 5, shape).astype(float), np.zeros(shape, bool)
+    counts[1, 3, :7] = 0
+    flags[0, np.flatnonzero((pairs == pairs[0, 0]).all(axis=1)), : data.Nfreqs // 2] = True
+    data.nsample_array, data.flag_array = counts.reshape(data.data_array.shape), flags.reshape(data.data_array.shape)
+    return data
+
+
+@pytest.mark.parametrize("settings", [AutoWeights(kind="autos"), SampleWeights(kind="nsamples"), FlagWeights()])
+def test_weights_of_finite_priors_are_inverse_variances(measured, settings):
+    """Against the radiometer equation, and against a noise that is given for samples that were measured once."""
+    pairs = antenna_pairs(measured)
+    cross = pairs[:, 0] != pairs[:, 1]
+    prior = ForegroundPrior(mean="sky-model", deviation=0.1)
+    calibrator = DelayWeighted(weights=settings, foreground_prior=prior)
+    observation, noise = Observation(measured), None if settings.kind == "autos" else 2.5
+    weights = make_weights(observation, cross, settings)
+    found = inverse_variances(observation, cross, weights, calibrator, noise)[..., 0]
+    counts = measured.nsample_array.reshape(2, measured.Nbls, -1)[:, cross]
+    if settings.kind == "autos":
+        variance = radiometer_variance(measured, pairs[cross], 0)
+        assert np.array_equal(found > 0, np.isfinite(variance))
+        assert np.allclose(found[found > 0], 1 / variance[found > 0], rtol=1e-9)
+    elif settings.kind == "nsamples":
+        assert np.allclose(found, counts / 2.5**2, rtol=1e-9)
+    else:
+        # All samples have the mean of what they should have.
+        assert np.allclose(found.mean(axis=(1, 2)), counts.mean(axis=(1, 2)) / 2.5**2, rtol=1e-9)
+
+
+def test_noise_of_measured_data_is_that_of_a_sample_that_was_measured_once(measured):
+    once = measured.copy()
+    once.nsample_array = np.ones(measured.data_array.shape)
+    crosses = antenna_pairs(measured)
+    crosses = crosses[crosses[:, 0] != crosses[:, 1]]
+    expected = np.sqrt(np.nanmean(radiometer_variance(once, crosses, 0)))
+    assert sample_noise(once) == pytest.approx(expected)
+    four_times = once.copy()
+    four_times.nsample_array = 4 * once.nsample_array
+    assert sample_noise(four_times) == pytest.approx(expected)
+    assert sample_noise(make_uvdata(make_toy(scattered(5)), 1)) is None
 
 
 def uvflag(data, values, path):

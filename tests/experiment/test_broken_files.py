@@ -100,6 +100,11 @@ HUGE = [
     *("--set", "instrument.channels.count=60000"),
     *("--set", "instrument.channels.width=1 kHz"),
 ]
+WEIGHTED = ("--set", "calibration.calibrator=delay-weighted")
+NOISELESS = (
+    *("--set", "corruption.noise=none"),
+    *("--set", "variants={residual: {components: [foregrounds], effects: true, calibrate: true}}"),
+)
 COMMANDS = [
     (["plan", "file.yaml", "--workers", "99999"], "--workers 99999: at most"),
     (["plan", "file.yaml", "--workers", "0"], "greater than or equal to 1"),
@@ -111,6 +116,15 @@ COMMANDS = [
     (["plan", "file.yaml", "--scale", "small"], "--scale small: not a scale"),
     (["plan", "file.yaml", "--set", "instrument.channels.width=80 mHz"], "must be at least 100 Hz"),
     (["plan", "file.yaml", "--set", "sky.eor.seed=010"], "010 is an octal number in YAML, 8"),
+    (
+        ["plan", "file.yaml", *WEIGHTED, "--set", "calibration.foreground_prior.deviation=10 %"],
+        "calibration.foreground_prior.deviation: '10 %' is neither a number of at least 0 nor 'infinite'",
+    ),
+    (["plan", "file.yaml", *WEIGHTED, *NOISELESS], "corruption.noise: is 'none', and the finite deviations of"),
+    (
+        ["plan", "file.yaml", "--set", "calibration.foreground_prior.mean=sky-model"],
+        "calibration.foreground_prior.mean: must be none beside an infinite deviation",
+    ),
     (["plan", "file.yaml", "--set", "outputs.figures.77=wedge"], "not an item of a list of 8"),
     (["plan", "empty.yaml"], "empty.yaml: must hold a block of keys such as 'name: quickstart', and is empty"),
     (["plan", "list.yaml"], "and holds a list"),

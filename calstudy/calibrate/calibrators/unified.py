@@ -12,7 +12,8 @@ class Unified(LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors are common to redundant baselines, but for a smaller part."""
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
-    version: ClassVar[int] = 2
+    # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
+    version: ClassVar[int] = 3
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
