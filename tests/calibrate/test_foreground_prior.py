@@ -370,3 +370,52 @@ def test_a_solve_whose_sky_model_is_zero_is_skipped_with_the_reason():
     first, second = run_calibrator(calibrator, data, sky, noise=1e-3).solutions
     assert (first.status, second.status) == ("skipped", "converged")
     assert "the sky model is zero" in first.message
+
+
+@pytest.fixture(scope="module")
+def changing():
+    """Two integrations and polarizations of a hexagon, with other foregrounds, noise and flags in each; a sky model."""
+    toy = make_toy(HEX)
+    data = make_uvdata(toy, 2, polarizations=(-5, -6))
+    rng = np.random.default_rng(31)
+    rms = np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))
+    drift = np.exp(1j * rng.uniform(0, 6, (2, len(toy.antennas), 1, 2)))
+    sky = toy.foregrounds[None, :, :, None] * drift
+    shape = (2, len(toy.antennas), FREQUENCIES.size, 2)
+    gains = gain_products(toy.gains, toy.antennas)[None, :, :, None]
+    measured = from_cube(data, gains * (sky + NOISE * rms * complex_normal(rng, shape)))
+    measured.flag_array = (rng.random(shape) < 0.1).reshape(measured.flag_array.shape)
+    model = from_cube(data, sky * (1 + 0.05 * complex_normal(rng, (2, len(toy.antennas), 1, 2))))
+    return toy, measured, model, NOISE * rms
+
+
+@pytest.mark.parametrize("calibrator", [DelayWeighted(), Unified()], ids=["delay-weighted", "unified"])
+def test_integrations_and_polarizations_have_priors_of_their_own(changing, calibrator):
+    """What is solved after another integration, from its gains, is what is solved by itself, to the tolerance."""
+    _, data, model, sigma = changing
+    together = run_calibrator(calibrator, data, model, noise=sigma)
+    assert {record.status for record in together.solutions} <= {"converged", "stalled"}
+    times = np.unique(data.time_array)
+    part = {"times": times[1:], "polarizations": [-6]}
+    alone = run_calibrator(
+        calibrator, data.select(**part, inplace=False), model.select(**part, inplace=False), noise=sigma
+    )
+    found = together.residual.select(**part, inplace=False)
+    used = ~alone.residual.flag_array
+    assert np.array_equal(used, ~found.flag_array)
+    excess = (found.data_array - alone.residual.data_array)[used]
+    # A tolerance of 1e-5 leaves some 0.3 % of the noise.
+    assert np.sqrt(np.mean(np.abs(excess) ** 2)) < 0.03 * sigma
+
+
+def test_integrations_that_are_solved_together_know_their_gains_better(changing):
+    toy, data, model, sigma = changing
+    true = gain_products(toy.gains, toy.antennas)
+    errors = []
+    for count in (1, 2):
+        calibrator = DelayWeighted(integrations_per_solve=count)
+        gains = run_calibrator(calibrator, data, model, noise=sigma).gains.gain_array[..., 0]
+        products = np.stack([gain_products(gains[:, :, t], toy.antennas) for t in range(2)])
+        errors.append(np.sqrt(np.median(np.abs(products / true - 1) ** 2)))
+    # The errors of the sky model differ between the integrations, and so does the noise.
+    assert errors[1] < 0.85 * errors[0]
