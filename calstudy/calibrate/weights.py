@@ -56,14 +56,16 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
 def inverse_variances(
     data: Observation, fitted: np.ndarray, weights: np.ndarray, settings: ForegroundFit, noise: float | None
 ) -> np.ndarray:
-    """Return weights that are 1 / sigma^2 in the mean over the samples that have any, the shape of `weights`.
+    """Return the weights times a factor for each integration and polarization that makes them 1 / sigma^2 in the mean.
+
+    Samples of zero weight do not count.
 
     Parameters
     ----------
     data, fitted
         As for `make_weights`.
     weights
-        What that returns.
+        What that returns, (Ntimes, Nfitted, Nfreqs, Npols).
     settings
         Whose `foreground_prior.noise` comes first.
     noise

@@ -62,19 +62,22 @@ def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> n
 
 
 def sample_noise(data: UVData) -> float | None:
-    """Return the rms of sigma of a cross-correlation that was measured once (nsamples of 1), in the unit of the data.
+    """Return sigma of cross-correlations with nsamples of 1, by the radiometer equation, in the unit of the data.
 
-    It is that of all polarizations together; None where no autocorrelations tell.
+    It is the rms over all unflagged samples and polarizations.
 
     Parameters
     ----------
     data
-        Flags and numbers of samples count.
+        With autocorrelations.
+
+    Returns
+    -------
+    None without the autocorrelations of all antennas, or if none of their samples can be used.
     """
-    all_pairs = antenna_pairs(data)
+    all_pairs, all_flags = antenna_pairs(data), flag_cube(data)
     crosses = all_pairs[:, 0] != all_pairs[:, 1]
-    flags = flag_cube(data)[:, crosses]
-    counts = data.nsample_array.reshape(flag_cube(data).shape)[:, crosses]
+    flags, counts = all_flags[:, crosses], data.nsample_array.reshape(all_flags.shape)[:, crosses]
     found = []
     for polarization in range(data.Npols):
         variance = radiometer_variance(data, all_pairs[crosses], polarization)
