@@ -18,6 +18,12 @@ import tensorflow as tf
 BATCHES = 8
 # Batches of fewer baselines than this are not worth their compilation.
 LEAST_BATCH = 16
+# Models with this much more vectors than the narrowest of a batch are not padded to it: the cost grows with the square
+# and the cube of their number.
+WIDEST = 4 / 3
+# Singular values kept in what bases span, relative to the largest: what is left out is an error of the Gauss-Newton
+# matrix.
+SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
 # One matrix product for each basis is faster than one for each model, if that many have it.
 ALIKE = 4
 
@@ -68,8 +74,10 @@ def make_batches(bases: Sequence[np.ndarray], sizes: Sequence[int], edges: np.nd
     if not apart:
         most = min(most, max(-(-int(edges[-1]) // BATCHES), LEAST_BATCH))
     n_models, cuts = len(bucket_of), [0]
+    widths = np.array([basis.shape[-1] for basis in bases])[bucket_of]
     for model in range(1, n_models):
-        full = not joint[model] and edges[model + 1] - edges[cuts[-1]] > most
+        many = edges[model + 1] - edges[cuts[-1]] > most or widths[model] > WIDEST * widths[cuts[-1]]
+        full = not joint[model] and many
         other = bucket_of[model] != bucket_of[model - 1]
         if full or (other and (apart or joint[model] or joint[model - 1])):
             cuts.append(model)
@@ -89,7 +97,7 @@ class Vectors:
     bases
         Different A^T, (Nbases, Nvec, length), float64, padded with rows of zeros.
     overlaps
-        A^T Q of each, (Nbases, Nvec, rank), in the precision of the inner products.
+        A^T Q of each, (Nbases, Nvec, rank), with the batch's span Q, in the precision of the inner products.
     widths
         Vectors that are not padding, (Nbases,).
     index
@@ -100,19 +108,18 @@ class Vectors:
         self.n_vectors, self.length = bases.shape[1:]
         # One where coefficients are not padding, zero where they are.
         self.filled = np.arange(self.n_vectors) < widths[index][:, None]
-        # How many rows each basis has, or, if there are few of each, the basis of every row.
-        self._rows_of_basis = np.bincount(index, minlength=len(bases)).tolist()
         self._by_basis = len(index) >= ALIKE * len(bases) or len(bases) == 1
-        self._bases = [tf.constant(basis.T) for basis in bases] if self._by_basis else []
-        self._overlaps = [tf.constant(overlap) for overlap in overlaps] if self._by_basis else []
-        self._stack, self._stacked_overlaps = tf.constant(bases), tf.constant(overlaps)
-        self._index = tf.constant(index, tf.int32)
+        if self._by_basis:
+            self._rows_of_basis = np.bincount(index, minlength=len(bases)).tolist()
+            self._bases = [tf.constant(basis.T) for basis in bases]
+            self._overlaps = [tf.constant(overlap) for overlap in overlaps]
+        else:
+            self._stack, self._stacked_overlaps = tf.constant(bases[index]), tf.constant(overlaps[index])
 
     def normal(self, curvature: tf.Tensor) -> tf.Tensor:
         """Return A^T D A, (Nrows, Nvec, Nvec), for D of shape (Nrows, length)."""
         if not self._by_basis:
-            stacked = tf.gather(self._stack, self._index)
-            return tf.matmul(curvature[:, None, :] * stacked, stacked, transpose_b=True)
+            return tf.matmul(curvature[:, None, :] * self._stack, self._stack, transpose_b=True)
         found = []
         for rows, basis in zip(tf.split(curvature, self._rows_of_basis), self._bases, strict=True):
             weighted = tf.reshape(tf.expand_dims(rows, 1) * tf.transpose(basis), [-1, self.length])
@@ -122,7 +129,7 @@ class Vectors:
     def reduce(self, values: tf.Tensor) -> tf.Tensor:
         """Return A^T y, (Nrows, Nvec, 2), for y of shape (2, Nrows, length)."""
         if not self._by_basis:
-            return tf.matmul(tf.gather(self._stack, self._index), tf.transpose(values, [1, 2, 0]))
+            return tf.matmul(self._stack, tf.transpose(values, [1, 2, 0]))
         found = []
         for rows, basis in zip(tf.split(values, self._rows_of_basis, axis=1), self._bases, strict=True):
             product = tf.reshape(rows, [-1, self.length]) @ basis
@@ -132,7 +139,7 @@ class Vectors:
     def expand(self, coefficients: tf.Tensor) -> tf.Tensor:
         """Return A u, (2, Nrows, length), for coefficients u of shape (Nrows, Nvec, 2)."""
         if not self._by_basis:
-            product = tf.matmul(tf.gather(self._stack, self._index), coefficients, transpose_a=True)
+            product = tf.matmul(self._stack, coefficients, transpose_a=True)
             return tf.transpose(product, [2, 0, 1])
         found = []
         columns = tf.transpose(coefficients, [2, 0, 1])
@@ -144,7 +151,7 @@ class Vectors:
     def overlap(self, root: tf.Tensor) -> tf.Tensor:
         """Return R A^T Q, (Nrows, N, rank), for R of shape (Nrows, N, Nvec)."""
         if not self._by_basis:
-            return root @ tf.gather(self._stacked_overlaps, self._index)
+            return root @ self._stacked_overlaps
         found = []
         for rows, overlap in zip(tf.split(root, self._rows_of_basis), self._overlaps, strict=True):
             product = tf.reshape(rows, [-1, self.n_vectors]) @ overlap
@@ -157,6 +164,8 @@ class Piece(NamedTuple):
 
     Attributes
     ----------
+    span
+        Orthonormal basis Q of what the batch's vectors span, (Nfreqs, rank), in the precision of the inner products.
     owner
         Position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model.
     vectors
@@ -166,6 +175,7 @@ class Piece(NamedTuple):
     """
 
     batch: Batch
+    span: tf.Tensor
     owner: tf.Tensor | None
     vectors: Vectors
     own: Vectors | None
@@ -180,29 +190,57 @@ class Piece(NamedTuple):
         """Give each baseline what its model has, the transpose of `to_models`."""
         return values if self.owner is None else tf.gather(values, self.owner, axis=1)
 
+    def absorb(self, values: tf.Tensor, root: tf.Tensor) -> tf.Tensor:
+        """Return ``Q S^T S Q^T y``, (2, N, Nfreqs), for y of that shape and S of shape (N, Nvec, rank)."""
+        n_frequencies, rank = self.span.shape
+        inner = tf.reshape(values, [-1, n_frequencies]) @ self.span
+        # Real and imaginary part share one batched product.
+        inner = tf.transpose(tf.reshape(inner, [2, -1, root.shape[2]]), [1, 0, 2])
+        inner = tf.matmul(inner, root, transpose_b=True) @ root
+        inner = tf.reshape(tf.transpose(inner, [1, 0, 2]), [-1, rank])
+        return tf.reshape(tf.matmul(inner, self.span, transpose_b=True), [2, -1, n_frequencies])
 
-def make_piece(batch: Batch, common: np.ndarray, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
+
+def make_piece(batch: Batch, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
     """Return a batch with its vectors.
 
     Parameters
     ----------
-    batch, common
-        As for `batch_vectors`.
+    batch
+        Which.
     owner
         Position in the batch of the model of each baseline, ascending, (Nbls,); None if each baseline is its own model.
     with_own
         Whether baselines have coefficients of their own besides the shared ones.
     dtype
-        Of the overlaps.
+        Of the span and the overlaps.
     """
     kind = dtype.as_numpy_dtype
-    own = batch_vectors(batch, common, owner, kind) if with_own else None
-    return Piece(
-        batch, None if owner is None else tf.constant(owner, tf.int32), batch_vectors(batch, common, None, kind), own
-    )
+    # A batch of short baselines spans little of what all bases do.
+    basis = span_of(batch.bases, dtype)
+    own = batch_vectors(batch, basis, owner, kind) if with_own else None
+    index = None if owner is None else tf.constant(owner, tf.int32)
+    return Piece(batch, tf.constant(basis, dtype), index, batch_vectors(batch, basis, None, kind), own)
 
 
-def batch_vectors(batch: Batch, common: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
+def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
+    """Return an orthonormal basis of what bases span together, (Nfreqs, rank), float64.
+
+    Parameters
+    ----------
+    bases
+        (Nfreqs, Nvec), or of the members of a joint batch, (Nmembers, Nfreqs, Nvec).
+    dtype
+        Precision that it is for.
+    """
+    vectors = np.concatenate([_side_by_side(basis) for basis in bases], axis=1)
+    # R of a QR decomposition has the same left singular vectors; the right ones, of no use, would take most time.
+    triangle = np.asarray(np.linalg.qr(vectors.T, mode="r"))
+    left, singular, _ = np.linalg.svd(triangle.T, full_matrices=False)
+    return left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
+
+
+def batch_vectors(batch: Batch, span: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
     """Return the vectors of the models of a batch, or of its baselines.
 
     Models with common coefficients are one row, whose channels are those of all of them, one after the other.
@@ -211,7 +249,7 @@ def batch_vectors(batch: Batch, common: np.ndarray, owner: np.ndarray | None, dt
     ----------
     batch
         Which.
-    common
+    span
         Q, (Nfreqs, rank).
     owner
         Position in the batch of the model of each baseline, ascending, for the vectors of the baselines; None for those
@@ -222,14 +260,21 @@ def batch_vectors(batch: Batch, common: np.ndarray, owner: np.ndarray | None, dt
     if batch.joint:
         (basis,) = batch.bases
         whole = basis.reshape(-1, basis.shape[-1]).T[None]
-        overlap = np.moveaxis(basis.transpose(0, 2, 1) @ common, 0, 1).reshape(1, basis.shape[-1], -1)
+        overlap = np.moveaxis(basis.transpose(0, 2, 1) @ span, 0, 1).reshape(1, basis.shape[-1], -1)
         return Vectors(whole, overlap.astype(dtype), np.array([basis.shape[-1]]), np.zeros(1, int))
     widths = np.array([basis.shape[1] for basis in batch.bases])
-    stack = np.zeros((len(widths), widths.max(), len(common)))
+    stack = np.zeros((len(widths), widths.max(), len(span)))
     for row, basis in zip(stack, batch.bases, strict=True):
         row[: basis.shape[1]] = basis.T
     index = batch.basis_index if owner is None else batch.basis_index[owner]
-    return Vectors(stack, (stack @ common).astype(dtype), widths, index)
+    return Vectors(stack, (stack @ span).astype(dtype), widths, index)
+
+
+def _side_by_side(basis: np.ndarray) -> np.ndarray:
+    """Return a normalized basis (Nfreqs, Nvec), or those of all members of a joint batch, (Nfreqs, Nmembers * Nvec)."""
+    if basis.ndim == 2:
+        return basis / np.linalg.norm(basis, axis=0)
+    return np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)
 
 
 def _joined(parts: list[tf.Tensor], axis: int) -> tf.Tensor:

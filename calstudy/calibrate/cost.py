@@ -110,7 +110,7 @@ def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
     if not isinstance(settings, ForegroundFit):
         return TENSORFLOW_MEMORY + RETAINED * (data + 20 * SINGLE * d.samples + by_channel + by_antenna)
     # Model, curvature and model on the baselines; roots.
-    projection = 2 * DOUBLE * d.models * d.channels + 3 * SINGLE * d.samples + SINGLE * d.models * d.widest * d.rank
+    projection = 2 * DOUBLE * d.models * d.channels + 3 * SINGLE * d.samples + SINGLE * d.coefficients * d.rank
     at_once = min(settings.models_at_once, d.models)
     pieces = 2 * DOUBLE * at_once * d.widest * d.channels
     # S times the model of each baseline of a stretch, in the common basis; products of all pairs of its vectors; the

@@ -27,7 +27,7 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.batches import Batch, Piece, make_piece
+from calstudy.calibrate.batches import Piece, make_piece, span_of
 from calstudy.calibrate.problem import FitStructure
 from calstudy.calibrate.tensors import FitTensors
 
@@ -39,13 +39,10 @@ KERNEL_RIDGE = {tf.float32: 1e-3, tf.float64: 1e-9}
 # A finite prior leaves nothing undetermined. Foregrounds that it holds where the data hardly do would converge slowly
 # with more.
 FINITE_KERNEL_RIDGE = {tf.float32: 1e-6, tf.float64: 1e-12}
-# Singular values kept in the common basis of all buckets, relative to the largest: what is left out is an error of the
-# Gauss-Newton matrix.
-SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
 
 
 class Roots(NamedTuple):
-    """How foregrounds answer a weighted change y of the visibilities: ``Q S^T S Q^T y``, with the common basis Q.
+    """How foregrounds answer a weighted change y of the visibilities: ``Q S^T S Q^T y``, with the span Q of a batch.
 
     Attributes
     ----------
@@ -120,8 +117,10 @@ class Projector:
 
     Attributes
     ----------
+    pieces
+        The batches, with their vectors.
     common
-        Orthonormal basis Q that spans all bases, (Nfreqs, rank), of `dtype`.
+        Orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`.
     """
 
     def __init__(self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
@@ -129,16 +128,10 @@ class Projector:
         self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
         self._level = 0 if structure.prior == "own" else 1
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
-        vectors = np.concatenate([_side_by_side(basis) for basis in distinct], axis=1)
-        # R of a QR decomposition has the same left singular vectors; the right ones, of no use, would take most time.
-        triangle = np.asarray(np.linalg.qr(vectors.T, mode="r"))
-        left, singular, _ = np.linalg.svd(triangle.T, full_matrices=False)
-        common = left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
-        self.common = tf.constant(common, dtype)
-        self.rank = common.shape[1]
+        self.common = tf.constant(span_of(distinct, dtype), dtype)
         needed = tensors.shared or self._two_levels
-        self._pieces = [
-            make_piece(batch, common, tensors.owner(batch) if needed else None, self._two_levels, dtype)
+        self.pieces = [
+            make_piece(batch, tensors.owner(batch) if needed else None, self._two_levels, dtype)
             for batch in tensors.batches
         ]
         self.project = tf.function(self._project, autograph=False)
@@ -189,7 +182,7 @@ class Projector:
         """
         parts: list[_Part] = []
         descent: list[tf.Tensor] = []
-        for piece in self._pieces:
+        for piece in self.pieces:
             first, last = baselines = piece.batch.baselines
             # Without this, all batches would be worked on at once, and their temporaries add up.
             with tf.control_dependencies([descent[-1], parts[-1].roots.first] if parts else []):
@@ -301,35 +294,25 @@ class Projector:
             Whose curvature and roots count.
         """
         answers = []
-        for piece, roots in zip(self._pieces, projection.roots, strict=True):
+        for piece, roots in zip(self.pieces, projection.roots, strict=True):
             first, last = piece.batch.baselines
             part = change[:, first:last]
             if roots.shared is None:
-                answers.append(piece.to_baselines(self._absorb(piece.to_models(part), roots.first)))
+                answers.append(piece.to_baselines(piece.absorb(piece.to_models(part), roots.first)))
                 continue
             curvature = projection.curvature[first:last]
-            left = part - curvature * self._absorb(part, roots.first)
-            common = piece.to_baselines(self._absorb(piece.to_models(left), roots.shared))
-            answers.append(common + self._absorb(part - curvature * common, roots.first))
+            left = part - curvature * piece.absorb(part, roots.first)
+            common = piece.to_baselines(piece.absorb(piece.to_models(left), roots.shared))
+            answers.append(common + piece.absorb(part - curvature * common, roots.first))
         return answers[0] if len(answers) == 1 else tf.concat(answers, axis=1)
 
-    def _absorb(self, values: tf.Tensor, root: tf.Tensor) -> tf.Tensor:
-        """Return ``Q S^T S Q^T values``, (2, N, Nfreqs)."""
-        n_frequencies, rank = self.common.shape
-        inner = tf.reshape(values, [-1, n_frequencies]) @ self.common
-        # Real and imaginary part share one batched product.
-        inner = tf.transpose(tf.reshape(inner, [2, -1, root.shape[2]]), [1, 0, 2])
-        inner = tf.matmul(inner, root, transpose_b=True) @ root
-        inner = tf.reshape(tf.transpose(inner, [1, 0, 2]), [-1, rank])
-        return tf.reshape(tf.matmul(inner, self.common, transpose_b=True), [2, -1, n_frequencies])
-
-    def baseline_roots(self, batch: Batch, roots: Roots) -> tf.Tensor:
+    def baseline_roots(self, piece: Piece, roots: Roots) -> tf.Tensor:
         """Return S of each baseline of a batch by itself, (Nbls, Nvec, rank)."""
         root = roots.first
-        if batch.joint:
-            root = tf.transpose(tf.reshape(root, [root.shape[1], -1, self.rank]), [1, 0, 2])
+        if piece.batch.joint:
+            root = tf.transpose(tf.reshape(root, [root.shape[1], -1, piece.span.shape[1]]), [1, 0, 2])
         owned = self._two_levels or not self.tensors.shared
-        return root if owned else tf.gather(root, self.tensors.owner(batch))
+        return root if owned else tf.gather(root, piece.owner)
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs)."""
@@ -385,10 +368,3 @@ class FrozenForegrounds:
         relative = self.tensors.relative_change(eta)
         change = projection.curvature * pairs.multiply(model, pairs.multiply(relative, relative))
         return -self.tensors.sum_over_antenna(pairs.conjugate_multiply(model, change))
-
-
-def _side_by_side(basis: np.ndarray) -> np.ndarray:
-    """Return a normalized basis (Nfreqs, Nvec), or those of all members of a joint batch, (Nfreqs, Nmembers * Nvec)."""
-    if basis.ndim == 2:
-        return basis / np.linalg.norm(basis, axis=0)
-    return np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)

@@ -126,12 +126,14 @@ def test_models_in_common_count_as_models_of_their_own(hexagon):
     found = antenna_blocks(projector, projection)
     model, curvature = pairs.to_complex(projection.baseline_model), projection.curvature.numpy()
     tensors, common = projector.tensors, projector.common.numpy()
-    expected = np.zeros((gains.shape[0], projector.rank, projector.rank), complex)
-    batches = zip(tensors.batches, projection.roots, strict=True)
-    roots = [root for batch, part in batches for root in projector.baseline_roots(batch, part).numpy()]
+    expected = np.zeros((gains.shape[0], common.shape[1], common.shape[1]), complex)
+    pieces = zip(projector.pieces, projection.roots, strict=True)
+    roots = [
+        root @ piece.span.numpy().T for piece, part in pieces for root in projector.baseline_roots(piece, part).numpy()
+    ]
     for p, (a, b) in enumerate(zip(tensors.first.numpy(), tensors.second.numpy(), strict=True)):
-        mixed = common.T @ ((curvature[p] * model[p])[:, None] * common)
-        part = mixed.conj() @ roots[p].T @ roots[p] @ mixed
+        mixed = (curvature[p] * model[p])[:, None] * common
+        part = (roots[p] @ mixed).conj().T @ (roots[p] @ mixed)
         expected[a] += part
         expected[b] += part.conj()
     absorbed = pairs.to_complex(found.absorbed)

@@ -5,10 +5,10 @@ within an antenna, which the eliminated foregrounds bring in.
 
 In the notation of `calstudy.calibrate.projection`, the block of one antenna is K - C. K is diagonal, the sum of D |F|^2
 over the antenna's baselines: its degrees. C is what the foregrounds of these baselines absorb, the sum of
-(D F)^* Q S^T S Q^T (D F), conjugated where the antenna is the second of its baseline. Foregrounds of few vectors follow
-only what is smooth, so that K - C is close to zero for some gains in the span of their common basis Q only, and not
-much below K for others. The preconditioner M has the values of the block on that span, and is K on its complement in
-the metric of K:
+(D F)^* P S^T S P^T (D F) with the span P of a baseline's batch, conjugated where the antenna is the second of its
+baseline. Foregrounds of few vectors follow only what is smooth, so that K - C is close to zero for some gains in the
+span of the common basis Q of all foregrounds only, and not much below K for others. The preconditioner M has the values
+of the block on that span, and is K on its complement in the metric of K:
 
     M = K - L (Q^T C Q) L^T, L = K Q (Q^T K Q)^-1
     M^-1 = K^-1 + Q [ (Q^T (K - C) Q)^-1 - (Q^T K Q)^-1 ] Q^T
@@ -118,26 +118,31 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     """
     tensors, common = projector.tensors, projector.common
     n_frequencies, rank = common.shape
-    products = tf.reshape(common[:, :, None] * common[:, None, :], [n_frequencies, -1])
     degrees = antenna_degrees(tensors, projection)
-    gram = tf.reshape(degrees @ products, [-1, rank, rank])
+    gram = tf.reshape(degrees @ _column_products(common, common), [-1, rank, rank])
     weighted = projection.curvature * projection.baseline_model
     absorbed: list[tf.Tensor] = []
-    for batch, batch_roots in zip(tensors.batches, projection.roots, strict=True):
+    for piece, batch_roots in zip(projector.pieces, projection.roots, strict=True):
         # Temporaries of several batches would add up.
         with tf.control_dependencies(absorbed[-1:]):
-            start, end = batch.baselines
+            start, end = piece.batch.baselines
+            products = _column_products(piece.span, common)
             mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies]) @ products
-            real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, rank, rank]))
-            roots = projector.baseline_roots(batch, batch_roots)
+            real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, piece.span.shape[1], rank]))
+            roots = projector.baseline_roots(piece, batch_roots)
             real, imaginary = roots @ real, roots @ imaginary
             square = tf.matmul(real, real, transpose_a=True) + tf.matmul(imaginary, imaginary, transpose_a=True)
             crossed = tf.matmul(real, imaginary, transpose_a=True)
-            both = tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)])
             # Added up on the way: the sums of all batches at once would be large.
             before = absorbed[-1] if absorbed else 0.0
-            absorbed.append(before + tensors.sum_over_antenna(both, batch.baselines))
-    return AntennaBlocks(degrees, common, gram, absorbed[-1])
+            absorbed.append(before + tensors.sum_over_antenna(tf.stack([square, crossed]), piece.batch.baselines))
+    square, crossed = tf.unstack(absorbed[-1])
+    return AntennaBlocks(degrees, common, gram, tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)]))
+
+
+def _column_products(left: tf.Tensor, right: tf.Tensor) -> tf.Tensor:
+    """Return the products of each column of one matrix with each of another, (N, Nleft * Nright)."""
+    return tf.reshape(left[:, :, None] * right[:, None, :], [left.shape[0], -1])
 
 
 class AntennaInverse(NamedTuple):
