@@ -18,8 +18,8 @@ import tensorflow as tf
 BATCHES = 8
 # Batches of fewer baselines than this are not worth their compilation.
 LEAST_BATCH = 16
-# Models with this much more vectors than the narrowest of a batch are not padded to it: the cost grows with the square
-# and the cube of their number.
+# No model of a batch has more than this many times the vectors of its narrowest one: the cost of padding grows with the
+# square and the cube of their number.
 WIDEST = 4 / 3
 # Singular values kept in what bases span, relative to the largest: what is left out is an error of the Gauss-Newton
 # matrix.
@@ -54,7 +54,9 @@ class Batch(NamedTuple):
 
 
 def make_batches(bases: Sequence[np.ndarray], sizes: Sequence[int], edges: np.ndarray, most: int) -> list[Batch]:
-    """Return batches of at most `most` baselines, unless one model has more or models have common coefficients.
+    """Return batches of at most `most` baselines and of models with similar numbers of vectors.
+
+    A model with more baselines than that, or models with common coefficients, are a batch all the same.
 
     Parameters
     ----------
@@ -76,8 +78,8 @@ def make_batches(bases: Sequence[np.ndarray], sizes: Sequence[int], edges: np.nd
     n_models, cuts = len(bucket_of), [0]
     widths = np.array([basis.shape[-1] for basis in bases])[bucket_of]
     for model in range(1, n_models):
-        many = edges[model + 1] - edges[cuts[-1]] > most or widths[model] > WIDEST * widths[cuts[-1]]
-        full = not joint[model] and many
+        wider = widths[model] > WIDEST * widths[cuts[-1]]
+        full = not joint[model] and (edges[model + 1] - edges[cuts[-1]] > most or wider)
         other = bucket_of[model] != bucket_of[model - 1]
         if full or (other and (apart or joint[model] or joint[model - 1])):
             cuts.append(model)
