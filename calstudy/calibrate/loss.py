@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 import tensorflow as tf
 
-from calstudy.calibrate.tensors import FitTensors
-
 # Real and imaginary parts stay apart here: stacking them would cost the compiled step a copy each time.
 Parts = tuple[tf.Tensor, tf.Tensor]
 
@@ -30,20 +28,22 @@ def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tenso
     for u, basis in zip(coefficients, bases, strict=True):
         n_vectors, n_frequencies = basis.shape[0], basis.shape[-1]
         both = tf.reshape(u, [-1, n_vectors]) @ tf.reshape(basis, [n_vectors, -1])
-        both = tf.reshape(both, [-1, n_frequencies])
-        n_members = both.shape[0] // 2
-        real.append(both[:n_members])
-        imaginary.append(both[n_members:])
+        # The gradient of a split is one concatenation; that of two slices would be two arrays padded with zeros.
+        parts = tf.split(tf.reshape(both, [-1, n_frequencies]), 2)
+        real.append(parts[0])
+        imaginary.append(parts[1])
     return tf.concat(real, axis=0), tf.concat(imaginary, axis=0)
 
 
 def likelihood(
-    tensors: FitTensors, gains: tf.Tensor, model: Parts, visibilities: tf.Tensor, weights: tf.Tensor
+    antennas: tuple[tf.Tensor, tf.Tensor], gains: tf.Tensor, model: Parts, visibilities: tf.Tensor, weights: tf.Tensor
 ) -> tf.Tensor:
     """Return sum w |v - g_a g_b* F|^2 over baselines and channels.
 
     Parameters
     ----------
+    antennas
+        a and b of each baseline, each of shape (Nbls,), int32.
     gains
         Shape (2, Nants, Nfreqs).
     model
@@ -51,8 +51,10 @@ def likelihood(
     visibilities, weights
         Shapes (2, Nbls, Nfreqs) and (Nbls, Nfreqs).
     """
-    a_real, a_imaginary = tf.gather(gains[0], tensors.first), tf.gather(gains[1], tensors.first)
-    b_real, b_imaginary = tf.gather(gains[0], tensors.second), tf.gather(gains[1], tensors.second)
+    first, second = antennas
+    real, imaginary = tf.unstack(gains)
+    a_real, a_imaginary = tf.gather(real, first), tf.gather(imaginary, first)
+    b_real, b_imaginary = tf.gather(real, second), tf.gather(imaginary, second)
     product_real = a_real * b_real + a_imaginary * b_imaginary
     product_imaginary = a_imaginary * b_real - a_real * b_imaginary
     residual_real = visibilities[0] - (product_real * model[0] - product_imaginary * model[1])
@@ -60,20 +62,17 @@ def likelihood(
     return tf.reduce_sum(weights * (tf.square(residual_real) + tf.square(residual_imaginary)))
 
 
-def sum_prior(tensors: FitTensors, model: Parts, weights: tf.Tensor, target: tf.Tensor) -> tf.Tensor:
+def sum_prior(coefficients: Sequence[tf.Tensor], summed: Sequence[tf.Tensor], target: tf.Tensor) -> tf.Tensor:
     """Return |sum w' (F - m)|^2 with w' = w, on the model itself and not on gains times model (paper §Method).
 
     Parameters
     ----------
-    model
-        F on the baselines, real and imaginary part, each (Nbls, Nfreqs).
-    weights
-        Shape (Nbls, Nfreqs).
+    coefficients
+        u of each bucket, see `foreground_model`.
+    summed
+        What sum w F has of each of them, for its real part and its imaginary part, of the same shapes.
     target
         The weighted sum of the sky model, shape (2,).
     """
-    # The sum runs over visibilities as they were measured, also where the solver turned a baseline around.
-    imaginary = model[1] if tensors.orientation is None else model[1] * tf.constant(tensors.orientation, weights.dtype)
-    real_excess = tf.reduce_sum(weights * model[0]) - target[0]
-    imaginary_excess = tf.reduce_sum(weights * imaginary) - target[1]
-    return tf.square(real_excess) + tf.square(imaginary_excess)
+    parts = [tf.reduce_sum(u * weight, axis=(1, 2)) for u, weight in zip(coefficients, summed, strict=True)]
+    return tf.reduce_sum(tf.square(tf.add_n(parts) - target))

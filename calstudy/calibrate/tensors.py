@@ -122,6 +122,10 @@ class FitTensors:
         start, end = batch.models
         return np.repeat(np.arange(end - start), np.diff(self._baseline_edges[start : end + 1]))
 
+    def baselines_of(self, model: int) -> tuple[int, int]:
+        """Return the first baseline of a model, and one past its last."""
+        return int(self._baseline_edges[model]), int(self._baseline_edges[model + 1])
+
     def of_models(self, values: tf.Tensor) -> tf.Tensor:
         """Return what the first baseline of each model has: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
         return values if self.model_index is None else tf.gather(values, self._baseline_edges[:-1], axis=1)

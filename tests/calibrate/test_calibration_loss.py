@@ -70,9 +70,9 @@ def numpy_loss(problem, gains, coefficients):
 
 def tensor_problem(problem, gains, coefficients, precision):
     kernels = first_order.JointKernels(problem.structure, first_order.Optimizer(), precision, "sum")
-    measured = kernels.tensors.load(problem, kernels.dtype)
+    measured, exact = (kernels.tensors.load(problem, dtype) for dtype in (kernels.dtype, tf.float64))
     target = pairs.to_pair(np.array(problem.prior_target / measured.scale), kernels.dtype)
-    data = first_order.FitData(measured.visibilities, measured.weights, target)
+    data = first_order.FitData(measured.visibilities, measured.weights, target, kernels.summed(exact.weights))
     parameters = first_order.Parameters(
         pairs.to_pair(gains, kernels.dtype),
         tuple(pairs.to_pair(u / measured.scale, kernels.dtype) for u in coefficients),

@@ -32,6 +32,9 @@ Stop = Literal["best-loss", "published"]
 # Decay of the first and second moment and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-7
 STEPS_PER_CALL = 50
+# Into about this many parts the baselines are divided, so that what a part needs for a while stays in the processor's
+# cache. More of them take longer to compile.
+PARTS = 8
 
 
 class Parameters(NamedTuple):
@@ -66,13 +69,29 @@ class Descent(NamedTuple):
 class FitData(NamedTuple):
     """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's target (2,), in units of the rms.
 
-    The model (2, Nbls, Nfreqs) is there only if it is frozen.
+    The model (2, Nbls, Nfreqs) is there only if it is frozen; `summed` of `calstudy.calibrate.loss.sum_prior` only if
+    it is not.
     """
 
     visibilities: tf.Tensor
     weights: tf.Tensor
     target: tf.Tensor
+    summed: tuple[tf.Tensor, ...] = ()
     model: tf.Tensor | None = None
+
+
+class Part(NamedTuple):
+    """Some baselines of the loss, which is a sum over them.
+
+    Attributes
+    ----------
+    buckets, models, baselines
+        First one and one past the last, in the solvers' order.
+    """
+
+    buckets: tuple[int, int]
+    models: tuple[int, int]
+    baselines: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -114,6 +133,19 @@ def _coefficients(model: tf.Tensor, basis: np.ndarray) -> tf.Tensor:
     if basis.ndim == 2:
         return model @ basis
     return tf.reshape(model, [2, 1, -1]) @ basis.reshape(-1, basis.shape[-1])
+
+
+def _make_parts(tensors: FitTensors) -> list[Part]:
+    """Return all baselines in about `PARTS` parts, of whole buckets."""
+    parts: list[Part] = []
+    start = 0
+    for bucket, (_, model) in enumerate(tensors.slices):
+        first_model = tensors.slices[start][0]
+        (first, _), (_, last) = tensors.baselines_of(first_model), tensors.baselines_of(model - 1)
+        if last >= tensors.n_baselines * (len(parts) + 1) / PARTS:
+            parts.append(Part((start, bucket + 1), (first_model, model), (first, last)))
+            start = bucket + 1
+    return parts
 
 
 def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
@@ -162,6 +194,7 @@ class JointKernels:
         self.space = GainSpace(structure.gain_vectors, self.dtype)
         self.bases = [tf.constant(np.moveaxis(basis, -1, 0), self.dtype) for basis in self.tensors.bases]
         self._optimizer, self._with_prior = optimizer, prior == "sum"
+        self._parts = _make_parts(self.tensors)
         self.descend = tf.function(self._descend, jit_compile=True, autograph=False)
 
     def load(self, problem: CalibrationProblem, gains: np.ndarray) -> tuple[Parameters, FitData, float]:
@@ -173,25 +206,54 @@ class JointKernels:
         if (frozen := problem.frozen_model) is not None:
             model = self.tensors.load_model(frozen, exact.scale, self.dtype)
         else:
-            best = self.tensors.of_models(self.projector.project(start, exact.visibilities, exact.weights).model)
-            parts = zip(self.tensors.slices, self.tensors.bases, strict=True)
-            coefficients = tuple(
-                tf.cast(_coefficients(best[:, first:last], basis), self.dtype) for (first, last), basis in parts
-            )
+            best = self.projector.project(start, exact.visibilities, exact.weights).model
+            coefficients = self._coefficients(self.tensors.of_models(best))
         target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
         visibilities, weights = (tf.cast(part, self.dtype) for part in (exact.visibilities, exact.weights))
-        data = FitData(visibilities, weights, pairs.to_pair(target, self.dtype), model)
+        summed = () if problem.frozen else self.summed(exact.weights)
+        data = FitData(visibilities, weights, pairs.to_pair(target, self.dtype), summed, model)
         return Parameters(self.space.reduce(tf.cast(start, self.dtype)), coefficients), data, exact.scale
+
+    def summed(self, weights: tf.Tensor) -> tuple[tf.Tensor, ...]:
+        """Return what the sum of w F over baselines and channels has of each coefficient; see `sum_prior`.
+
+        Parameters
+        ----------
+        weights
+            (Nbls, Nfreqs), float64.
+        """
+        # The sum runs over visibilities as they were measured, also where the solver turned a baseline around.
+        orientation = self.tensors.orientation
+        of_parts = tf.stack([weights, weights if orientation is None else weights * orientation])
+        return self._coefficients(self.tensors.sum_pairs_over_group(of_parts))
+
+    def _coefficients(self, models: tf.Tensor) -> tuple[tf.Tensor, ...]:
+        """Return A^T F of each bucket for models (2, Nmodels, Nfreqs), the transpose of `foreground_model`."""
+        parts = zip(self.tensors.slices, self.tensors.bases, strict=True)
+        return tuple(tf.cast(_coefficients(models[:, first:last], basis), self.dtype) for (first, last), basis in parts)
+
+    def _part_loss(self, part: Part, gains: tf.Tensor, coefficients: tuple[tf.Tensor, ...], data: FitData) -> tf.Tensor:
+        """Return the likelihood of a part, for gains (2, Nants, Nfreqs) and the coefficients of its models."""
+        first, last = part.baselines
+        if data.model is not None:
+            model = tf.unstack(data.model[:, first:last])
+        else:
+            model = foreground_model(coefficients, self.bases[slice(*part.buckets)])
+            if self.tensors.model_index is not None:
+                owner = self.tensors.model_index[first:last] - part.models[0]
+                model = tuple(tf.gather(values, owner) for values in model)
+        antennas = self.tensors.first[first:last], self.tensors.second[first:last]
+        return likelihood(antennas, gains, model, data.visibilities[:, first:last], data.weights[first:last])
 
     def loss(self, parameters: Parameters, data: FitData) -> tf.Tensor:
         """Return the likelihood, plus the sum prior where the problem has it."""
         gains = self.space.expand(parameters.gains)
-        if data.model is not None:
-            return likelihood(self.tensors, gains, tf.unstack(data.model), data.visibilities, data.weights)
-        real, imaginary = foreground_model(parameters.coefficients, self.bases)
-        model = self.tensors.to_baselines(real, axis=0), self.tensors.to_baselines(imaginary, axis=0)
-        value = likelihood(self.tensors, gains, model, data.visibilities, data.weights)
-        return value + sum_prior(self.tensors, model, data.weights, data.target) if self._with_prior else value
+        values = [
+            self._part_loss(part, gains, parameters.coefficients[slice(*part.buckets)], data) for part in self._parts
+        ]
+        if self._with_prior and data.summed:
+            values.append(sum_prior(parameters.coefficients, data.summed, data.target))
+        return tf.add_n(values)
 
     def estimate(self, parameters: Parameters, data: FitData, scale: float) -> Estimate:
         """Return gains and model in the problem's order and unit.
@@ -212,10 +274,28 @@ class JointKernels:
 
     def loss_and_gradient(self, parameters: Parameters, data: FitData) -> tuple[tf.Tensor, Parameters]:
         """Return the loss and its gradient, of the shape of the parameters."""
-        with tf.GradientTape() as tape:
-            tape.watch(parameters)
-            value = self.loss(parameters, data)
-        return value, _map(tf.convert_to_tensor, tape.gradient(value, parameters))
+        with tf.GradientTape() as expansion:
+            expansion.watch(parameters.gains)
+            gains = self.space.expand(parameters.gains)
+        values, of_gains, of_coefficients = [], [], []
+        # The gradient of each part by itself: that of their sum would keep all that the parts need until the end.
+        for part in self._parts:
+            coefficients = parameters.coefficients[slice(*part.buckets)]
+            with tf.GradientTape() as tape:
+                tape.watch([gains, coefficients])
+                value = self._part_loss(part, gains, coefficients, data)
+            slope, slopes = tape.gradient(value, [gains, coefficients])
+            values.append(value)
+            of_gains.append(slope)
+            of_coefficients.extend(slopes)
+        if self._with_prior and data.summed:
+            with tf.GradientTape() as tape:
+                tape.watch(parameters.coefficients)
+                values.append(sum_prior(parameters.coefficients, data.summed, data.target))
+            slopes = tape.gradient(values[-1], parameters.coefficients)
+            of_coefficients = [slope + more for slope, more in zip(of_coefficients, slopes, strict=True)]
+        slope = tf.convert_to_tensor(expansion.gradient(gains, parameters.gains, tf.add_n(of_gains)))
+        return tf.add_n(values), Parameters(slope, tuple(of_coefficients))
 
     def _descend(
         self, n_steps: tf.Tensor, done: tf.Tensor, descent: Descent, data: FitData
