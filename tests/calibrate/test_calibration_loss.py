@@ -9,6 +9,7 @@ from toy import HEX, complex_normal, make_toy
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import make_basis
+from calstudy.calibrate.loss import FitData, Parameters
 from calstudy.calibrate.problem import FitStructure, flag_weights, gain_products
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers import first_order
@@ -72,8 +73,8 @@ def tensor_problem(problem, gains, coefficients, precision):
     kernels = first_order.JointKernels(problem.structure, first_order.Optimizer(), precision, "sum")
     measured, exact = (kernels.tensors.load(problem, dtype) for dtype in (kernels.dtype, tf.float64))
     target = pairs.to_pair(np.array(problem.prior_target / measured.scale), kernels.dtype)
-    data = first_order.FitData(measured.visibilities, measured.weights, target, kernels.summed(exact.weights))
-    parameters = first_order.Parameters(
+    data = FitData(measured.visibilities, measured.weights, target, kernels.loss.summed(exact.weights))
+    parameters = Parameters(
         pairs.to_pair(gains, kernels.dtype),
         tuple(pairs.to_pair(u / measured.scale, kernels.dtype) for u in coefficients),
     )
@@ -84,14 +85,14 @@ def tensor_problem(problem, gains, coefficients, precision):
 def test_loss_is_the_papers_formula(case, precision):
     problem, gains, coefficients = case
     kernels, parameters, data, scale = tensor_problem(problem, gains, coefficients, precision)
-    value = scale**2 * float(kernels.loss(parameters, data))
+    value = scale**2 * float(kernels.loss.value(parameters, data))
     assert value == pytest.approx(numpy_loss(problem, gains, coefficients), rel=TOLERANCE[precision])
 
 
 def test_gradient_is_the_finite_difference(case):
     problem, gains, coefficients = case
     kernels, parameters, data, scale = tensor_problem(problem, gains, coefficients, "double")
-    _, gradient = kernels.loss_and_gradient(parameters, data)
+    _, gradient = kernels.loss.value_and_gradient(parameters, data)
     rng = np.random.default_rng(6)
     step_gains = complex_normal(rng, gains.shape)
     step_coefficients = [scale * complex_normal(rng, u.shape) for u in coefficients]
@@ -186,8 +187,8 @@ def test_updates_are_those_of_keras(method):
     rng = np.random.default_rng(10)
     variable = tf.Variable(rng.standard_normal((2, 3, 4)))
     gradients = [tf.constant(rng.standard_normal((2, 3, 4))) for _ in range(5)]
-    parameters = first_order.Parameters(tf.constant(variable.numpy()), ())
-    zero = first_order.Parameters(tf.zeros_like(parameters.gains), ())
+    parameters = Parameters(tf.constant(variable.numpy()), ())
+    zero = Parameters(tf.zeros_like(parameters.gains), ())
     moments = (zero, zero)
     optimizer = {
         "adamax": tf.keras.optimizers.Adamax,
@@ -197,7 +198,5 @@ def test_updates_are_those_of_keras(method):
     for count, gradient in enumerate(gradients, 1):
         optimizer.apply_gradients([(gradient, variable)])
         step = tf.constant(float(count), tf.float64)
-        parameters, moments = first_order.update(
-            method, 0.03, step, parameters, moments, first_order.Parameters(gradient, ())
-        )
+        parameters, moments = first_order.update(method, 0.03, step, parameters, moments, Parameters(gradient, ()))
     assert np.allclose(parameters.gains, variable, rtol=0, atol=1e-6)

@@ -17,7 +17,7 @@ import tensorflow as tf
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.gain_space import GainSpace
-from calstudy.calibrate.loss import foreground_model, likelihood, sum_prior
+from calstudy.calibrate.loss import FitData, JointLoss, Parameters
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, Prior
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
@@ -32,19 +32,6 @@ Stop = Literal["best-loss", "published"]
 # Decay of the first and second moment and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-7
 STEPS_PER_CALL = 50
-# Into about this many parts the baselines are divided, so that what a part needs for a while stays in the processor's
-# cache. More of them take longer to compile.
-PARTS = 8
-
-
-class Parameters(NamedTuple):
-    """Unknowns or anything of their shape: gains (2, Nants, Nfreqs) and one (2, Nmembers, Nvec) per piece.
-
-    Gains in a smooth basis are its coefficients, (2, Nants, Ngain). With frozen foregrounds there is no piece.
-    """
-
-    gains: tf.Tensor
-    coefficients: tuple[tf.Tensor, ...]
 
 
 class Descent(NamedTuple):
@@ -64,34 +51,6 @@ class Descent(NamedTuple):
     moments: tuple[Parameters, Parameters]
     best: Parameters
     best_loss: tf.Tensor
-
-
-class FitData(NamedTuple):
-    """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's target (2,), in units of the rms.
-
-    The model (2, Nbls, Nfreqs) is there only if it is frozen; `summed` of `calstudy.calibrate.loss.sum_prior` only if
-    it is not.
-    """
-
-    visibilities: tf.Tensor
-    weights: tf.Tensor
-    target: tf.Tensor
-    summed: tuple[tf.Tensor, ...] = ()
-    model: tf.Tensor | None = None
-
-
-class Part(NamedTuple):
-    """Some baselines of the loss, which is a sum over them.
-
-    Attributes
-    ----------
-    buckets, models, baselines
-        First one and one past the last, in the solvers' order.
-    """
-
-    buckets: tuple[int, int]
-    models: tuple[int, int]
-    baselines: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -126,26 +85,6 @@ class Optimizer:
         if self.schedule == "exponential":
             return self.learning_rate * tf.exp(math.log(self.final_rate) * done)
         return tf.constant(self.learning_rate, step.dtype)
-
-
-def _coefficients(model: tf.Tensor, basis: np.ndarray) -> tf.Tensor:
-    """Return the coefficients of models (2, Nmembers, Nfreqs) in an orthonormal basis; see `foreground_model`."""
-    if basis.ndim == 2:
-        return model @ basis
-    return tf.reshape(model, [2, 1, -1]) @ basis.reshape(-1, basis.shape[-1])
-
-
-def _make_parts(tensors: FitTensors) -> list[Part]:
-    """Return all baselines in about `PARTS` parts, of whole buckets."""
-    parts: list[Part] = []
-    start = 0
-    for bucket, (_, model) in enumerate(tensors.slices):
-        first_model = tensors.slices[start][0]
-        (first, _), (_, last) = tensors.baselines_of(first_model), tensors.baselines_of(model - 1)
-        if last >= tensors.n_baselines * (len(parts) + 1) / PARTS:
-            parts.append(Part((start, bucket + 1), (first_model, model), (first, last)))
-            start = bucket + 1
-    return parts
 
 
 def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
@@ -192,9 +131,8 @@ class JointKernels:
         self.tensors = FitTensors(structure)
         self.projector = Projector(structure, self.tensors)
         self.space = GainSpace(structure.gain_vectors, self.dtype)
-        self.bases = [tf.constant(np.moveaxis(basis, -1, 0), self.dtype) for basis in self.tensors.bases]
-        self._optimizer, self._with_prior = optimizer, prior == "sum"
-        self._parts = _make_parts(self.tensors)
+        self.loss = JointLoss(self.tensors, self.space, prior, self.dtype)
+        self._optimizer = optimizer
         self.descend = tf.function(self._descend, jit_compile=True, autograph=False)
 
     def load(self, problem: CalibrationProblem, gains: np.ndarray) -> tuple[Parameters, FitData, float]:
@@ -207,53 +145,12 @@ class JointKernels:
             model = self.tensors.load_model(frozen, exact.scale, self.dtype)
         else:
             best = self.projector.project(start, exact.visibilities, exact.weights).model
-            coefficients = self._coefficients(self.tensors.of_models(best))
+            coefficients = self.loss.coefficients(self.tensors.of_models(best))
         target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
         visibilities, weights = (tf.cast(part, self.dtype) for part in (exact.visibilities, exact.weights))
-        summed = () if problem.frozen else self.summed(exact.weights)
+        summed = () if problem.frozen else self.loss.summed(exact.weights)
         data = FitData(visibilities, weights, pairs.to_pair(target, self.dtype), summed, model)
         return Parameters(self.space.reduce(tf.cast(start, self.dtype)), coefficients), data, exact.scale
-
-    def summed(self, weights: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """Return what the sum of w F over baselines and channels has of each coefficient; see `sum_prior`.
-
-        Parameters
-        ----------
-        weights
-            (Nbls, Nfreqs), float64.
-        """
-        # The sum runs over visibilities as they were measured, also where the solver turned a baseline around.
-        orientation = self.tensors.orientation
-        of_parts = tf.stack([weights, weights if orientation is None else weights * orientation])
-        return self._coefficients(self.tensors.sum_pairs_over_group(of_parts))
-
-    def _coefficients(self, models: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """Return A^T F of each bucket for models (2, Nmodels, Nfreqs), the transpose of `foreground_model`."""
-        parts = zip(self.tensors.slices, self.tensors.bases, strict=True)
-        return tuple(tf.cast(_coefficients(models[:, first:last], basis), self.dtype) for (first, last), basis in parts)
-
-    def _part_loss(self, part: Part, gains: tf.Tensor, coefficients: tuple[tf.Tensor, ...], data: FitData) -> tf.Tensor:
-        """Return the likelihood of a part, for gains (2, Nants, Nfreqs) and the coefficients of its models."""
-        first, last = part.baselines
-        if data.model is not None:
-            model = tf.unstack(data.model[:, first:last])
-        else:
-            model = foreground_model(coefficients, self.bases[slice(*part.buckets)])
-            if self.tensors.model_index is not None:
-                owner = self.tensors.model_index[first:last] - part.models[0]
-                model = tuple(tf.gather(values, owner) for values in model)
-        antennas = self.tensors.first[first:last], self.tensors.second[first:last]
-        return likelihood(antennas, gains, model, data.visibilities[:, first:last], data.weights[first:last])
-
-    def loss(self, parameters: Parameters, data: FitData) -> tf.Tensor:
-        """Return the likelihood, plus the sum prior where the problem has it."""
-        gains = self.space.expand(parameters.gains)
-        values = [
-            self._part_loss(part, gains, parameters.coefficients[slice(*part.buckets)], data) for part in self._parts
-        ]
-        if self._with_prior and data.summed:
-            values.append(sum_prior(parameters.coefficients, data.summed, data.target))
-        return tf.add_n(values)
 
     def estimate(self, parameters: Parameters, data: FitData, scale: float) -> Estimate:
         """Return gains and model in the problem's order and unit.
@@ -269,33 +166,8 @@ class JointKernels:
         """
         model = data.model
         if model is None:
-            model = self.tensors.to_baselines(tf.stack(foreground_model(parameters.coefficients, self.bases)))
+            model = self.loss.model(parameters.coefficients)
         return Estimate(pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload(model, scale))
-
-    def loss_and_gradient(self, parameters: Parameters, data: FitData) -> tuple[tf.Tensor, Parameters]:
-        """Return the loss and its gradient, of the shape of the parameters."""
-        with tf.GradientTape() as expansion:
-            expansion.watch(parameters.gains)
-            gains = self.space.expand(parameters.gains)
-        values, of_gains, of_coefficients = [], [], []
-        # The gradient of each part by itself: that of their sum would keep all that the parts need until the end.
-        for part in self._parts:
-            coefficients = parameters.coefficients[slice(*part.buckets)]
-            with tf.GradientTape() as tape:
-                tape.watch([gains, coefficients])
-                value = self._part_loss(part, gains, coefficients, data)
-            slope, slopes = tape.gradient(value, [gains, coefficients])
-            values.append(value)
-            of_gains.append(slope)
-            of_coefficients.extend(slopes)
-        if self._with_prior and data.summed:
-            with tf.GradientTape() as tape:
-                tape.watch(parameters.coefficients)
-                values.append(sum_prior(parameters.coefficients, data.summed, data.target))
-            slopes = tape.gradient(values[-1], parameters.coefficients)
-            of_coefficients = [slope + more for slope, more in zip(of_coefficients, slopes, strict=True)]
-        slope = tf.convert_to_tensor(expansion.gradient(gains, parameters.gains, tf.add_n(of_gains)))
-        return tf.add_n(values), Parameters(slope, tuple(of_coefficients))
 
     def _descend(
         self, n_steps: tf.Tensor, done: tf.Tensor, descent: Descent, data: FitData
@@ -303,7 +175,7 @@ class JointKernels:
         """Take `n_steps` steps after `done`; returns the descent, the loss before each step, and the loss after all."""
 
         def body(index: tf.Tensor, now: Descent, losses: tf.Tensor) -> tuple[tf.Tensor, Descent, tf.Tensor]:
-            value, gradient = self.loss_and_gradient(now.parameters, data)
+            value, gradient = self.loss.value_and_gradient(now.parameters, data)
             better = value < now.best_loss
             best = _map(lambda new, old: tf.where(better, new, old), now.parameters, now.best)
             step = tf.cast(done + index + 1, self.dtype)
@@ -314,7 +186,7 @@ class JointKernels:
 
         start = (tf.constant(0), descent, tf.zeros([STEPS_PER_CALL], self.dtype))
         _, descent, losses = tf.while_loop(lambda index, *_: index < n_steps, body, start, parallel_iterations=1)
-        return descent, losses, self.loss(descent.parameters, data)
+        return descent, losses, self.loss.value(descent.parameters, data)
 
 
 @lru_cache(maxsize=4)
@@ -378,7 +250,7 @@ class FirstOrder:
         kernels = compiled(problem.structure, self.optimizer, self.precision, problem.prior)
         gains = problem.initial_gains if warm is None else warm.gains
         parameters, data, scale = kernels.load(problem, gains)
-        loss = kernels.loss(parameters, data)
+        loss = kernels.loss.value(parameters, data)
         zero = _map(tf.zeros_like, parameters)
         descent = Descent(parameters, (zero, zero), parameters, loss)
         return FirstOrderState(kernels, data, scale, descent, (float(loss),))
