@@ -78,6 +78,13 @@ Output = Annotated[
     typer.Option(metavar="FOLDER", help="Where the run gets its folder: --set outputs.runs=FOLDER."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
+Finished = Annotated[
+    list[Path] | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Take members of a collection from finished runs, or references, in this folder; may be repeated.",
+    ),
+]
 Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster instead.")]
 
 
@@ -105,11 +112,13 @@ def run(
     max_memory: MaxMemory = None,
     scheduler: Scheduler = None,
     output: Output = None,
+    finished: Finished = None,
 ) -> None:
     """Run an experiment or a collection: simulate, corrupt, calibrate, measure power spectra, draw figures.
 
     Products that are in the store already are not made again; an interrupted run is resumed by the same command.
     """
+    from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import show_run
     from calstudy.studies.study import Budget, run_study
@@ -117,6 +126,8 @@ def run(
     console = Console(soft_wrap=True, highlight=False)
     changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
     study = load_study(file, scale, changes)
+    if finished:
+        study = with_finished(study, finished, console)
     show_run(run_study(study, Budget(workers, max_memory, scheduler), console), console)
 
 

@@ -25,7 +25,7 @@ EXPERIMENT, MANIFEST = "experiment.yaml", "manifest.json"
 KEPT = ("png", "npz")
 """Endings of a figure's files that are kept: the picture and its arrays."""
 TABLES = ("realizations.md", "comparison.md")
-"""Tables that are kept."""
+"""Tables for readers, which are kept beside the figures."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def accept(run: Path, reference: Path) -> None:
-    """Make a finished run the reference: its pictures, arrays, claims, manifest and experiment replace what is there.
+    """Make a finished run the reference: its pictures, arrays, tables, claims and description replace what is there.
 
     A collection keeps the experiments of its members as they are in the references beside it, by the members' names.
 
@@ -138,6 +138,8 @@ def accept(run: Path, reference: Path) -> None:
     sources = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
     sources |= {name: run / name for name in (*CLAIMS_FILES, MANIFEST) if (run / name).is_file()}
     sources |= {name: run / "tables" / name for name in TABLES if (run / "tables" / name).is_file()}
+    # A collection can be put together from references that have these (`calstudy.studies.finished`).
+    tables = {f"tables/{name}": run / "tables" / name for name in _listed_tables(run)}
     description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
     try:
         reference.mkdir(parents=True, exist_ok=True)
@@ -145,11 +147,20 @@ def accept(run: Path, reference: Path) -> None:
         for old in [*kept, *(reference / name for name in (*CLAIMS_FILES, *TABLES))]:
             if old.name not in sources:
                 old.unlink(missing_ok=True)
-        for name, source in sources.items():
+        shutil.rmtree(reference / "tables", ignore_errors=True)
+        if tables:
+            (reference / "tables").mkdir()
+        for name, source in (sources | tables).items():
             _replace(reference / name, source.read_bytes())
         _replace(reference / EXPERIMENT, description.encode())
     except OSError as error:
         raise InputError(f"{reference}: cannot be written ({error.strerror})") from None
+
+
+def _listed_tables(run: Path) -> list[str]:
+    """Return the names of the tables whose content the manifest of a run has on record."""
+    products = json.loads((run / MANIFEST).read_text(encoding="utf-8")).get("products", [])
+    return sorted({name for entry in products for name in entry.get("files", ())})
 
 
 def _replace(path: Path, content: bytes) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -78,10 +79,19 @@ class Collection(Study):
         The experiments by name, in the order of the file; all with the same store and folder of runs.
     roles
         Names of members by the role that they play in their papers.
+    finished
+        Run folders of members that were run before, by name, whose tables are in the store. The collection does not run
+        these, and needs nothing else of them.
     """
 
-    def __init__(self, file: CollectionFile, members: Mapping[str, Experiment], roles: Mapping[str, str]) -> None:
-        self.file, self.members, self.roles = file, dict(members), dict(roles)
+    def __init__(
+        self,
+        file: CollectionFile,
+        members: Mapping[str, Experiment],
+        roles: Mapping[str, str],
+        finished: Mapping[str, Path] | None = None,
+    ) -> None:
+        self.file, self.members, self.roles, self.finished = file, dict(members), dict(roles), dict(finished or {})
         self.name, self.description = file.name, file.description
 
     @property
@@ -90,24 +100,34 @@ class Collection(Study):
         return next(iter(self.members.values())).outputs
 
     @cached_property
-    def parts(self) -> Mapping[str, ExperimentStudy | Realizations]:
+    def studies(self) -> Mapping[str, ExperimentStudy | Realizations]:
         """The members."""
         return {
             name: Realizations(experiment) if experiment.realizations else ExperimentStudy(experiment)
             for name, experiment in self.members.items()
         }
 
+    @property
+    def parts(self) -> Mapping[str, ExperimentStudy | Realizations]:
+        """The members that are run."""
+        return {name: study for name, study in self.studies.items() if name not in self.finished}
+
+    def without(self, finished: Mapping[str, Path]) -> Self:
+        """Return the collection with members that need not be run; see `finished`."""
+        return type(self)(self.file, self.members, self.roles, {**self.finished, **finished})
+
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the collection with every member fitted, and the smallest number of workers of all."""
         fits = fitted_parts(self.parts, budget)
-        members = {name: part.experiment for name, (part, _) in fits.items()}
-        return type(self)(self.file, members, self.roles), min(count for _, count in fits.values())
+        members = {**self.members, **{name: part.experiment for name, (part, _) in fits.items()}}
+        count = min((count for _, count in fits.values()), default=1)
+        return type(self)(self.file, members, self.roles, self.finished), count
 
     @property
     def folder(self) -> Path:
         """The run folder: the name, and a digest of what the collection and its members say."""
         content = {
-            "members": {name: part.folder.name for name, part in self.parts.items()},
+            "members": {name: study.folder.name for name, study in self.studies.items()},
             "roles": self.roles,
             "figures": identity(self.file.figures),
         }
@@ -116,7 +136,7 @@ class Collection(Study):
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
         """What any member uses in place of the papers' own ingredients."""
-        return unique_notes(note for part in self.parts.values() for note in part.stand_ins)
+        return unique_notes(note for study in self.studies.values() for note in study.stand_ins)
 
     @cached_property
     def figures(self) -> list[Task]:
@@ -124,7 +144,7 @@ class Collection(Study):
         return [self._figure(figure) for figure in _comparisons(self.file)]
 
     def _figure(self, figure: ComparisonFigure) -> Task:
-        compared = {role: self.parts[self.roles[role]] for role in figure.titles} or dict(self.parts)
+        compared = {role: self.studies[self.roles[role]] for role in figure.titles} or dict(self.studies)
         notes = unique_notes(note for part in compared.values() for note in part.stand_ins)
         return comparison_task({role: part.graph for role, part in compared.items()}, figure, notes)
 
@@ -134,15 +154,21 @@ class Collection(Study):
 
         Members with realizations have no claims: these are about single runs.
         """
-        graphs = {name: part.graph for name, part in self.parts.items()}
+        graphs = {name: study.graph for name, study in self.studies.items()}
         papers = distinct_papers(
             paper for experiment in self.members.values() if not experiment.realizations for paper in experiment.papers
         )
         return combined_claims(self.name, graphs, papers, self.roles, self.stand_ins)
 
+    def _place(self, name: str) -> str:
+        """Return where the folder of a member is, from the folder of runs."""
+        if name in self.finished:
+            return os.path.relpath(self.finished[name].resolve(), self.folder.parent)
+        return self.studies[name].folder.name
+
     @property
     def targets(self) -> list[Task]:
-        """The products of all members, and the figures and claims that compare them."""
+        """The products of all members that are run, and the figures and claims that compare members."""
         own = [*self.figures, *([self.claims] if self.claims else [])]
         return [task for part in self.parts.values() for task in part.targets] + own
 
@@ -155,7 +181,7 @@ class Collection(Study):
         own = [*self.figures, *([self.claims] if self.claims else [])]
         fields = {
             "description": self.description,
-            "members": {name: part.folder.name for name, part in self.parts.items()},
+            "members": {name: self._place(name) for name in self.members},
             "roles": self.roles,
             "figures": [figure.model_dump(mode="json") for figure in self.file.figures],
             "stand_ins": list(self.stand_ins),

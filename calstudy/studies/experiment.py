@@ -130,7 +130,7 @@ class ExperimentStudy(Study):
             **({"sky_model": sky_model.described(self.graph)} if self.calibrates else {}),
             "captions": {figure.label: figure.caption for figure in figures_of(self.experiment)},
             "seeds": seeds(self.experiment.model_dump(mode="json")),
-            "products": product_entries(self.tasks, made.products, made.tasks),
+            "products": product_entries(self.tasks, made.products, made.tasks, self.tables),
         }
         write_manifest(folder, self.name, fields)
 

@@ -130,7 +130,7 @@ RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_byte
 
 
 def product_entries(
-    tasks: Sequence[Task], products: Mapping[str, Product], made: Sequence[Task]
+    tasks: Sequence[Task], products: Mapping[str, Product], made: Sequence[Task], tables: Sequence[Task] = ()
 ) -> list[dict[str, Any]]:
     """Return what a manifest says of every product: what it was made from, what it took, and by which run.
 
@@ -142,12 +142,16 @@ def product_entries(
         By key; tasks without one are left out.
     made
         The tasks whose products this run made.
+    tables
+        The tasks whose files are the tables of the run folder. Their entries have the SHA-256 of each file.
     """
-    keys = {task.key for task in made}
+    keys, published = {task.key for task in made}, {task.key for task in tables}
     entries = []
     for task in tasks:
         if task.key in products:
             record = products[task.key].record
             entry = {"stage": task.stage.name, **{field: record[field] for field in RECORDED}}
+            if task.key in published:
+                entry["files"] = {name: file["sha256"] for name, file in record["files"].items()}
             entries.append({**entry, "made_by_this_run": task.key in keys})
     return entries

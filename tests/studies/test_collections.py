@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,12 @@ from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.products import corruption, simulation
 from calstudy.products.spectra import power
+from calstudy.regression.reference import accept
+from calstudy.run.execution import schedule
+from calstudy.run.store import Store
 from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.finished import with_finished
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
@@ -190,3 +195,65 @@ def test_the_papers_collection_shares_its_simulations(scale):
         assert component(graphs["minredundant"]).key == component(graphs["lowsnr"]).key
     assert corruption.gains(graphs["redundant"]).key == corruption.gains(graphs["redundant-modelling"]).key
     assert set(collection.roles) == {"minimally_redundant", "redundant", "redundant_modelling", "low_snr"}
+
+
+def elsewhere(folder: Path, place: Path, *overrides: str) -> Collection:
+    """Return the same collection with an empty store, and a folder of runs, in another place."""
+    changes = [f"outputs.store={place / 'store'}", f"outputs.runs={place / 'runs'}", *overrides]
+    return load_study(write(folder), overrides=changes)
+
+
+def test_members_that_were_run_elsewhere_are_compared_without_being_run(finished, folder, tmp_path):
+    runs = finished.folder.parent
+    text = io.StringIO()
+    taken = with_finished(elsewhere(folder, tmp_path), [runs], Console(file=text, width=300))
+    assert [line.partition(":")[0] for line in text.getvalue().splitlines()] == ["hexagon", "redundant"]
+    result = run_study(taken, Budget(1), Console(file=io.StringIO()))
+    assert {task.stage.name for task in result.made.tasks} == {"figure", "claims"}
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {result.folder.name}
+    assert result.folder.name == finished.folder.name
+    for name in PAIR["figures"]:
+        arrays = [np.load(run.folder / "figures" / f"{name}.npz") for run in (finished, result)]
+        assert all(
+            np.array_equal(arrays[0][key], arrays[1][key], equal_nan=True) for key in arrays[0] if key[-5:] != "title"
+        )
+    claims = [from_json((run.folder / "claims.json").read_text()) for run in (finished, result)]
+    assert claims[0] == claims[1] == evaluate_folder(result.folder).claims
+
+
+def test_a_member_can_come_from_a_reference_and_others_are_run(finished, folder, tmp_path):
+    reference = tmp_path / "figures" / "hexagon"
+    accept(finished.parts["hexagon"].folder, reference)
+    taken = with_finished(elsewhere(folder, tmp_path), [tmp_path / "figures"], Console(file=io.StringIO()))
+    assert list(taken.parts) == ["redundant"]
+    assert taken.finished == {"hexagon": reference}
+    stages = {task.stage.name for task in schedule(taken.targets, Store(tmp_path / "store")).todo}
+    assert stages >= {"simulate", "calibrate"}
+
+
+def test_a_finished_run_of_something_else_is_not_taken(finished, folder, tmp_path):
+    text, other = io.StringIO(), elsewhere(folder, tmp_path, "power.taper=hann")
+    with pytest.raises(InputError, match=r"no finished run of a member is there \(members: hexagon, redundant\)"):
+        with_finished(other, [finished.folder.parent], Console(file=text, width=300))
+    assert "is left out (other settings, or another version of a stage)" in text.getvalue()
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_table_that_was_changed_is_refused(finished, folder, tmp_path):
+    run = tmp_path / "old" / "hexagon"
+    shutil.copytree(finished.parts["hexagon"].folder, run)
+    (run / "tables" / "eor.wedge.h5").write_bytes(b"")
+    with pytest.raises(InputError, match=r"tables/eor\.wedge\.h5 is not what the run wrote"):
+        with_finished(elsewhere(folder, tmp_path), [run], Console(file=io.StringIO()))
+
+
+@pytest.mark.parametrize(
+    ("file", "place", "told"),
+    [
+        ("hex.yaml", ".", "only a collection"),
+        ("pair.yaml", "nowhere", "nowhere: is not the folder of a finished run, and holds none"),
+    ],
+)
+def test_what_cannot_be_put_together_is_refused(finished, folder, file, place, told):
+    with pytest.raises(InputError, match=told):
+        with_finished(load_study(folder / file), [finished.folder.parent / place], Console(file=io.StringIO()))
