@@ -21,9 +21,11 @@ from calstudy.power.drawn import input_power
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
+from calstudy.power.transfer import TransferFunction
 from calstudy.products.corruption import LEVELS
 from calstudy.products.files import read_json, spectrum_file
 from calstudy.products.graph import Graph
+from calstudy.products.signal_loss import TRANSFER
 from calstudy.products.spectra import read_delay_spectra
 from calstudy.run.task import Task
 from calstudy.verdicts.criterion import Finding
@@ -120,6 +122,11 @@ class Inputs:
         """Return the spherical spectrum of a variant outside the wedge, from the product "spectra"."""
         file = self.folder(experiment, "spectra") / spectrum_file(variant, "outside-wedge")
         return load_spectrum(file, SphericalSpectrum)
+
+    def transfer(self, experiment: str) -> TransferFunction:
+        """Return the transfer function of the calibration outside the wedge, from the product "transfer"."""
+        file = self.folder(experiment, "transfer") / spectrum_file(TRANSFER, "outside-wedge")
+        return load_spectrum(file, TransferFunction)
 
     def cylindrical(self, experiment: str, variant: str) -> CylindricalSpectrum:
         """Return the cylindrical spectrum of a variant, from the product "spectra"."""

@@ -2,7 +2,8 @@
 
 Pulls (P^R - P^S) / sigma outside wedge and buffer, with two readings of sigma: the paper's error bar sigma_N + sigma_S,
 and the error of the difference, from which the sample variance that P^R and P^S share is gone
-(`calstudy.power.spectra.SphericalSpectrum.difference_error`). The second is the harder.
+(`calstudy.power.spectra.SphericalSpectrum.difference_error`). The second is the harder. P^R / P^S is told as it is, and
+without the flux scale s of the fit, by whose square P^R is divided.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from pydantic import Field
 
 from calstudy.base.units import Wavenumber
 from calstudy.claims.bins import recovered, used_bins
-from calstudy.products import spectra
+from calstudy.products import signal_loss, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.measurement import Findings, Inputs, Measurement
+from calstudy.validation.measurement import Findings, Inputs, Measurement, required
 from calstudy.verdicts.criterion import Finding
 
 SIGMAS = 2
@@ -31,8 +32,9 @@ class EndToEnd(Measurement):
     k_min: Wavenumber = Field(0.0, description="Bins below are left out.")
 
     def products(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra of all variants."""
-        return {"spectra": spectra.spectra(graph)}
+        """Return the averaged spectra of all variants, and the transfer function, which has the flux scale."""
+        transfer = required(signal_loss.transfer(graph), "the variants of signal loss")
+        return {"spectra": spectra.spectra(graph), "transfer": transfer}
 
     def measure(self, inputs: Inputs) -> Findings:
         """Compare the residual's spectrum with the EoR's."""
@@ -47,5 +49,9 @@ class EndToEnd(Measurement):
                 values[f"{name}_{reading}"] = Finding(float(within.mean()), float(sampling))
             ratio = recovered(residual, signal, self.k_min)
             values[f"{name}_ratio"] = ratio
-            remarks.append(f"{name}: P^R / P^S = {ratio.value:.3f} ± {ratio.uncertainty:.3f} in {used.sum()} bins")
+            scale = inputs.transfer(name).flux_scale
+            remarks.append(
+                f"{name}: P^R / P^S = {ratio.value:.3f} ± {ratio.uncertainty:.3f} in {used.sum()} bins; without the "
+                f"flux scale, {scale:.3f}: {scale**2 * ratio.value:.3f} ± {scale**2 * ratio.uncertainty:.3f}"
+            )
         return Findings(values, tuple(remarks))

@@ -6,7 +6,9 @@ The spectrum of the EoR alone is followed through the chain, each entry in units
 - *averaging*: all integrations averaged as they are: fringes wash out;
 - *fringe-stop*: what stopping the fringes first gives back;
 - *taper*: the window instead of none;
-- *calibration*: the response D of the residual to the EoR (`calstudy.power.transfer`) in place of the EoR;
+- *calibration*: what the fit absorbs: in place of the EoR, T s^2 of it, the response D of the residual
+  (`calstudy.power.transfer`) free of the flux scale s;
+- *flux-scale*: what the flux scale of the fit takes: T in place of T s^2;
 - *mask*: modes outside the wedge in place of all modes of the band;
 - *left*: what the residual holds when there is no EoR, noise and foregrounds, which is no signal but in P^R (negative).
 
@@ -40,7 +42,7 @@ from calstudy.run.task import Task
 from calstudy.validation.measurement import Findings, Inputs, Measurement, required
 from calstudy.verdicts.criterion import Finding
 
-STAGES = ("sky", "averaging", "fringe-stop", "taper", "calibration", "mask", "left")
+STAGES = ("sky", "averaging", "fringe-stop", "taper", "calibration", "flux-scale", "mask", "left")
 
 
 @dataclass(frozen=True)
@@ -77,15 +79,17 @@ class SignalLossBudget(Measurement):
     sections: ClassVar = ("instrument", "power", "sky")
 
     def products(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the EoR before averaging, and the spectra of EoR, response, residual, and residual without EoR."""
+        """Return the EoR before averaging, its transfer function, and spectra of EoR, response, and both residuals."""
         eor = Variant(components=("eor",))
+        transfer = required(signal_loss.transfer(graph), "the variants of signal loss")
         return {
             "levels": corruption.levels(graph),
             "data": corruption.data(graph, eor, "even"),
             "eor": spectra.variant_power(graph, "eor", eor),
             "residual": spectra.power(graph, "residual"),
             "left": spectra.power(graph, "residual_without_eor"),
-            "response": required(signal_loss.transfer(graph), "the variants of signal loss").inputs["response"],
+            "transfer": transfer,
+            "response": transfer.inputs["response"],
         }
 
     def measure(self, inputs: Inputs) -> Findings:
@@ -128,7 +132,9 @@ def budget(inputs: Inputs, name: str) -> list[Band]:
         if not (inside & outside).any():
             continue
         put_in = float(inputs.input_power(name, np.array((low + high) / 2)))
-        powers = [1.0, *(_mean(modes, inside).value / put_in for modes in (*followed, response))]
+        powers = [1.0, *(_mean(modes, inside).value / put_in for modes in followed)]
+        after = _mean(response, inside).value / put_in
+        powers += [after * inputs.transfer(name).flux_scale ** 2, after]
         powers.append(_mean(response, inside & outside).value / put_in)
         powers.append(powers[-1] + _mean(left, inside & outside).value / put_in)
         difference = _mean(residual, inside & outside, minus=(response, left))
