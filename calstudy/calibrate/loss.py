@@ -124,8 +124,9 @@ def sum_prior(coefficients: Sequence[tf.Tensor], summed: Sequence[tf.Tensor], ta
     target
         The weighted sum of the sky model, shape (2,).
     """
-    parts = [tf.reduce_sum(u * weight, axis=(1, 2)) for u, weight in zip(coefficients, summed, strict=True)]
-    return tf.reduce_sum(tf.square(tf.add_n(parts) - target))
+    # One sum of all is compiled faster than one for each bucket.
+    products = [tf.reshape(u * weight, [2, -1]) for u, weight in zip(coefficients, summed, strict=True)]
+    return tf.reduce_sum(tf.square(tf.reduce_sum(tf.concat(products, axis=1), axis=1) - target))
 
 
 def _make_parts(tensors: FitTensors) -> list[Part]:
