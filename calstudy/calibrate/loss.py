@@ -17,7 +17,7 @@ from calstudy.calibrate.tensors import FitTensors
 
 # Real and imaginary parts stay apart here: stacking them would cost the compiled step a copy each time.
 Parts = tuple[tf.Tensor, tf.Tensor]
-# Into about this many parts the baselines are divided, so that what a part needs for a while stays in the processor's
+# Into at most this many parts the baselines are divided, so that what a part needs for a while stays in the processor's
 # cache. More of them take longer to compile.
 PARTS = 8
 
@@ -42,7 +42,7 @@ class FitData(NamedTuple):
     visibilities: tf.Tensor
     weights: tf.Tensor
     target: tf.Tensor
-    summed: tuple[tf.Tensor, ...] = ()
+    summed: tuple[tf.Tensor, ...]
     model: tf.Tensor | None = None
 
 
@@ -130,7 +130,7 @@ def sum_prior(coefficients: Sequence[tf.Tensor], summed: Sequence[tf.Tensor], ta
 
 
 def _make_parts(tensors: FitTensors) -> list[Part]:
-    """Return all baselines in about `PARTS` parts, of whole buckets."""
+    """Return all baselines in at most `PARTS` parts, of whole buckets."""
     parts: list[Part] = []
     start = 0
     for bucket, (_, model) in enumerate(tensors.slices):
@@ -183,7 +183,13 @@ class JointLoss:
         return self.coefficients(self._tensors.sum_pairs_over_group(of_parts))
 
     def coefficients(self, models: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """Return A^T F of each bucket for models (2, Nmodels, Nfreqs), the transpose of `foreground_model`."""
+        """Return A^T F of each bucket, the transpose of `foreground_model`.
+
+        Parameters
+        ----------
+        models
+            (2, Nmodels, Nfreqs), float64.
+        """
         parts = zip(self._tensors.slices, self._tensors.bases, strict=True)
         return tuple(
             tf.cast(_coefficients(models[:, first:last], basis), self._dtype) for (first, last), basis in parts
@@ -212,7 +218,7 @@ class JointLoss:
         values = [
             self._part_loss(part, gains, parameters.coefficients[slice(*part.buckets)], data) for part in self._parts
         ]
-        if self._with_prior and data.summed:
+        if self._with_prior and data.model is None:
             values.append(sum_prior(parameters.coefficients, data.summed, data.target))
         return tf.add_n(values)
 
@@ -230,7 +236,7 @@ class JointLoss:
             values.append(value)
             of_gains.append(slope)
             of_coefficients.extend(slopes)
-        if self._with_prior and data.summed:
+        if self._with_prior and data.model is None:
             with tf.GradientTape() as tape:
                 tape.watch(parameters.coefficients)
                 values.append(sum_prior(parameters.coefficients, data.summed, data.target))

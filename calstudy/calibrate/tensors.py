@@ -130,9 +130,9 @@ class FitTensors:
         """Return what the first baseline of each model has: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
         return values if self.model_index is None else tf.gather(values, self._baseline_edges[:-1], axis=1)
 
-    def to_baselines(self, model: tf.Tensor, axis: int = 1) -> tf.Tensor:
-        """Give each baseline its model: (2, Nmodels, Nfreqs) to (2, Nbls, Nfreqs), or one part of it with axis 0."""
-        return model if self.model_index is None else tf.gather(model, self.model_index, axis=axis)
+    def to_baselines(self, model: tf.Tensor) -> tf.Tensor:
+        """Give each baseline its model: (2, Nmodels, Nfreqs) to (2, Nbls, Nfreqs)."""
+        return model if self.model_index is None else tf.gather(model, self.model_index, axis=1)
 
     def sum_over_group(self, values: tf.Tensor) -> tf.Tensor:
         """Add up the baselines of each model, the transpose of `to_baselines`; first axis (Nbls,) to (Nmodels,)."""

@@ -7,7 +7,7 @@ is named by the path of its file in ``outputs.figures``.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast
 
 from calstudy.base.errors import InputError
@@ -128,6 +128,17 @@ class ComparisonFigure(StudyFigure):
     """
 
     titles: ClassVar[Mapping[str, str]] = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
+
+    def roles(self, played: Collection[str]) -> Sequence[str]:
+        """Return the roles that it compares in a collection: by default all of `titles`, played or not.
+
+        Parameters
+        ----------
+        played
+            The roles that members of the collection play.
+        """
+        del played
+        return tuple(self.titles)
 
     def refusal(self, experiment: Experiment) -> str:
         """Refuse: a single experiment has nothing to compare."""

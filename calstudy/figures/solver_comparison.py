@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -112,20 +112,25 @@ def _add_legend(figure: Figure) -> None:
 
 
 class SolverComparison(ComparisonFigure):
-    """P^R outside the wedge with the paper's solver and at the minimum, with EoR and without, of both arrays.
+    """P^R outside the wedge with the paper's solver and at the minimum, with EoR and without, of one array or both.
 
     The members in the roles `paper_solver` and `redundant_paper_solver` have the paper's solver, those in the roles
-    `minimally_redundant` and `redundant` the default one.
+    `minimally_redundant` and `redundant` the default one. An array is shown if both of its roles are played.
     """
 
     caption = "Residual power outside the wedge with the paper's solver and at the minimum: with EoR, and without."
     titles: ClassVar[Mapping[str, str]] = {role: title for title, roles in ARRAYS.items() for role in roles}
     tolerances = SPHERICAL_RULES
 
+    def roles(self, played: Collection[str]) -> Sequence[str]:
+        """Return the roles of the arrays that are shown; those of the first array if no array has both."""
+        shown = [roles for roles in ARRAYS.values() if all(role in played for role in roles)]
+        return [role for roles in shown or [next(iter(ARRAYS.values()))] for role in roles]
+
     def draw(self, job: Job) -> Drawing:
         """Draw a column for each array."""
-        columns = {role: self._read(job, role) for role in self.titles}
-        arrays = {title: (columns[own], columns[minimum]) for title, (own, minimum) in ARRAYS.items()}
+        columns = {role: self._read(job, role) for role in self.roles(job.settings["layouts"])}
+        arrays = {title: (columns[own], columns[minimum]) for title, (own, minimum) in ARRAYS.items() if own in columns}
         return Drawing(draw_solver_comparison(arrays, stand_ins=job.settings["notes"]), columns)
 
     def _read(self, job: Job, role: str) -> SphericalColumn:

@@ -128,39 +128,43 @@ def accept(run: Path, reference: Path) -> None:
     run
         Folder of a finished run of an experiment or a collection.
     reference
-        Made if it does not exist. Pictures, arrays and claims that the run does not have are removed.
+        Made if it does not exist. Pictures, arrays, tables and claims that the run does not have are removed.
 
     Raises
     ------
     InputError
-        If the folder cannot be written.
+        If the run is not readable, or the folder cannot be written; all of the run is read before anything is written.
     """
-    sources = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
-    sources |= {name: run / name for name in (*CLAIMS_FILES, MANIFEST) if (run / name).is_file()}
-    sources |= {name: run / "tables" / name for name in TABLES if (run / "tables" / name).is_file()}
-    # A collection can be put together from references that have these (`calstudy.studies.finished`).
-    tables = {f"tables/{name}": run / "tables" / name for name in _listed_tables(run)}
-    description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
     try:
-        reference.mkdir(parents=True, exist_ok=True)
+        manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))
+        paths = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
+        paths |= {name: run / name for name in CLAIMS_FILES if (run / name).is_file()}
+        paths |= {name: run / "tables" / name for name in TABLES if (run / "tables" / name).is_file()}
+        # With these a collection can be put together from references (`calstudy.studies.finished`).
+        listed = {name for entry in manifest.get("products", []) for name in entry.get("files", ())}
+        paths |= {f"tables/{name}": run / "tables" / name for name in sorted(listed)}
+        contents = {name: path.read_bytes() for name, path in paths.items()}
+        contents[MANIFEST] = (run / MANIFEST).read_bytes()
+        if "members" in manifest:
+            beside = {**manifest, "members": {name: name for name in manifest["members"]}}
+            contents[MANIFEST] = json.dumps(beside, indent=1).encode()
+        description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{run}: cannot be read ({error})") from None
+    try:
+        (reference / "tables").mkdir(parents=True, exist_ok=True)
         kept = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
-        for old in [*kept, *(reference / name for name in (*CLAIMS_FILES, *TABLES))]:
-            if old.name not in sources:
+        kept += [*(reference / name for name in (*CLAIMS_FILES, *TABLES)), *(reference / "tables").iterdir()]
+        for old in kept:
+            if old.relative_to(reference).as_posix() not in contents:
                 old.unlink(missing_ok=True)
-        shutil.rmtree(reference / "tables", ignore_errors=True)
-        if tables:
-            (reference / "tables").mkdir()
-        for name, source in (sources | tables).items():
-            _replace(reference / name, source.read_bytes())
+        for name, content in contents.items():
+            _replace(reference / name, content)
         _replace(reference / EXPERIMENT, description.encode())
+        if not listed:
+            (reference / "tables").rmdir()
     except OSError as error:
         raise InputError(f"{reference}: cannot be written ({error.strerror})") from None
-
-
-def _listed_tables(run: Path) -> list[str]:
-    """Return the names of the tables whose content the manifest of a run has on record."""
-    products = json.loads((run / MANIFEST).read_text(encoding="utf-8")).get("products", [])
-    return sorted({name for entry in products for name in entry.get("files", ())})
 
 
 def _replace(path: Path, content: bytes) -> None:

@@ -146,7 +146,7 @@ def read_contents(folder: Path) -> Contents:
         tables=[table for table in tables if table is not None],
         headline=read_headline(folder),
         files=_files(folder),
-        parts=_parts(manifest),
+        parts=_parts(folder, manifest),
         experiment=text,
     )
 
@@ -214,11 +214,13 @@ def _files(folder: Path) -> list[str]:
     return [str(path.relative_to(folder)) for path in (*records, *tables) if path.is_file()]
 
 
-def _parts(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _parts(folder: Path, manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
     points = [
         (item["folder"].rpartition("/")[2], f"{item['folder']}/report.html") for item in manifest.get("points", [])
     ]
-    return points + [(name, f"../{folder}/report.html") for name, folder in manifest.get("members", {}).items()]
+    pages = {name: f"../{place}/report.html" for name, place in manifest.get("members", {}).items()}
+    # Members may come from references, which have no page.
+    return points + [(name, page) for name, page in pages.items() if (folder / page).is_file()]
 
 
 def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None:

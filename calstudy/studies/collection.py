@@ -144,7 +144,8 @@ class Collection(Study):
         return [self._figure(figure) for figure in _comparisons(self.file)]
 
     def _figure(self, figure: ComparisonFigure) -> Task:
-        compared = {role: self.studies[self.roles[role]] for role in figure.titles} or dict(self.studies)
+        shown = figure.roles(self.roles)
+        compared = {role: self.studies[self.roles[role]] for role in shown} or dict(self.studies)
         notes = unique_notes(note for part in compared.values() for note in part.stand_ins)
         return comparison_task({role: part.graph for role, part in compared.items()}, figure, notes)
 
@@ -167,10 +168,14 @@ class Collection(Study):
         return self.studies[name].folder.name
 
     @property
+    def own(self) -> list[Task]:
+        """The figures and claims that compare members."""
+        return [*self.figures, *([self.claims] if self.claims else [])]
+
+    @property
     def targets(self) -> list[Task]:
         """The products of all members that are run, and the figures and claims that compare members."""
-        own = [*self.figures, *([self.claims] if self.claims else [])]
-        return [task for part in self.parts.values() for task in part.targets] + own
+        return [task for part in self.parts.values() for task in part.targets] + self.own
 
     def fill(self, made: Made) -> None:
         """Write the figures and claims that compare members, and a manifest that names the members' folders."""
@@ -178,7 +183,7 @@ class Collection(Study):
         publish([made.products[task.key] for task in self.figures], folder / "figures")
         if self.claims is not None:
             publish([made.products[self.claims.key]], folder)
-        own = [*self.figures, *([self.claims] if self.claims else [])]
+        taken = [task for name in self.finished for task in self.studies[name].targets if task.key in made.products]
         fields = {
             "description": self.description,
             "members": {name: self._place(name) for name in self.members},
@@ -186,7 +191,9 @@ class Collection(Study):
             "figures": [figure.model_dump(mode="json") for figure in self.file.figures],
             "stand_ins": list(self.stand_ins),
             "captions": {figure.label: figure.caption for figure in _comparisons(self.file)},
-            "products": [{"stage": task.stage.name, "label": task.label, "key": task.key} for task in own],
+            "products": [
+                {"stage": task.stage.name, "label": task.label, "key": task.key} for task in (*taken, *self.own)
+            ],
         }
         write_manifest(folder, self.name, fields)
 
@@ -207,7 +214,7 @@ def load_collection(
             built_in = [name for name in FIGURES.built_in() if issubclass(FIGURES.find(name), ComparisonFigure)]
             hint = f"does not compare members{nearest(figure.label, built_in)} (built in: {', '.join(built_in)})"
             raise ExperimentError([f"figures.{place}: {figure.label!r} {hint}; ask for it in an experiment"])
-        missing = [role for role in figure.titles if role not in roles]
+        missing = [role for role in figure.roles(roles) if role not in roles]
         if missing:
             raise ExperimentError(
                 [f"figures: asks for {figure.label!r}, which needs a member in the role(s) {', '.join(missing)}"]

@@ -12,7 +12,8 @@ from typing import Any
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-from calstudy.run.store import Store, digest_file
+from calstudy.run.store import Product, Store, digest_file
+from calstudy.run.task import Task
 from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.folder import MANIFEST
@@ -39,13 +40,29 @@ class FinishedRun:
     manifest: Mapping[str, Any]
     tables: Mapping[str, Mapping[str, Any]]
 
-    def has(self, study: ExperimentStudy) -> bool:
-        """Return whether these are the tables of a study: same settings, same versions of the stages."""
-        return all(task.key in self.tables for task in study.tables)
+    @property
+    def described(self) -> str:
+        """The folder, and when the run finished."""
+        return f"{self.folder} (finished {self.manifest.get('finished', 'at an unknown time')})"
+
+    def refusal(self, study: ExperimentStudy) -> str | None:
+        """Return why a study cannot be taken from this run, or None: its tables must be there, as they were written."""
+        if not self.tables:
+            return (
+                "its manifest does not list the files of its tables: it is of an older version, or not of an experiment"
+            )
+        if not all(task.key in self.tables for task in study.tables):
+            return "its tables are of other settings, or another version of a stage"
+        for task in study.tables:
+            for name, digest in self.tables[task.key]["files"].items():
+                path = self.folder / TABLES / name
+                if Path(name).name != name or not path.is_file() or digest_file(path) != digest:
+                    return f"{TABLES}/{name} is not what the run wrote: it was changed or lost"
+        return None
 
 
 def find_finished(folders: Sequence[Path]) -> list[FinishedRun]:
-    """Return the finished runs among these folders and directly below them.
+    """Return the finished runs among these folders and directly below them; those that cannot be read are left out.
 
     Raises
     ------
@@ -54,21 +71,22 @@ def find_finished(folders: Sequence[Path]) -> list[FinishedRun]:
     """
     found = []
     for folder in folders:
-        paths = (
+        inside = (
             [folder] if (folder / MANIFEST).is_file() else sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
         )
-        if not paths:
+        runs = [run for path in inside if (run := _read(path)) is not None]
+        if not runs:
             raise InputError(f"--finished {folder}: is not the folder of a finished run, and holds none")
-        found += [_read(path) for path in paths]
+        found += runs
     return found
 
 
-def _read(folder: Path) -> FinishedRun:
+def _read(folder: Path) -> FinishedRun | None:
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        tables = {entry["key"]: entry for entry in manifest.get("products", []) if "files" in entry}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"--finished {folder}: its {MANIFEST} cannot be read ({error})") from None
+        tables = {entry["key"]: entry for entry in manifest.get("products", []) if isinstance(entry.get("files"), dict)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
     return FinishedRun(folder, manifest, tables)
 
 
@@ -89,60 +107,76 @@ def with_finished(collection: Study, folders: Sequence[Path], console: Console) 
     Raises
     ------
     InputError
-        If the study is not a collection, no member is found, a table is not what its run wrote, or the store cannot be
+        If the study is not a collection, no member is found, the store has other results of a member, or it cannot be
         written.
     """
     if not isinstance(collection, Collection):
         raise InputError("--finished: only a collection (a file with the key 'experiments') takes members from runs")
     runs, store = find_finished(folders), Store(collection.outputs.store)
-    taken = {}
+    taken: dict[str, tuple[FinishedRun, list[Task]]] = {}
     for name, study in collection.studies.items():
-        if not isinstance(study, ExperimentStudy):
+        reason = _needs_more(collection, name, study)
+        if reason is not None:
+            console.print(f"{name}: will be run ({reason})", markup=False)
             continue
-        run = next((run for run in runs if run.has(study)), None)
+        assert isinstance(study, ExperimentStudy)
+        refusals = {run.folder: run.refusal(study) for run in runs}
+        run = next((run for run in runs if refusals[run.folder] is None), None)
         if run is not None:
-            taken[name] = run
-            console.print(f"{name}: taken from {run.folder}, finished {run.manifest['finished']}", markup=False)
+            taken[name] = run, study.tables
+            console.print(f"{name}: taken from {run.described}", markup=False)
             continue
-        for other in runs:
-            if other.manifest.get("name") == name:
-                console.print(f"{name}: {other.folder} is left out ({_reason(other)}); will be run", markup=False)
+        named = [run for run in runs if run.manifest.get("name") == name]
+        for other in named:
+            console.print(f"{name}: {other.folder} is left out; {refusals[other.folder]}", markup=False)
+        console.print(f"{name}: will be run", markup=False)
     if not taken:
         given = ", ".join(str(folder) for folder in folders)
         members = ", ".join(collection.members)
         raise InputError(f"--finished {given}: no finished run of a member is there (members: {members})")
+    for run, tables in taken.values():
+        for task in tables:
+            _put(task, run, store)
+    return collection.without({name: run.folder for name, (run, _) in taken.items()})
+
+
+def _needs_more(collection: Collection, name: str, study: Study) -> str | None:
+    """Return why tables are not all that a collection needs of a member, or None."""
+    if not isinstance(study, ExperimentStudy):
+        return "it has realizations; such members are always run"
+    tables = {task.key for task in study.tables}
+    others = {task.key for task in study.tasks} - tables
+    for task in collection.own:
+        for needed in task.needs.values():
+            if needed.key in others:
+                return f"{task.label} needs of {name} what is no table: {needed.stage.name} ({needed.label})"
+    return None
+
+
+def _put(task: Task, run: FinishedRun, store: Store) -> None:
+    """Put a table of a run into a store, under the key of the product that its files are."""
+    entry, stage = run.tables[task.key], task.stage.name
+    if (there := store.verify(stage, task.key)) is not None:
+        _require_same(there, entry["files"], run, store)
+        return
     store.prepare()
-    for name, run in taken.items():
-        _import(run, collection.studies[name], store)
-    return collection.without({name: run.folder for name, run in taken.items()})
+    with store.lock(stage, task.key), store.building(stage, task.key) as folder:
+        try:
+            for name in entry["files"]:
+                shutil.copyfile(run.folder / TABLES / name, folder / name)
+            record = {key: value for key, value in entry.items() if key not in ("files", "made_by_this_run")}
+            origin = {key: run.manifest.get(key) for key in ("name", "finished", "git_commit")}
+            store.seal(folder, {**record, "stage": stage, "temporary": False, "from_run": origin})
+        except OSError as error:
+            raise InputError(f"outputs.store = {str(store.root)!r}: cannot be written ({error.strerror})") from None
 
 
-def _reason(run: FinishedRun) -> str:
-    if not (run.folder / TABLES).is_dir():
-        return "it has no tables"
-    if not run.tables:
-        return "its manifest does not list the files of its tables; it is of an older version"
-    return "other settings, or another version of a stage"
-
-
-def _import(run: FinishedRun, study: Any, store: Store) -> None:
-    """Put the tables of a run into a store, under the keys of the products that they are the files of."""
-    for task in study.tables:
-        entry = run.tables[task.key]
-        for name, digest in entry["files"].items():
-            path = run.folder / TABLES / name
-            if Path(name).name != name or not path.is_file() or digest_file(path) != digest:
-                raise InputError(
-                    f"--finished {run.folder}: {TABLES}/{name} is not what the run wrote; it was changed or lost"
-                )
-    for task in study.tables:
-        stage, entry = task.stage.name, run.tables[task.key]
-        with store.lock(stage, task.key):
-            if store.verify(stage, task.key) is not None:
-                continue
-            with store.building(stage, task.key) as folder:
-                for name in entry["files"]:
-                    shutil.copyfile(run.folder / TABLES / name, folder / name)
-                record = {key: value for key, value in entry.items() if key not in ("files", "made_by_this_run")}
-                origin = {key: run.manifest.get(key) for key in ("name", "finished", "git_commit")}
-                store.seal(folder, {**record, "stage": stage, "temporary": False, "from_run": origin})
+def _require_same(there: Product, files: Mapping[str, str], run: FinishedRun, store: Store) -> None:
+    """Raise InputError if a product of the store is not the one of a run: two runs of a study differ by rounding."""
+    found = {name: file["sha256"] for name, file in there.record["files"].items()}
+    other = next((name for name in {**files, **found} if files.get(name) != found.get(name)), None)
+    if other is not None:
+        raise InputError(
+            f"--finished {run.folder}: {TABLES}/{other} differs from that of the same study in the store {store.root}; "
+            "leave this folder out to use the store, or use another store with --set outputs.store=DIR"
+        )

@@ -123,10 +123,13 @@ class Inputs:
         file = self.folder(experiment, "spectra") / spectrum_file(variant, "outside-wedge")
         return load_spectrum(file, SphericalSpectrum)
 
-    def transfer(self, experiment: str) -> TransferFunction:
-        """Return the transfer function of the calibration outside the wedge, from the product "transfer"."""
+    def flux_scale(self, experiment: str) -> float | None:
+        """Return the flux scale of the calibration, from the product "transfer"; None if it is not known."""
+        if f"{experiment}:transfer" not in self.folders:
+            return None
         file = self.folder(experiment, "transfer") / spectrum_file(TRANSFER, "outside-wedge")
-        return load_spectrum(file, TransferFunction)
+        scale = load_spectrum(file, TransferFunction).flux_scale
+        return scale if np.isfinite(scale) else None
 
     def cylindrical(self, experiment: str, variant: str) -> CylindricalSpectrum:
         """Return the cylindrical spectrum of a variant, from the product "spectra"."""

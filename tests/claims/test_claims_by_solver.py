@@ -107,14 +107,33 @@ def test_the_product_of_a_collection_has_the_table_if_both_solvers_are_in_it(stu
 
 def test_the_figure_shows_the_tables_of_the_members(studies, tmp_path):
     inputs = {f"spectra:{role}": study.folders[0] for role, study in studies.items()}
-    drawing = SolverComparison().draw(Job(settings={"notes": ["a small sky"]}, inputs=inputs, output=tmp_path))
+    settings = {"notes": ["a small sky"], "layouts": dict.fromkeys(studies)}
+    drawing = SolverComparison().draw(Job(settings=settings, inputs=inputs, output=tmp_path))
     shown = figure_arrays(drawing.shown)
     for role, study in studies.items():
         for name in ("residual", "residual_without_eor"):
             np.testing.assert_array_equal(shown[f"{role}.{name}.power"], study.spherical(name, "outside-wedge").power)
     (study.folders[0] / "residual_without_eor.outside-wedge.h5").unlink()
     with pytest.raises(InputError, match=r"the member in the role \w+ has no variant residual_without_eor"):
-        SolverComparison().draw(Job(settings={"notes": []}, inputs=inputs, output=tmp_path))
+        SolverComparison().draw(Job(settings=settings, inputs=inputs, output=tmp_path))
+
+
+def test_the_figure_shows_an_array_that_was_calibrated_with_both_solvers(studies, tmp_path):
+    both = ("paper_solver", "minimally_redundant")
+    assert tuple(SolverComparison().roles({*both, "redundant", "low_snr"})) == both
+    assert set(SolverComparison().roles(studies)) == set(studies)
+    # What is missing is told, if nothing can be shown.
+    assert tuple(SolverComparison().roles({"paper_solver", "redundant"})) == both
+    inputs = {f"spectra:{role}": studies[role].folders[0] for role in both}
+    job = Job(settings={"notes": [], "layouts": dict.fromkeys(both)}, inputs=inputs, output=tmp_path)
+    assert set(SolverComparison().draw(job).shown) == set(both)
+
+
+def test_the_main_study_with_both_solvers_is_a_part_of_the_whole():
+    whole, part = (load_study(EXPERIMENTS / f"{name}.yaml") for name in ("paper-solver", "minredundant-solvers"))
+    for name, study in part.parts.items():
+        assert study.folder == whole.parts[name].folder
+    assert {role: whole.roles[role] for role in part.roles} == part.roles
 
 
 @pytest.mark.parametrize("scale", [None, "small"])

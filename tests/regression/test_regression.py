@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from calstudy.regression.comparison import compare_array, compare_claims, compar
 from calstudy.regression.reference import accept, find_references, read_reference, read_run
 from calstudy.regression.remake import remake
 from calstudy.regression.tables import Regression, show
+from calstudy.run.store import digest_file
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, run_study
 from calstudy.verdicts.criterion import Verdict
@@ -62,9 +64,29 @@ def statuses(reference: Path, made: Path) -> dict[str, str]:
 def test_a_reference_is_small_and_names_no_place_of_the_machine(reference, finished, folder):
     names = {path.name for path in reference.iterdir()}
     kept = {f"{figure}.{ending}" for figure in FIGURES for ending in ("png", "npz")}
-    assert names == kept | {"claims.json", "claims.md", "manifest.json", "experiment.yaml"}
+    assert names == kept | {"claims.json", "claims.md", "manifest.json", "experiment.yaml", "tables"}
     assert str(folder) not in (reference / "experiment.yaml").read_text()
     assert load(reference / "experiment.yaml").instrument == load(finished / "experiment.yaml").instrument
+
+
+def test_a_reference_keeps_the_tables_that_the_manifest_has_on_record(reference, finished, tmp_path):
+    manifest = json.loads((reference / "manifest.json").read_text())
+    files = {name: digest for entry in manifest["products"] for name, digest in entry.get("files", {}).items()}
+    assert "residual.outside-wedge.h5" in files
+    assert {path.name: digest_file(path) for path in (reference / "tables").iterdir()} == files
+    other, run = tmp_path / "reference", tmp_path / "run"
+    shutil.copytree(reference, other)
+    shutil.copytree(finished, run)
+    # All of a run is read before anything of a reference is replaced.
+    (run / "tables" / "residual.outside-wedge.h5").unlink()
+    with pytest.raises(InputError, match=r"run: cannot be read .*residual\.outside-wedge\.h5"):
+        accept(run, other)
+    assert {path.name for path in (other / "tables").iterdir()} == set(files)
+    # A run of an older version lists none.
+    old = {**manifest, "products": [{**entry, "files": {}} for entry in manifest["products"]]}
+    (run / "manifest.json").write_text(json.dumps(old))
+    accept(run, other)
+    assert not (other / "tables").exists()
 
 
 def test_made_again_from_the_store_nothing_moves(reference, finished, places):

@@ -20,7 +20,7 @@ from calstudy.products import corruption, simulation
 from calstudy.products.spectra import power
 from calstudy.regression.reference import accept
 from calstudy.run.execution import schedule
-from calstudy.run.store import Store
+from calstudy.run.store import Store, digest_file
 from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.finished import with_finished
@@ -29,6 +29,7 @@ from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+DRAWN = {"realizations": [{"draw": ["noise"], "count": 2}], "papers": []}
 PAIR = {
     "name": "pair",
     "experiments": [
@@ -207,7 +208,9 @@ def test_members_that_were_run_elsewhere_are_compared_without_being_run(finished
     runs = finished.folder.parent
     text = io.StringIO()
     taken = with_finished(elsewhere(folder, tmp_path), [runs], Console(file=text, width=300))
-    assert [line.partition(":")[0] for line in text.getvalue().splitlines()] == ["hexagon", "redundant"]
+    assert [line[: line.index("/")] for line in text.getvalue().splitlines()] == [
+        f"{name}: taken from " for name in ("hexagon", "redundant")
+    ]
     result = run_study(taken, Budget(1), Console(file=io.StringIO()))
     assert {task.stage.name for task in result.made.tasks} == {"figure", "claims"}
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {result.folder.name}
@@ -235,16 +238,51 @@ def test_a_finished_run_of_something_else_is_not_taken(finished, folder, tmp_pat
     text, other = io.StringIO(), elsewhere(folder, tmp_path, "power.taper=hann")
     with pytest.raises(InputError, match=r"no finished run of a member is there \(members: hexagon, redundant\)"):
         with_finished(other, [finished.folder.parent], Console(file=text, width=300))
-    assert "is left out (other settings, or another version of a stage)" in text.getvalue()
+    assert "is left out; its tables are of other settings, or another version of a stage" in text.getvalue()
     assert not (tmp_path / "store").exists()
 
 
-def test_a_table_that_was_changed_is_refused(finished, folder, tmp_path):
+def test_a_run_with_a_changed_table_is_left_out_for_one_that_is_whole(finished, folder, tmp_path):
+    whole, run = finished.parts["hexagon"].folder, tmp_path / "old" / "hexagon"
+    shutil.copytree(whole, run)
+    (run / "tables" / "eor.wedge.h5").write_bytes(b"")
+    text = io.StringIO()
+    taken = with_finished(elsewhere(folder, tmp_path), [run, whole], Console(file=text, width=300))
+    assert taken.finished == {"hexagon": whole}
+    with pytest.raises(InputError, match="no finished run of a member is there"):
+        with_finished(elsewhere(folder, tmp_path), [run], Console(file=text, width=300))
+    assert "tables/eor.wedge.h5 is not what the run wrote" in text.getvalue()
+
+
+def test_other_results_in_the_store_are_not_passed_off_as_those_of_the_run(finished, folder, tmp_path):
+    """The same study run twice, on machines that round differently, has one key and two results."""
     run = tmp_path / "old" / "hexagon"
     shutil.copytree(finished.parts["hexagon"].folder, run)
-    (run / "tables" / "eor.wedge.h5").write_bytes(b"")
-    with pytest.raises(InputError, match=r"tables/eor\.wedge\.h5 is not what the run wrote"):
-        with_finished(elsewhere(folder, tmp_path), [run], Console(file=io.StringIO()))
+    (run / "tables" / "eor.all-modes.csv").write_text("other")
+    manifest = json.loads((run / "manifest.json").read_text())
+    (entry,) = (item for item in manifest["products"] if "eor.all-modes.csv" in item.get("files", {}))
+    entry["files"]["eor.all-modes.csv"] = digest_file(run / "tables" / "eor.all-modes.csv")
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    there = elsewhere(folder, tmp_path)
+    assert with_finished(there, [run], Console(file=io.StringIO())).finished == {"hexagon": run}
+    # The same again is in the store already.
+    assert with_finished(there, [run], Console(file=io.StringIO())).finished == {"hexagon": run}
+    with pytest.raises(
+        InputError, match=r"tables/eor\.all-modes\.csv differs from that of the same study in the store"
+    ):
+        with_finished(there, [finished.parts["hexagon"].folder], Console(file=io.StringIO()))
+
+
+def test_a_member_of_which_more_than_tables_is_needed_is_run(finished, folder, tmp_path):
+    text = io.StringIO()
+    path = write(
+        folder, figures=[], experiments=["hex.yaml", {"file": "hex.yaml", "name": "drawn", "overrides": DRAWN}]
+    )
+    changes = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
+    taken = with_finished(load_study(path, overrides=changes), [finished.folder.parent], Console(file=text, width=300))
+    write(folder)
+    assert list(taken.finished) == ["hexagon"]
+    assert "drawn: will be run (it has realizations; such members are always run)" in text.getvalue()
 
 
 @pytest.mark.parametrize(

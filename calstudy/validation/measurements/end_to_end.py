@@ -18,7 +18,7 @@ from calstudy.claims.bins import recovered, used_bins
 from calstudy.products import signal_loss, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.measurement import Findings, Inputs, Measurement, required
+from calstudy.validation.measurement import Findings, Inputs, Measurement
 from calstudy.verdicts.criterion import Finding
 
 SIGMAS = 2
@@ -32,9 +32,9 @@ class EndToEnd(Measurement):
     k_min: Wavenumber = Field(0.0, description="Bins below are left out.")
 
     def products(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra of all variants, and the transfer function, which has the flux scale."""
-        transfer = required(signal_loss.transfer(graph), "the variants of signal loss")
-        return {"spectra": spectra.spectra(graph), "transfer": transfer}
+        """Return the averaged spectra of all variants, and the transfer function, if any, which has the flux scale."""
+        transfer = signal_loss.transfer(graph)
+        return {"spectra": spectra.spectra(graph), **({} if transfer is None else {"transfer": transfer})}
 
     def measure(self, inputs: Inputs) -> Findings:
         """Compare the residual's spectrum with the EoR's."""
@@ -49,9 +49,13 @@ class EndToEnd(Measurement):
                 values[f"{name}_{reading}"] = Finding(float(within.mean()), float(sampling))
             ratio = recovered(residual, signal, self.k_min)
             values[f"{name}_ratio"] = ratio
-            scale = inputs.transfer(name).flux_scale
-            remarks.append(
-                f"{name}: P^R / P^S = {ratio.value:.3f} ± {ratio.uncertainty:.3f} in {used.sum()} bins; without the "
-                f"flux scale, {scale:.3f}: {scale**2 * ratio.value:.3f} ± {scale**2 * ratio.uncertainty:.3f}"
-            )
+            remarks.append(f"{name}: {_sentence(ratio, int(used.sum()), inputs.flux_scale(name))}")
         return Findings(values, tuple(remarks))
+
+
+def _sentence(ratio: Finding, n_bins: int, scale: float | None) -> str:
+    text = f"P^R / P^S = {ratio.value:.3f} ± {ratio.uncertainty:.3f} in {n_bins} bins"
+    if scale is None:
+        return f"{text}; the flux scale is not known"
+    free = f"{scale**2 * ratio.value:.3f} ± {scale**2 * ratio.uncertainty:.3f}"
+    return f"{text}; without the flux scale, {scale:.3f}: {free}"

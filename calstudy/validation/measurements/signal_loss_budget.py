@@ -124,6 +124,8 @@ def budget(inputs: Inputs, name: str) -> list[Band]:
     settings = inputs.power(name)
     followed = [*_before_calibration(inputs, name), inputs.delay_spectra(name, "eor")]
     response, residual, left = (inputs.delay_spectra(name, product) for product in ("response", "residual", "left"))
+    # Of a flux scale that is not known, the share is told as loss.
+    scale = inputs.flux_scale(name) or 1.0
     outside = outside_wedge(response, settings.wedge_buffer)
     k = np.hypot(response.k_perp[:, None], response.k_parallel)
     bands = []
@@ -134,7 +136,7 @@ def budget(inputs: Inputs, name: str) -> list[Band]:
         put_in = float(inputs.input_power(name, np.array((low + high) / 2)))
         powers = [1.0, *(_mean(modes, inside).value / put_in for modes in followed)]
         after = _mean(response, inside).value / put_in
-        powers += [after * inputs.transfer(name).flux_scale ** 2, after]
+        powers += [after * scale**2, after]
         powers.append(_mean(response, inside & outside).value / put_in)
         powers.append(powers[-1] + _mean(left, inside & outside).value / put_in)
         difference = _mean(residual, inside & outside, minus=(response, left))
