@@ -192,12 +192,18 @@ def test_signal_loss_is_a_table_if_it_was_measured(folder):
 
 def test_a_sweep_and_a_collection_lead_to_the_reports_of_their_parts(folder):
     points = [{"folder": "points/01-buffer=0ns", "changes": {}}]
+    members = {"hex": "hex-12345678", "kept": "kept"}
+    for name in members.values():
+        (folder.parent / name).mkdir()
+    # A reference has no page.
+    (folder.parent / "hex-12345678" / "report.html").touch()
     (folder / "manifest.json").write_text(
-        json.dumps({"name": "both", "points": points, "members": {"hex": "hex-12345678"}, "products": []})
+        json.dumps({"name": "both", "points": points, "members": members, "products": []})
     )
     links = [value for tag, name, value in page_of(folder).attributes if (tag, name) == ("a", "href")]
     assert "points/01-buffer=0ns/report.html" in links
     assert "../hex-12345678/report.html" in links
+    assert not any("kept" in link for link in links)
 
 
 def test_the_summary_of_a_sweep_has_a_row_per_point(folder):
