@@ -16,7 +16,7 @@ from calstudy.calibrate.problem import Prior
 from calstudy.calibrate.tensors import FitTensors
 
 # Real and imaginary parts stay apart here: stacking them would cost the compiled step a copy each time.
-Parts = tuple[tf.Tensor, tf.Tensor]
+RealImaginary = tuple[tf.Tensor, tf.Tensor]
 # Into at most this many parts the baselines are divided, so that what a part needs for a while stays in the processor's
 # cache. More of them take longer to compile.
 PARTS = 8
@@ -60,7 +60,7 @@ class Part(NamedTuple):
     baselines: tuple[int, int]
 
 
-def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tensor]) -> Parts:
+def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tensor]) -> RealImaginary:
     """Return sum_i u_i A_i of all models, one matrix product per bucket (paper Eq. FGMODEL).
 
     Parameters
@@ -86,7 +86,7 @@ def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tenso
 
 
 def likelihood(
-    antennas: tuple[tf.Tensor, tf.Tensor], gains: tf.Tensor, model: Parts, visibilities: tf.Tensor, weights: tf.Tensor
+    antennas: tuple[tf.Tensor, tf.Tensor], gains: tf.Tensor, model: RealImaginary, visibilities: tf.Tensor, weights: tf.Tensor
 ) -> tf.Tensor:
     """Return sum w |v - g_a g_b* F|^2 over baselines and channels.
 
@@ -196,7 +196,7 @@ class JointLoss:
         )
 
     def model(self, coefficients: Sequence[tf.Tensor]) -> tf.Tensor:
-        """Return F on the baselines, (2, Nbls, Nfreqs)."""
+        """Return F on the baselines, (2, Nbls, Nfreqs), for the coefficients of each bucket; see `foreground_model`."""
         return self._tensors.to_baselines(tf.stack(foreground_model(coefficients, self._bases)))
 
     def _part_loss(self, part: Part, gains: tf.Tensor, coefficients: tuple[tf.Tensor, ...], data: FitData) -> tf.Tensor:
