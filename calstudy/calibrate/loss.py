@@ -86,7 +86,11 @@ def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tenso
 
 
 def likelihood(
-    antennas: tuple[tf.Tensor, tf.Tensor], gains: tf.Tensor, model: RealImaginary, visibilities: tf.Tensor, weights: tf.Tensor
+    antennas: tuple[tf.Tensor, tf.Tensor],
+    gains: tf.Tensor,
+    model: RealImaginary,
+    visibilities: tf.Tensor,
+    weights: tf.Tensor,
 ) -> tf.Tensor:
     """Return sum w |v - g_a g_b* F|^2 over baselines and channels.
 
