@@ -138,14 +138,20 @@ def plan(
     overrides: Set = None,
     workers: Workers = None,
     max_memory: MaxMemory = None,
+    finished: Finished = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
+    from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import describe_plan, show_plan
     from calstudy.studies.study import Budget
 
-    found = describe_plan(load_study(file, scale, overrides or ()), Budget(workers, max_memory))
+    study = load_study(file, scale, overrides or ())
+    if finished:
+        # Of JSON nothing else is on standard output.
+        study = with_finished(study, finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
+    found = describe_plan(study, Budget(workers, max_memory))
     if as_json:
         typer.echo(json.dumps(found, indent=1))
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -68,14 +68,24 @@ class Workers:
     scheduler: str | None = None
 
 
-def schedule(targets: Iterable[Task], store: Store) -> Schedule:
-    """Find out what must be made: the targets and what they need, as far as it is not in the store, intact."""
+def schedule(targets: Iterable[Task], store: Store, given: Container[str] = ()) -> Schedule:
+    """Find out what must be made: the targets and what they need, as far as it is not in the store, intact.
+
+    Parameters
+    ----------
+    targets
+        What is wanted.
+    store
+        Where it is looked for.
+    given
+        Keys of products that will be there.
+    """
     todo: dict[str, Task] = {}
     ready: dict[str, Product] = {}
     damaged: list[Task] = []
 
     def visit(task: Task) -> None:
-        if task.key in todo or task.key in ready:
+        if task.key in todo or task.key in ready or task.key in given:
             return
         product = store.verify(task.stage.name, task.key)
         if product is not None:

@@ -112,6 +112,12 @@ class Collection(Study):
         """The members that are run."""
         return {name: study for name, study in self.studies.items() if name not in self.finished}
 
+    @property
+    def given(self) -> frozenset[str]:
+        """Keys of the tables of members that were run before."""
+        members = (self.studies[name] for name in self.finished)
+        return frozenset(task.key for study in members if isinstance(study, ExperimentStudy) for task in study.tables)
+
     def without(self, finished: Mapping[str, Path]) -> Self:
         """Return the collection with members that need not be run; see `finished`."""
         return type(self)(self.file, self.members, self.roles, {**self.finished, **finished})

@@ -90,7 +90,7 @@ def _read(folder: Path) -> FinishedRun | None:
     return FinishedRun(folder, manifest, tables)
 
 
-def with_finished(collection: Study, folders: Sequence[Path], console: Console) -> Collection:
+def with_finished(collection: Study, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Collection:
     """Return a collection whose members are taken from finished runs, as far as these are of the same study.
 
     The tables of such a member are put into the store; the member itself is not run again.
@@ -103,6 +103,8 @@ def with_finished(collection: Study, folders: Sequence[Path], console: Console) 
         Run folders or references, or folders that hold some.
     console
         Is told where each member comes from, and why a run of its name is left out.
+    planned
+        The store is only compared: nothing is put into it.
 
     Raises
     ------
@@ -115,29 +117,38 @@ def with_finished(collection: Study, folders: Sequence[Path], console: Console) 
     runs, store = find_finished(folders), Store(collection.outputs.store)
     taken: dict[str, tuple[FinishedRun, list[Task]]] = {}
     for name, study in collection.studies.items():
-        reason = _needs_more(collection, name, study)
-        if reason is not None:
+        if (reason := _needs_more(collection, name, study)) is not None:
             console.print(f"{name}: will be run ({reason})", markup=False)
             continue
         assert isinstance(study, ExperimentStudy)
-        refusals = {run.folder: run.refusal(study) for run in runs}
-        run = next((run for run in runs if refusals[run.folder] is None), None)
-        if run is not None:
+        if (run := _choose(name, study, runs, console)) is not None:
             taken[name] = run, study.tables
-            console.print(f"{name}: taken from {run.described}", markup=False)
-            continue
-        named = [run for run in runs if run.manifest.get("name") == name]
-        for other in named:
-            console.print(f"{name}: {other.folder} is left out; {refusals[other.folder]}", markup=False)
-        console.print(f"{name}: will be run", markup=False)
     if not taken:
         given = ", ".join(str(folder) for folder in folders)
         members = ", ".join(collection.members)
         raise InputError(f"--finished {given}: no finished run of a member is there (members: {members})")
     for run, tables in taken.values():
         for task in tables:
-            _put(task, run, store)
+            there = store.verify(task.stage.name, task.key)
+            if there is not None:
+                _require_same(there, run.tables[task.key]["files"], run, store)
+            elif not planned:
+                _put(task, run, store)
     return collection.without({name: run.folder for name, (run, _) in taken.items()})
+
+
+def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], console: Console) -> FinishedRun | None:
+    """Return the run that a member is taken from, or None; the console is told which, or why none."""
+    refusals = {run.folder: run.refusal(study) for run in runs}
+    for run in runs:
+        if refusals[run.folder] is None:
+            console.print(f"{name}: taken from {run.described}", markup=False)
+            return run
+    for other in runs:
+        if other.manifest.get("name") == name:
+            console.print(f"{name}: {other.folder} is left out; {refusals[other.folder]}", markup=False)
+    console.print(f"{name}: will be run", markup=False)
+    return None
 
 
 def _needs_more(collection: Collection, name: str, study: Study) -> str | None:
@@ -156,9 +167,6 @@ def _needs_more(collection: Collection, name: str, study: Study) -> str | None:
 def _put(task: Task, run: FinishedRun, store: Store) -> None:
     """Put a table of a run into a store, under the key of the product that its files are."""
     entry, stage = run.tables[task.key], task.stage.name
-    if (there := store.verify(stage, task.key)) is not None:
-        _require_same(there, entry["files"], run, store)
-        return
     store.prepare()
     with store.lock(stage, task.key), store.building(stage, task.key) as folder:
         try:
@@ -172,7 +180,7 @@ def _put(task: Task, run: FinishedRun, store: Store) -> None:
 
 
 def _require_same(there: Product, files: Mapping[str, str], run: FinishedRun, store: Store) -> None:
-    """Raise InputError if a product of the store is not the one of a run: two runs of a study differ by rounding."""
+    """Raise InputError if a table of the store is not the one of a run: two runs of a study differ by rounding."""
     found = {name: file["sha256"] for name, file in there.record["files"].items()}
     other = next((name for name in {**files, **found} if files.get(name) != found.get(name)), None)
     if other is not None:

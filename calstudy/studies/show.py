@@ -54,7 +54,7 @@ def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
     """
     study, workers = study.fitted(budget)
     store = Store(study.outputs.store)
-    plan = schedule(study.targets, store)
+    plan = schedule(study.targets, store, study.given)
     if plan.todo:
         require_writable(store.root, f"outputs.store = {str(store.root)!r}")
     require_writable(study.folder.parent, f"outputs.runs = {str(study.folder.parent)!r}")

@@ -162,6 +162,11 @@ class Study(ABC):
         return unique(self.targets)
 
     @property
+    def given(self) -> frozenset[str]:
+        """Keys of products that are not made by a run of this study, though it needs them."""
+        return frozenset()
+
+    @property
     def folders(self) -> list[Path]:
         """The run folders of the study and of its parts."""
         return [self.folder, *(folder for part in self.parts.values() for folder in part.folders)]

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.finished import with_finished
 from calstudy.studies.load import load_study
+from calstudy.studies.show import describe_plan
 from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
 
@@ -232,6 +234,18 @@ def test_a_member_can_come_from_a_reference_and_others_are_run(finished, folder,
     assert taken.finished == {"hexagon": reference}
     stages = {task.stage.name for task in schedule(taken.targets, Store(tmp_path / "store")).todo}
     assert stages >= {"simulate", "calibrate"}
+
+
+def test_a_plan_with_finished_members_is_what_the_run_makes_and_leaves_the_store_alone(finished, folder, tmp_path):
+    there, runs = elsewhere(folder, tmp_path), [finished.parts["hexagon"].folder]
+    planned = with_finished(there, runs, Console(file=io.StringIO()), planned=True)
+    plan = describe_plan(planned, Budget(1))
+    assert not (tmp_path / "store").exists()
+    taken = with_finished(there, runs, Console(file=io.StringIO()))
+    counts = Counter(task.stage.name for task in schedule(taken.targets, Store(tmp_path / "store")).todo)
+    assert {row["stage"]: row["to_make"] for row in plan["stages"] if row["to_make"]} == counts
+    # Without the option the other member is counted as well.
+    assert sum(counts.values()) < sum(row["to_make"] for row in describe_plan(there, Budget(1))["stages"])
 
 
 def test_a_finished_run_of_something_else_is_not_taken(finished, folder, tmp_path):
