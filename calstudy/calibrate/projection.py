@@ -27,7 +27,7 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.batches import Piece, make_piece, span_of
+from calstudy.calibrate.batches import Piece, make_piece, span_of, span_of_products
 from calstudy.calibrate.problem import FitStructure
 from calstudy.calibrate.tensors import FitTensors
 
@@ -39,6 +39,10 @@ KERNEL_RIDGE = {tf.float32: 1e-3, tf.float64: 1e-9}
 # A finite prior leaves nothing undetermined. Foregrounds that it holds where the data hardly do would converge slowly
 # with more.
 FINITE_KERNEL_RIDGE = {tf.float32: 1e-6, tf.float64: 1e-12}
+
+# From this many visibilities on, the elementwise products of a fit are compiled (XLA): one pass over the memory in
+# place of a dozen, for a second of compilation.
+LEAST_FUSED = 1_000_000
 
 
 class Roots(NamedTuple):
@@ -84,22 +88,49 @@ class Projection(NamedTuple):
     roots: tuple[Roots, ...]
 
 
-class _Part(NamedTuple):
-    """What one batch adds to a `Projection`; `pull` is its share of the descent, by baseline."""
+class _Passes:
+    """Products of gains, models and data on all baselines; those of large arrays go through the memory only once.
 
-    loss: tf.Tensor
-    model: tf.Tensor
-    pull: tf.Tensor
-    curvature: tf.Tensor
-    roots: Roots
+    Parameters
+    ----------
+    tensors
+        Index tensors of the fit.
+    """
 
+    def __init__(self, tensors: FitTensors) -> None:
+        self._tensors = tensors
+        fused = tensors.n_baselines * tensors.n_frequencies >= LEAST_FUSED
+        self.match, self.residual, self.change, self.pull = (
+            tf.function(function, jit_compile=fused, autograph=False)
+            for function in (self._match, self._residual, self._change, self._pull)
+        )
 
-class _PieceData(NamedTuple):
-    """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's mean, if any, of one batch."""
+    def _match(
+        self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, mean: tf.Tensor | None
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return D, (Nbls, Nfreqs), and G* w V - D m, (2, Nbls, Nfreqs); see `Projector`."""
+        products = self._tensors.gain_products(gains)
+        curvature = weights * pairs.squared_modulus(products)
+        matched = pairs.conjugate_multiply(products, weights * visibilities)
+        return curvature, matched if mean is None else matched - curvature * mean
 
-    visibilities: tf.Tensor
-    weights: tf.Tensor
-    mean: tf.Tensor | None
+    def _residual(
+        self, gains: tf.Tensor, model: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return sum w |V - G F|^2, and minus half its gradient in eta with F fixed, (2, Nants, Nfreqs)."""
+        products = self._tensors.gain_products(gains)
+        residual = visibilities - pairs.multiply(products, model)
+        pull = pairs.conjugate_multiply(model, weights * pairs.conjugate_multiply(products, residual))
+        return tf.reduce_sum(weights * pairs.squared_modulus(residual)), self._tensors.sum_over_antenna(pull)
+
+    def _change(self, eta: tf.Tensor, curvature: tf.Tensor, model: tf.Tensor) -> tf.Tensor:
+        """Return D F (eta_a + eta_b*), (2, Nbls, Nfreqs)."""
+        return curvature * pairs.multiply(model, self._tensors.relative_change(eta))
+
+    def _pull(self, change: tf.Tensor, answer: tf.Tensor | None, curvature: tf.Tensor, model: tf.Tensor) -> tf.Tensor:
+        """Return F* times a weighted change, less D times how foregrounds answer it, by antenna; (2, Nants, Nfreqs)."""
+        left = change if answer is None else change - curvature * answer
+        return self._tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
 
 
 class Projector:
@@ -121,17 +152,21 @@ class Projector:
         The batches, with their vectors.
     common
         Orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`.
+    products_span
+        The same of the products of any two of its vectors; None if these have hardly fewer dimensions than channels.
     """
 
     def __init__(self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
-        self.tensors, self.dtype = tensors, dtype
+        self.tensors, self.dtype, self._passes = tensors, dtype, _Passes(tensors)
         self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
         self._level = 0 if structure.prior == "own" else 1
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
         self.common = tf.constant(span_of(distinct, dtype), dtype)
+        products_span = span_of_products(span_of(distinct, tf.float64))
+        self.products_span = None if products_span is None else tf.constant(products_span, dtype)
         needed = tensors.shared or self._two_levels
         self.pieces = [
-            make_piece(batch, tensors.owner(batch) if needed else None, self._two_levels, dtype)
+            make_piece(batch, tensors.owner(batch) if needed else None, self._two_levels, dtype, products_span)
             for batch in tensors.batches
         ]
         self.project = tf.function(self._project, autograph=False)
@@ -180,48 +215,28 @@ class Projector:
         deviations
             t of the baselines' own coefficients and s of the shared ones, (2,), if the prior is finite.
         """
-        parts: list[_Part] = []
-        descent: list[tf.Tensor] = []
-        for piece in self.pieces:
-            first, last = baselines = piece.batch.baselines
-            # Without this, all batches would be worked on at once, and their temporaries add up.
-            with tf.control_dependencies([descent[-1], parts[-1].roots.first] if parts else []):
-                products = self.tensors.gain_products(gains, first, last)
-                data = _PieceData(
-                    visibilities[:, first:last], weights[first:last], None if mean is None else mean[:, first:last]
-                )
-                part = self._eliminate(piece, products, data, deviations)
-                before = descent[-1] if descent else 0.0
-                descent.append(before + self.tensors.sum_over_antenna(part.pull, baselines))
-            parts.append(part)
-        model = tf.concat([part.model for part in parts], axis=1)
-        curvature = tf.concat([tf.cast(part.curvature, self.dtype) for part in parts], axis=0)
-        return Projection(
-            tf.add_n([part.loss for part in parts]),
-            model,
-            descent[-1],
-            curvature,
-            tf.cast(model, self.dtype),
-            tuple(part.roots for part in parts),
-        )
-
-    def _eliminate(self, piece: Piece, products: tf.Tensor, data: _PieceData, deviations: tf.Tensor | None) -> _Part:
-        """Eliminate the foregrounds of one batch, whose baselines have the gain products `products`."""
-        curvature = data.weights * pairs.squared_modulus(products)
-        matched = pairs.conjugate_multiply(products, data.weights * data.visibilities)
-        if data.mean is not None:
-            matched -= curvature * data.mean
         eliminate = self._eliminate_both if self._two_levels else self._eliminate_one
-        model, penalty, roots = eliminate(piece, curvature, matched, deviations)
-        if data.mean is not None:
-            model += data.mean
-        residual = data.visibilities - pairs.multiply(products, model)
-        return _Part(
-            tf.reduce_sum(data.weights * pairs.squared_modulus(residual)) + penalty,
+        curvature, matched = self._passes.match(gains, visibilities, weights, mean)
+        models: list[tf.Tensor] = []
+        penalties: list[tf.Tensor] = []
+        roots: list[Roots] = []
+        for piece in self.pieces:
+            first, last = piece.batch.baselines
+            # Without this, all batches would be worked on at once, and their temporaries add up.
+            with tf.control_dependencies([models[-1], roots[-1].first] if models else []):
+                model, penalty, root = eliminate(piece, curvature[first:last], matched[:, first:last], deviations)
+            models.append(model)
+            penalties.append(penalty)
+            roots.append(root)
+        model = tf.concat(models, axis=1) if mean is None else tf.concat(models, axis=1) + mean
+        loss, descent = self._passes.residual(gains, model, visibilities, weights)
+        return Projection(
+            loss + tf.add_n(penalties),
             model,
-            pairs.conjugate_multiply(model, data.weights * pairs.conjugate_multiply(products, residual)),
-            curvature,
-            roots,
+            descent,
+            tf.cast(curvature, self.dtype),
+            tf.cast(model, self.dtype),
+            tuple(roots),
         )
 
     def _eliminate_one(
@@ -316,11 +331,9 @@ class Projector:
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs)."""
-        tensors = self.tensors
         curvature, model = projection.curvature, projection.baseline_model
-        change = curvature * pairs.multiply(model, tensors.relative_change(eta))
-        left = change - curvature * self.answer(change, projection)
-        return tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
+        change = self._passes.change(eta, curvature, model)
+        return self._passes.pull(change, self.answer(change, projection), curvature, model)
 
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return minus the product of the Jacobian with the second derivative of the residual along eta.
@@ -328,13 +341,11 @@ class Projector:
         Along g exp(t eta), with foregrounds that follow as F + t dF, the second derivative of G F in t is
         G ((eta_a + eta_b*)^2 F + 2 (eta_a + eta_b*) dF). Shape (2, Nants, Nfreqs).
         """
-        tensors = self.tensors
         curvature, model = projection.curvature, projection.baseline_model
-        relative = tensors.relative_change(eta)
-        first = pairs.multiply(model, relative)
-        change = curvature * pairs.multiply(relative, first - 2 * self.answer(curvature * first, projection))
-        left = change - curvature * self.answer(change, projection)
-        return -tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
+        first = self._passes.change(eta, curvature, model)
+        bent = pairs.multiply(model, self.tensors.relative_change(eta)) - 2 * self.answer(first, projection)
+        change = self._passes.change(eta, curvature, bent)
+        return -self._passes.pull(change, self.answer(change, projection), curvature, model)
 
 
 class FrozenForegrounds:
@@ -344,27 +355,21 @@ class FrozenForegrounds:
     """
 
     def __init__(self, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
-        self.tensors, self.dtype = tensors, dtype
+        self.tensors, self.dtype, self._passes = tensors, dtype, _Passes(tensors)
         self.project = tf.function(self._project, autograph=False)
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
-        products = self.tensors.gain_products(gains)
-        residual = visibilities - pairs.multiply(products, model)
-        loss = tf.reduce_sum(weights * pairs.squared_modulus(residual))
-        pull = pairs.conjugate_multiply(model, weights * pairs.conjugate_multiply(products, residual))
-        curvature = tf.cast(weights * pairs.squared_modulus(products), self.dtype)
-        descent = self.tensors.sum_over_antenna(pull)
+        loss, descent = self._passes.residual(gains, model, visibilities, weights)
+        curvature = tf.cast(weights * pairs.squared_modulus(self.tensors.gain_products(gains)), self.dtype)
         return Projection(loss, model, descent, curvature, tf.cast(model, self.dtype), ())
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the gains alone times eta, shape (2, Nants, Nfreqs)."""
-        model = projection.baseline_model
-        change = projection.curvature * pairs.multiply(model, self.tensors.relative_change(eta))
-        return self.tensors.sum_over_antenna(pairs.conjugate_multiply(model, change))
+        curvature, model = projection.curvature, projection.baseline_model
+        return self._passes.pull(self._passes.change(eta, curvature, model), None, curvature, model)
 
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return what `Projector.curvature_descent` does; foregrounds do not follow."""
-        model = projection.baseline_model
-        relative = self.tensors.relative_change(eta)
-        change = projection.curvature * pairs.multiply(model, pairs.multiply(relative, relative))
-        return -self.tensors.sum_over_antenna(pairs.conjugate_multiply(model, change))
+        curvature, model = projection.curvature, projection.baseline_model
+        bent = pairs.multiply(model, self.tensors.relative_change(eta))
+        return -self._passes.pull(self._passes.change(eta, curvature, bent), None, curvature, model)

@@ -24,6 +24,7 @@ from typing import NamedTuple, Protocol
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
+from calstudy.calibrate.batches import column_products
 from calstudy.calibrate.projection import Projection, Projector
 from calstudy.calibrate.tensors import FitTensors
 
@@ -119,15 +120,18 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     tensors, common = projector.tensors, projector.common
     n_frequencies, rank = common.shape
     degrees = antenna_degrees(tensors, projection)
-    gram = tf.reshape(degrees @ _column_products(common, common), [-1, rank, rank])
+    gram = tf.reshape(degrees @ column_products(common, common), [-1, rank, rank])
     weighted = projection.curvature * projection.baseline_model
     absorbed: list[tf.Tensor] = []
     for piece, batch_roots in zip(projector.pieces, projection.roots, strict=True):
         # Temporaries of several batches would add up.
         with tf.control_dependencies(absorbed[-1:]):
             start, end = piece.batch.baselines
-            products = _column_products(piece.span, common)
-            mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies]) @ products
+            products = column_products(piece.span, common)
+            mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies])
+            if (narrow := projector.products_span) is not None:
+                mixed, products = mixed @ narrow, tf.matmul(narrow, products, transpose_a=True)
+            mixed = mixed @ products
             real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, piece.span.shape[1], rank]))
             roots = projector.baseline_roots(piece, batch_roots)
             real, imaginary = roots @ real, roots @ imaginary
@@ -138,11 +142,6 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
             absorbed.append(before + tensors.sum_over_antenna(tf.stack([square, crossed]), piece.batch.baselines))
     square, crossed = tf.unstack(absorbed[-1])
     return AntennaBlocks(degrees, common, gram, tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)]))
-
-
-def _column_products(left: tf.Tensor, right: tf.Tensor) -> tf.Tensor:
-    """Return the products of each column of one matrix with each of another, (N, Nleft * Nright)."""
-    return tf.reshape(left[:, :, None] * right[:, None, :], [left.shape[0], -1])
 
 
 class AntennaInverse(NamedTuple):
