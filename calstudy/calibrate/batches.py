@@ -24,8 +24,6 @@ WIDEST = 4 / 3
 # Singular values kept in what bases span, relative to the largest: what is left out is an error of the Gauss-Newton
 # matrix.
 SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
-# What products of two vectors span is used where it is at most this part of all channels.
-NARROW = 0.5
 # One matrix product for each basis is faster than one for each model, if that many have it.
 ALIKE = 4
 
@@ -106,18 +104,9 @@ class Vectors:
         Vectors that are not padding, (Nbases,).
     index
         Which of them each row has, (Nrows,), ascending.
-    products_span
-        Orthonormal basis of what the products of two vectors span, (length, rank), float64; None if that is not little.
     """
 
-    def __init__(
-        self,
-        bases: np.ndarray,
-        overlaps: np.ndarray,
-        widths: np.ndarray,
-        index: np.ndarray,
-        products_span: np.ndarray | None = None,
-    ) -> None:
+    def __init__(self, bases: np.ndarray, overlaps: np.ndarray, widths: np.ndarray, index: np.ndarray) -> None:
         self.n_vectors, self.length = bases.shape[1:]
         # One where coefficients are not padding, zero where they are.
         self.filled = np.arange(self.n_vectors) < widths[index][:, None]
@@ -126,7 +115,6 @@ class Vectors:
             self._rows_of_basis = np.bincount(index, minlength=len(bases)).tolist()
             self._bases = [tf.constant(basis.T) for basis in bases]
             self._overlaps = [tf.constant(overlap) for overlap in overlaps]
-            self._products_span = None if products_span is None else tf.constant(products_span)
         else:
             self._stack, self._stacked_overlaps = tf.constant(bases[index]), tf.constant(overlaps[index])
 
@@ -136,14 +124,11 @@ class Vectors:
             return tf.matmul(curvature[:, None, :] * self._stack, self._stack, transpose_b=True)
         found = []
         for rows, basis in zip(tf.split(curvature, self._rows_of_basis), self._bases, strict=True):
-            # Either the products of the vectors with each other are made, or those with D; the fewer.
-            if rows.shape[0] <= self.n_vectors:
-                product = tf.reshape(rows[:, None, :] * tf.transpose(basis), [-1, self.length]) @ basis
-            elif self._products_span is None:
+            # Of the products of vectors with each other, and of vectors with D, the fewer are made.
+            if rows.shape[0] > self.n_vectors:
                 product = rows @ column_products(basis, basis)
             else:
-                inner = tf.matmul(self._products_span, column_products(basis, basis), transpose_a=True)
-                product = (rows @ self._products_span) @ inner
+                product = tf.reshape(rows[:, None, :] * tf.transpose(basis), [-1, self.length]) @ basis
             found.append(tf.reshape(product, [-1, self.n_vectors, self.n_vectors]))
         return _joined(found, 0)
 
@@ -222,9 +207,7 @@ class Piece(NamedTuple):
         return tf.reshape(tf.matmul(inner, self.span, transpose_b=True), [2, -1, n_frequencies])
 
 
-def make_piece(
-    batch: Batch, owner: np.ndarray | None, with_own: bool, dtype: tf.DType, products_span: np.ndarray | None = None
-) -> Piece:
+def make_piece(batch: Batch, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
     """Return a batch with its vectors.
 
     Parameters
@@ -237,16 +220,13 @@ def make_piece(
         Whether baselines have coefficients of their own besides the shared ones.
     dtype
         Of the span and the overlaps.
-    products_span
-        See `Vectors`.
     """
     kind = dtype.as_numpy_dtype
     # A batch of short baselines spans little of what all bases do.
     basis = span_of(batch.bases, dtype)
-    own = batch_vectors(batch, basis, owner, kind, products_span) if with_own else None
+    own = batch_vectors(batch, basis, owner, kind) if with_own else None
     index = None if owner is None else tf.constant(owner, tf.int32)
-    vectors = batch_vectors(batch, basis, None, kind, products_span)
-    return Piece(batch, tf.constant(basis, dtype), index, vectors, own)
+    return Piece(batch, tf.constant(basis, dtype), index, batch_vectors(batch, basis, None, kind), own)
 
 
 def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
@@ -266,30 +246,7 @@ def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
     return left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
 
 
-def span_of_products(basis: np.ndarray) -> np.ndarray | None:
-    """Return an orthonormal basis of what products of two vectors span, (Nfreqs, rank), or None if that is not little.
-
-    Vectors within a band of delays have products within one of twice the width, to rounding.
-
-    Parameters
-    ----------
-    basis
-        (Nfreqs, Nvec), float64.
-    """
-    first, second = np.triu_indices(basis.shape[1])
-    products = basis[:, first] * basis[:, second]
-    # Vectors without a channel in common have none.
-    span = span_of([products[:, np.any(products != 0, axis=0)]], tf.float64)
-    return span if span.shape[1] <= NARROW * span.shape[0] else None
-
-
-def batch_vectors(
-    batch: Batch,
-    span: np.ndarray,
-    owner: np.ndarray | None,
-    dtype: np.dtype,
-    products_span: np.ndarray | None = None,
-) -> Vectors:
+def batch_vectors(batch: Batch, span: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
     """Return the vectors of the models of a batch, or of its baselines.
 
     Models with common coefficients are one row, whose channels are those of all of them, one after the other.
@@ -305,8 +262,6 @@ def batch_vectors(
         of the models.
     dtype
         Of the overlaps.
-    products_span
-        See `Vectors`; not used for models with common coefficients.
     """
     if batch.joint:
         (basis,) = batch.bases
@@ -318,7 +273,7 @@ def batch_vectors(
     for row, basis in zip(stack, batch.bases, strict=True):
         row[: basis.shape[1]] = basis.T
     index = batch.basis_index if owner is None else batch.basis_index[owner]
-    return Vectors(stack, (stack @ span).astype(dtype), widths, index, products_span)
+    return Vectors(stack, (stack @ span).astype(dtype), widths, index)
 
 
 def _side_by_side(basis: np.ndarray) -> np.ndarray:

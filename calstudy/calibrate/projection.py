@@ -27,7 +27,7 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.batches import Piece, make_piece, span_of, span_of_products
+from calstudy.calibrate.batches import Piece, make_piece, span_of
 from calstudy.calibrate.problem import FitStructure
 from calstudy.calibrate.tensors import FitTensors
 
@@ -100,15 +100,19 @@ class _Passes:
     def __init__(self, tensors: FitTensors) -> None:
         self._tensors = tensors
         fused = tensors.n_baselines * tensors.n_frequencies >= LEAST_FUSED
-        self.match, self.residual, self.change, self.pull = (
+        self.curvature, self.match, self.residual, self.change, self.pull = (
             tf.function(function, jit_compile=fused, autograph=False)
-            for function in (self._match, self._residual, self._change, self._pull)
+            for function in (self._curvature, self._match, self._residual, self._change, self._pull)
         )
+
+    def _curvature(self, gains: tf.Tensor, weights: tf.Tensor) -> tf.Tensor:
+        """Return D, (Nbls, Nfreqs), for gains (2, Nants, Nfreqs); see the module."""
+        return weights * pairs.squared_modulus(self._tensors.gain_products(gains))
 
     def _match(
         self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, mean: tf.Tensor | None
     ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return D, (Nbls, Nfreqs), and G* w V - D m, (2, Nbls, Nfreqs); see `Projector`."""
+        """Return D, (Nbls, Nfreqs), and G* w V, less D m if there is a mean m, (2, Nbls, Nfreqs)."""
         products = self._tensors.gain_products(gains)
         curvature = weights * pairs.squared_modulus(products)
         matched = pairs.conjugate_multiply(products, weights * visibilities)
@@ -128,7 +132,7 @@ class _Passes:
         return curvature * pairs.multiply(model, self._tensors.relative_change(eta))
 
     def _pull(self, change: tf.Tensor, answer: tf.Tensor | None, curvature: tf.Tensor, model: tf.Tensor) -> tf.Tensor:
-        """Return F* times a weighted change, less D times how foregrounds answer it, by antenna; (2, Nants, Nfreqs)."""
+        """Return F* (y - D x) of a weighted change y that foregrounds answer by x, by antenna; (2, Nants, Nfreqs)."""
         left = change if answer is None else change - curvature * answer
         return self._tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
 
@@ -152,8 +156,6 @@ class Projector:
         The batches, with their vectors.
     common
         Orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`.
-    products_span
-        The same of the products of any two of its vectors; None if these have hardly fewer dimensions than channels.
     """
 
     def __init__(self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
@@ -162,11 +164,9 @@ class Projector:
         self._level = 0 if structure.prior == "own" else 1
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
         self.common = tf.constant(span_of(distinct, dtype), dtype)
-        products_span = span_of_products(span_of(distinct, tf.float64))
-        self.products_span = None if products_span is None else tf.constant(products_span, dtype)
         needed = tensors.shared or self._two_levels
         self.pieces = [
-            make_piece(batch, tensors.owner(batch) if needed else None, self._two_levels, dtype, products_span)
+            make_piece(batch, tensors.owner(batch) if needed else None, self._two_levels, dtype)
             for batch in tensors.batches
         ]
         self.project = tf.function(self._project, autograph=False)
@@ -360,7 +360,7 @@ class FrozenForegrounds:
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
         loss, descent = self._passes.residual(gains, model, visibilities, weights)
-        curvature = tf.cast(weights * pairs.squared_modulus(self.tensors.gain_products(gains)), self.dtype)
+        curvature = tf.cast(self._passes.curvature(gains, weights), self.dtype)
         return Projection(loss, model, descent, curvature, tf.cast(model, self.dtype), ())
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:

@@ -144,18 +144,9 @@ class FitTensors:
             return values
         return tf.stack([self.sum_over_group(part) for part in tf.unstack(values)])
 
-    def gain_products(self, gains: tf.Tensor, start: int = 0, end: int | None = None) -> tf.Tensor:
-        """Return g_a g_b* of a range of baselines, (2, end - start, Nfreqs).
-
-        Parameters
-        ----------
-        gains
-            (2, Nants, Nfreqs).
-        start, end
-            First baseline, and one past the last, in the solvers' order; by default all.
-        """
-        first = tf.gather(gains, self.first[start:end], axis=1)
-        second = tf.gather(gains, self.second[start:end], axis=1)
+    def gain_products(self, gains: tf.Tensor) -> tf.Tensor:
+        """Return g_a g_b* of all baselines, (2, Nbls, Nfreqs), for gains (2, Nants, Nfreqs)."""
+        first, second = (tf.gather(gains, index, axis=1) for index in (self.first, self.second))
         return pairs.conjugate_multiply(second, first)
 
     def relative_change(self, eta: tf.Tensor) -> tf.Tensor:

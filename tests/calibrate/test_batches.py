@@ -1,7 +1,6 @@
-"""Products with foreground vectors, and of gains, models and data: the ways that large arrays take against the direct.
+"""The ways that large arrays take to normal matrices and elementwise products, against the direct ones.
 
-The direct ways are NumPy here; the plain products of `calstudy.calibrate.projection` are tested against NumPy in
-test_calibration_loss.py.
+The plain elementwise products are tested against NumPy in test_calibration_loss.py and test_foreground_prior.py.
 """
 
 from __future__ import annotations
@@ -9,86 +8,74 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tensorflow as tf
-from toy import complex_normal, make_toy, scattered
+from test_calibration_loss import redundant_structure
+from test_foreground_prior import prior_structure
+from test_joint_basis import block_diagonal
+from toy import HEX, complex_normal, make_toy
 
-from calstudy.calibrate import batches, pairs, projection
+from calstudy.calibrate import pairs, projection
 from calstudy.calibrate.basis import dpss_vectors
-from calstudy.calibrate.batches import Vectors, span_of, span_of_products
-from calstudy.calibrate.projection import FrozenForegrounds, Projector
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.batches import ALIKE, Vectors
+from calstudy.calibrate.solvers.reduced import ReducedKernels
 
 CHANNELS = 200
 
 
-@pytest.mark.parametrize("half_bandwidth", [4.0, 12.0])
-def test_products_of_vectors_span_twice_their_band(half_bandwidth):
-    basis = dpss_vectors(CHANNELS, half_bandwidth, 1e-12)
-    span = span_of_products(basis)
-    # Slepian's count for twice the band, and a few sequences for each edge, as the basis itself has.
-    assert span.shape[1] <= 2 * basis.shape[1] + 10
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(CHANNELS, -1)
-    left = products - span @ (span.T @ products)
-    assert np.abs(left).max() < 1e-14 * np.abs(products).max() * CHANNELS
-
-
-def test_products_that_span_nearly_all_channels_are_of_no_use():
-    assert span_of_products(dpss_vectors(CHANNELS, 40.0, 1e-12)) is None
-    # Foregrounds that are free in each channel: vectors without a channel in common have no product.
-    assert span_of_products(np.eye(CHANNELS)) is None
-
-
-# Rows of one basis: fewer than its vectors, and more; with and without what their products span.
-@pytest.mark.parametrize("rows", [3, 60])
-@pytest.mark.parametrize("narrow", [True, False])
-def test_normal_matrices_are_sums_over_channels(rows, narrow):
+# Each way of `Vectors.normal`: a basis for each row; few rows of one basis; more rows than it has vectors.
+@pytest.mark.parametrize("rows", [1, ALIKE, 60])
+def test_normal_matrices_are_sums_over_channels(rows):
     short, long = dpss_vectors(CHANNELS, 4.0, 1e-12), dpss_vectors(CHANNELS, 6.0, 1e-12)
+    assert ALIKE < short.shape[1] < long.shape[1] < 60
     bases = np.zeros((2, long.shape[1], CHANNELS))
     bases[0, : short.shape[1]], bases[1] = short.T, long.T
-    # The longer basis alone does not span the edges of the shorter one.
-    span = span_of_products(span_of([short, long], tf.float64)) if narrow else None
-    index = np.repeat([0, 1], rows)
-    widths = np.array([short.shape[1], long.shape[1]])
+    index, widths = np.repeat([0, 1], rows), np.array([short.shape[1], long.shape[1]])
     curvature = np.random.default_rng(1).exponential(size=(2 * rows, CHANNELS))
-    found = Vectors(bases, bases, widths, index, span).normal(tf.constant(curvature)).numpy()
+    found = Vectors(bases, bases, widths, index).normal(tf.constant(curvature)).numpy()
     expected = np.einsum("rf,rvf,rwf->rvw", curvature, bases[index], bases[index])
     assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
 
 
 @pytest.fixture(scope="module")
 def toy():
-    return make_toy(scattered(6))
+    return make_toy(HEX)
 
 
-def results(toy, frozen):
-    """Projection, Gauss-Newton product and curvature at gains with errors, as NumPy arrays."""
-    problem, structure = toy.problem(), toy.structure
-    tensors = FitTensors(structure)
-    data = tensors.load(problem, tf.float64)
-    arguments = [pairs.to_pair(toy.gains, tf.float64), data.visibilities, data.weights]
-    if frozen:
-        projector = FrozenForegrounds(tensors, tf.float64)
-        arguments.append(tensors.load_model(toy.foregrounds, data.scale, tf.float64))
-    else:
-        projector = Projector(structure, tensors, tf.float64)
-    found = projector.project(*arguments)
-    eta = pairs.to_pair(complex_normal(np.random.default_rng(2), toy.gains.shape), tf.float64)
-    images = projector.hessian_product(eta, found), projector.curvature_descent(eta, found)
-    return [value.numpy() for value in (found.loss, found.model, found.descent, found.curvature, *images)]
+def make_problem(toy, case):
+    """A problem with flags, and all that its kind of fit needs."""
+    structure = {
+        "per-baseline": lambda: toy.structure,
+        "frozen": lambda: toy.structure,
+        "turned-and-shared": lambda: redundant_structure(toy),
+        "joint": lambda: block_diagonal(toy.structure),
+        "prior": lambda: prior_structure(toy, "both"),
+    }[case]()
+    rng, shape = np.random.default_rng(2), toy.foregrounds.shape
+    more = {"prior": {"deviations": (0.7, 1.9)}, "frozen": {"frozen": True}}.get(case, {})
+    weights = rng.uniform(0.5, 2, shape) * (rng.random(shape) > 0.1)
+    return toy.problem(structure, weights=weights, sky_model=toy.foregrounds, **more)
 
 
-@pytest.mark.parametrize("frozen", [False, True])
-def test_fused_products_are_the_plain_ones(toy, frozen, monkeypatch):
-    plain = results(toy, frozen)
+@pytest.mark.parametrize("case", ["per-baseline", "frozen", "turned-and-shared", "joint", "prior"])
+@pytest.mark.parametrize("dtype", [tf.float64, tf.float32])
+def test_fused_products_are_the_plain_ones(toy, case, dtype, monkeypatch):
+    problem = make_problem(toy, case)
+    rng = np.random.default_rng(3)
+    eta, gains = complex_normal(rng, toy.gains.shape), toy.gains * (1 + 0.1 * complex_normal(rng, toy.gains.shape))
+
+    def results():
+        kernels = ReducedKernels(problem.structure, case == "frozen", dtype)
+        reduced = kernels.reduce(problem, gains)
+        found = kernels.project(reduced.gains, *reduced.data)
+        direction = pairs.to_pair(eta, dtype)
+        images = (
+            kernels.projector.hessian_product(direction, found),
+            kernels.projector.curvature_descent(direction, found),
+        )
+        return (found.loss, found.model, found.descent), (found.curvature, *images)
+
+    plain = results()
     monkeypatch.setattr(projection, "LEAST_FUSED", 1)
-    for one, other in zip(plain, results(toy, frozen), strict=True):
-        # Descent and loss come from residuals a thousand times smaller than the data.
-        assert np.abs(one - other).max() < 1e-10 * np.abs(one).max()
-
-
-def test_the_projection_by_the_span_of_products_is_the_same(toy, monkeypatch):
-    direct = results(toy, frozen=False)
-    # The toy's bands are too wide for their products to span little of them.
-    monkeypatch.setattr(batches, "NARROW", 1.0)
-    monkeypatch.setattr(batches, "ALIKE", 0)
-    for one, other in zip(direct, results(toy, frozen=False), strict=True):
-        assert np.abs(one - other).max() < 1e-8 * np.abs(one).max()
+    # Loss, model and gradient are float64 always. They are made of 21 baselines and 64 channels.
+    for ones, others, rounding in zip(plain, results(), (1e-10, 1e-10 if dtype == tf.float64 else 1e-4), strict=True):
+        for one, other in zip(ones, others, strict=True):
+            assert np.abs(one - other).max() < rounding * np.abs(one).max()

@@ -11,7 +11,7 @@ from test_calibration_loss import redundant_structure
 from test_joint_basis import block_diagonal
 from toy import FREQUENCIES, complex_normal
 
-from calstudy.calibrate import batches, pairs
+from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import flag_weights
@@ -56,7 +56,7 @@ def dense_preconditioner(blocks, antenna):
     return np.diag((1 + DAMPING) * degrees) - lift @ absorbed @ lift.T
 
 
-@pytest.fixture(scope="module", params=["per-baseline", "span-of-products", "joint", "few-at-once", "flagged"])
+@pytest.fixture(scope="module", params=["per-baseline", "joint", "few-at-once", "flagged"])
 def blocks(request, toy):
     problem = toy.problem()
     if request.param == "joint":
@@ -68,11 +68,7 @@ def blocks(request, toy):
         flags = rng.random(toy.foregrounds.shape) < 0.1
         flags[:, 20:29] = True
         problem = toy.problem(weights=flag_weights(flags))
-    with pytest.MonkeyPatch.context() as patch:
-        if request.param == "span-of-products":
-            patch.setattr(batches, "NARROW", 1.0)
-        projector, projection, gains = at_random_gains(problem)
-    assert (projector.products_span is not None) == (request.param == "span-of-products")
+    projector, projection, gains = at_random_gains(problem)
     return projector, projection, gains, antenna_blocks(projector, projection)
 
 

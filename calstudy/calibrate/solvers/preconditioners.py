@@ -128,10 +128,7 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
         with tf.control_dependencies(absorbed[-1:]):
             start, end = piece.batch.baselines
             products = column_products(piece.span, common)
-            mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies])
-            if (narrow := projector.products_span) is not None:
-                mixed, products = mixed @ narrow, tf.matmul(narrow, products, transpose_a=True)
-            mixed = mixed @ products
+            mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies]) @ products
             real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, piece.span.shape[1], rank]))
             roots = projector.baseline_roots(piece, batch_roots)
             real, imaginary = roots @ real, roots @ imaginary
