@@ -14,6 +14,7 @@ from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.claims.folders import evaluate_folder
+from calstudy.cli import main as cli
 from calstudy.experiment.files import override
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
@@ -246,6 +247,16 @@ def test_a_plan_with_finished_members_is_what_the_run_makes_and_leaves_the_store
     assert {row["stage"]: row["to_make"] for row in plan["stages"] if row["to_make"]} == counts
     # Without the option the other member is counted as well.
     assert sum(counts.values()) < sum(row["to_make"] for row in describe_plan(there, Budget(1))["stages"])
+
+
+def test_the_plan_in_json_is_alone_on_standard_output(finished, folder, tmp_path, capsys):
+    changes = [text for field in ("store", "runs") for text in ("--set", f"outputs.{field}={tmp_path / field}")]
+    arguments = ["plan", write(folder), "--finished", finished.folder.parent, "--json", *changes]
+    cli.app([str(argument) for argument in arguments], standalone_mode=False)
+    printed = capsys.readouterr()
+    stages = json.loads(printed.out)["stages"]
+    assert {row["stage"] for row in stages if row["to_make"]} == {"figure", "claims"}
+    assert printed.err.count("taken from") == len(PAIR["experiments"])
 
 
 def test_a_finished_run_of_something_else_is_not_taken(finished, folder, tmp_path):
