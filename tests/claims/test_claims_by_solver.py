@@ -129,13 +129,6 @@ def test_the_figure_shows_an_array_that_was_calibrated_with_both_solvers(studies
     assert set(SolverComparison().draw(job).shown) == set(both)
 
 
-def test_the_main_study_with_both_solvers_is_a_part_of_the_whole():
-    whole, part = (load_study(EXPERIMENTS / f"{name}.yaml") for name in ("paper-solver", "minredundant-solvers"))
-    for name, study in part.parts.items():
-        assert study.folder == whole.parts[name].folder
-    assert {role: whole.roles[role] for role in part.roles} == part.roles
-
-
 @pytest.mark.parametrize("scale", [None, "small"])
 def test_the_collection_with_the_papers_solver_plays_every_role_twice_and_shares_its_data(scale):
     collection = load_study(EXPERIMENTS / "paper-solver.yaml", scale)
