@@ -88,13 +88,13 @@ class Projection(NamedTuple):
     roots: tuple[Roots, ...]
 
 
-class _Passes:
-    """Products of gains, models and data on all baselines; those of large arrays go through the memory only once.
+class _BaselineProducts:
+    """Elementwise products of gains, models and data on all baselines, in the notation of the module.
 
     Parameters
     ----------
     tensors
-        Index tensors of the fit.
+        Index tensors of the fit. From `LEAST_FUSED` visibilities on the products are compiled.
     """
 
     def __init__(self, tensors: FitTensors) -> None:
@@ -159,7 +159,7 @@ class Projector:
     """
 
     def __init__(self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
-        self.tensors, self.dtype, self._passes = tensors, dtype, _Passes(tensors)
+        self.tensors, self.dtype, self._products = tensors, dtype, _BaselineProducts(tensors)
         self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
         self._level = 0 if structure.prior == "own" else 1
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
@@ -216,7 +216,7 @@ class Projector:
             t of the baselines' own coefficients and s of the shared ones, (2,), if the prior is finite.
         """
         eliminate = self._eliminate_both if self._two_levels else self._eliminate_one
-        curvature, matched = self._passes.match(gains, visibilities, weights, mean)
+        curvature, matched = self._products.match(gains, visibilities, weights, mean)
         models: list[tf.Tensor] = []
         penalties: list[tf.Tensor] = []
         roots: list[Roots] = []
@@ -229,7 +229,7 @@ class Projector:
             penalties.append(penalty)
             roots.append(root)
         model = tf.concat(models, axis=1) if mean is None else tf.concat(models, axis=1) + mean
-        loss, descent = self._passes.residual(gains, model, visibilities, weights)
+        loss, descent = self._products.residual(gains, model, visibilities, weights)
         return Projection(
             loss + tf.add_n(penalties),
             model,
@@ -332,8 +332,8 @@ class Projector:
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs)."""
         curvature, model = projection.curvature, projection.baseline_model
-        change = self._passes.change(eta, curvature, model)
-        return self._passes.pull(change, self.answer(change, projection), curvature, model)
+        change = self._products.change(eta, curvature, model)
+        return self._products.pull(change, self.answer(change, projection), curvature, model)
 
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return minus the product of the Jacobian with the second derivative of the residual along eta.
@@ -342,10 +342,10 @@ class Projector:
         G ((eta_a + eta_b*)^2 F + 2 (eta_a + eta_b*) dF). Shape (2, Nants, Nfreqs).
         """
         curvature, model = projection.curvature, projection.baseline_model
-        first = self._passes.change(eta, curvature, model)
+        first = self._products.change(eta, curvature, model)
         bent = pairs.multiply(model, self.tensors.relative_change(eta)) - 2 * self.answer(first, projection)
-        change = self._passes.change(eta, curvature, bent)
-        return -self._passes.pull(change, self.answer(change, projection), curvature, model)
+        change = self._products.change(eta, curvature, bent)
+        return -self._products.pull(change, self.answer(change, projection), curvature, model)
 
 
 class FrozenForegrounds:
@@ -355,21 +355,21 @@ class FrozenForegrounds:
     """
 
     def __init__(self, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
-        self.tensors, self.dtype, self._passes = tensors, dtype, _Passes(tensors)
+        self.tensors, self.dtype, self._products = tensors, dtype, _BaselineProducts(tensors)
         self.project = tf.function(self._project, autograph=False)
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
-        loss, descent = self._passes.residual(gains, model, visibilities, weights)
-        curvature = tf.cast(self._passes.curvature(gains, weights), self.dtype)
+        loss, descent = self._products.residual(gains, model, visibilities, weights)
+        curvature = tf.cast(self._products.curvature(gains, weights), self.dtype)
         return Projection(loss, model, descent, curvature, tf.cast(model, self.dtype), ())
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the gains alone times eta, shape (2, Nants, Nfreqs)."""
         curvature, model = projection.curvature, projection.baseline_model
-        return self._passes.pull(self._passes.change(eta, curvature, model), None, curvature, model)
+        return self._products.pull(self._products.change(eta, curvature, model), None, curvature, model)
 
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return what `Projector.curvature_descent` does; foregrounds do not follow."""
         curvature, model = projection.curvature, projection.baseline_model
         bent = pairs.multiply(model, self.tensors.relative_change(eta))
-        return -self._passes.pull(self._passes.change(eta, curvature, bent), None, curvature, model)
+        return -self._products.pull(self._products.change(eta, curvature, bent), None, curvature, model)

@@ -93,7 +93,7 @@ def _read(folder: Path) -> FinishedRun | None:
 def with_finished(collection: Study, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Collection:
     """Return a collection whose members are taken from finished runs, as far as these are of the same study.
 
-    The tables of such a member are put into the store, unless it is only planned. The member itself is not run again.
+    The tables of such a member are put into the store, and the member itself is not run again.
 
     Parameters
     ----------
