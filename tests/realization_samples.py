@@ -36,6 +36,8 @@ def spectrum(power: np.ndarray, noise: float = 0.0, sample: float = 0.0) -> Sphe
         "power": power + 0j,
         "noise_error": np.full(BINS, noise),
         "sample_error": np.full(BINS, sample),
+        "sample_modes": np.full(BINS, SAMPLE**-2),
+        "cross_modes": np.full(BINS, 1 / SAMPLE),
         "wedge_excluded": True,
     }
     return SphericalSpectrum(**{item.name: known.get(item.name, np.ones(BINS)) for item in fields(SphericalSpectrum)})

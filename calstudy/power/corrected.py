@@ -17,7 +17,13 @@ restores it to that of the data. So with P = P^R / T,
     sigma^2 (P - P^S) = sigma_{R-S}^2 + (P sigma_T / T)^2,
 
 where sigma_{R-S} is the error of P^R - P^S, of noise and its product with the EoR
-(`SphericalSpectrum.difference_error`); P less the input power has the sample variance sigma_S^2 besides.
+(`SphericalSpectrum.difference_error`); P less the input power has the sample variance of the input power besides,
+
+    sigma_S^2 = P_input^2 / (independent modes of the signal).
+
+The sample error of a spectrum follows its own power instead, so that low powers have small bars: with sixty independent
+modes such bars cover the input in 94.2 % of cases instead of 95.1, with twelve in 91.1 instead of 95.4 %. The 95 %
+interval is the set of input powers that differ from P by at most 1.96 of the standard deviations that belong to them.
 
 There is no result where too little of the EoR is left, or where what is left is power from elsewhere
 (`calstudy.power.correctable`).
@@ -45,7 +51,7 @@ class Corrected:
     power
         P^R / T, (K, Nk), mK^2 h^-3 Mpc^3.
     error, error_with_sample
-        Standard deviations of its difference from P^S, and from the input power, (K, Nk).
+        Standard deviations of its difference from P^S, and from the input power, with its sample variance, (K, Nk).
     power_known_scale
         P^R s^2 / (T s^2), (K, Nk): P^R on the true flux scale, by s of the realization itself, over T s^2 of others.
     shared
@@ -108,7 +114,7 @@ def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected
     known_scale = power * factor * scale**2 / transfer_of_others(scale_free, design)[0]
     own = np.stack([sample.residual.difference_error for sample in samples])
     with_noise = np.hypot(own, power * error / factor)
-    with_sample = np.hypot(with_noise, np.stack([sample.residual.sample_error for sample in samples]))
+    with_sample = np.hypot(with_noise, np.stack([_sample_error_of_input(sample) for sample in samples]))
     return Corrected(
         transfer=mean,
         transfer_error=error,
@@ -121,6 +127,11 @@ def correct_realizations(samples: Sequence[Sample], design: Design) -> Corrected
         ),
         reasons=np.array([_reason(*column) for column in zip(known.T, error.T, np.stack(judged).T, strict=True)]),
     )
+
+
+def _sample_error_of_input(sample: Sample) -> np.ndarray:
+    modes = sample.eor.sample_modes
+    return np.divide(sample.put_in, np.sqrt(modes), out=np.full(modes.shape, np.nan), where=modes > 0)
 
 
 def _of_others(name: str, samples: Sequence[Sample], design: Design) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

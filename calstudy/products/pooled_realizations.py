@@ -222,4 +222,4 @@ def _of_other_realizations(corrected: Corrected) -> str:
     )
 
 
-POOL = Stage(name="pooled-realizations", version=3, make=make_tables, cost=lambda task: Cost(5, disk=1e6))
+POOL = Stage(name="pooled-realizations", version=4, make=make_tables, cost=lambda task: Cost(5, disk=1e6))
