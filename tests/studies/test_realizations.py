@@ -305,7 +305,7 @@ def test_a_file_with_realizations_is_a_study_of_its_own_also_in_a_collection(fol
 def test_the_shipped_file_draws_what_the_docs_say(scale):
     study = load_study(Path(__file__).parents[2] / "experiments" / "realizations.yaml", scale)
     assert isinstance(study, Collection)
-    assert len(study.parts) == 2
+    assert len(study.parts) == 3
     assert [task.label for task in study.figures] == ["realizations-comparison"]
     assert study.claims is None
     for part in study.parts.values():
