@@ -1,4 +1,4 @@
-"""Spherical power spectra of the residual with the paper's solver and at the minimum of the same likelihood."""
+"""Spherical power spectra of the residual with the paper's solver and with the default one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ROWS = {"residual": r"$|P^{R}|$", "residual_without_eor": r"$|P^{R}|$, no EoR"}
 SOLVERS = (
     Marking("the paper's solver", "D", style.BLUE, 2.5, -0.12),
-    Marking("the minimum", "s", style.ORANGE, 2.6, 0.12),
+    Marking("the default solver", "s", style.ORANGE, 2.6, 0.12),
 )
 ARRAYS = {
     "Minimally redundant": ("paper_solver", "minimally_redundant"),
@@ -44,7 +44,7 @@ def draw_solver_comparison(
     Parameters
     ----------
     arrays
-        By the title of the array its spectra with the paper's solver, and at the minimum; power in mK² h⁻³ Mpc³, k in
+        By the title of the array its spectra with the paper's solver, and with the default one; power in mK² h⁻³ Mpc³, k in
         h/Mpc.
     last_k
         Upper end of the k axis, h/Mpc.
@@ -112,13 +112,13 @@ def _add_legend(figure: Figure) -> None:
 
 
 class SolverComparison(ComparisonFigure):
-    """P^R outside the wedge with the paper's solver and at the minimum, with EoR and without, of one array or both.
+    """P^R outside the wedge with the paper's solver and the default one, with EoR and without, of one array or both.
 
     The members in the roles `paper_solver` and `redundant_paper_solver` have the paper's solver, those in the roles
     `minimally_redundant` and `redundant` the default one. An array is shown if both of its roles are played.
     """
 
-    caption = "Residual power outside the wedge with the paper's solver and at the minimum: with EoR, and without."
+    caption = "Residual power outside the wedge with the paper's solver and with the default one: with EoR, and without."
     titles: ClassVar[Mapping[str, str]] = {role: title for title, roles in ARRAYS.items() for role in roles}
     tolerances = SPHERICAL_RULES
 

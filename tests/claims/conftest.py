@@ -34,6 +34,7 @@ class World:
     recovered: float = 1.0
     recovered_small_k: float = 1.0
     biased_below: float = 0.28
+    outside_biased_below: float = 0.0
     noise: float = 0.03
     without_eor_bias: float = 0.0
     without_eor_error: float = 0.0
@@ -74,7 +75,10 @@ PAPERS_AGREEMENT = {
 def spherical(world: World, rng: np.random.Generator, kind: str, modes: str) -> SphericalSpectrum:
     noise, signal = SIGNAL * world.noise * rng.normal(size=K.size), np.full(K.size, SIGNAL)
     inside = (world.biased_below > EDGES[:-1] + 1e-9) if modes == "all-modes" else np.zeros(K.size, bool)
-    kept = np.where(inside, 0.05, np.where(K < 0.3, world.recovered_small_k, world.recovered))
+    lost = (world.outside_biased_below > EDGES[:-1] + 1e-9) if modes == "outside-wedge" else np.zeros(K.size, bool)
+    kept = np.where(lost, 0.8, 1.0) * np.where(
+        inside, 0.05, np.where(K < 0.3, world.recovered_small_k, world.recovered)
+    )
     lowest = np.exp(-K / 0.01) if modes == "all-modes" else np.where(K < 0.25, world.sidelobes / world.foregrounds, 0)
     reflection = SIGNAL * ((K > 0.54) & (K < 0.76))
     power = {
