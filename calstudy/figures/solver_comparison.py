@@ -44,8 +44,8 @@ def draw_solver_comparison(
     Parameters
     ----------
     arrays
-        By the title of the array its spectra with the paper's solver, and with the default one; power in mK² h⁻³ Mpc³, k in
-        h/Mpc.
+        By the title of the array its spectra with the paper's solver, and with the default one; power in
+        mK² h⁻³ Mpc³, k in h/Mpc.
     last_k
         Upper end of the k axis, h/Mpc.
     stand_ins
@@ -118,7 +118,7 @@ class SolverComparison(ComparisonFigure):
     `minimally_redundant` and `redundant` the default one. An array is shown if both of its roles are played.
     """
 
-    caption = "Residual power outside the wedge with the paper's solver and with the default one: with EoR, and without."
+    caption = "Residual power outside the wedge with the paper's solver and the default one: with EoR, and without."
     titles: ClassVar[Mapping[str, str]] = {role: title for title, roles in ARRAYS.items() for role in roles}
     tolerances = SPHERICAL_RULES
 
