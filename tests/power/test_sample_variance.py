@@ -17,7 +17,7 @@ from calstudy.simulate.chunks import simulate_chunk
 from calstudy.simulate.component import Component
 
 EXPERIMENT = Path(__file__).parents[2] / "experiments" / "redundant.yaml"
-SKIES = 24
+SKIES = 12
 CHEAPER = (
     "instrument.times.count=1",
     "sky.eor.nside=128",
@@ -50,7 +50,7 @@ def test_skies_scatter_by_the_sample_error_on_the_redundant_array():
         found = spectrum.power.real[bins] - put_in[bins]
         deviations.append(found / expected)
         covered.append(inside_bars(found, expected))
-    # By Monte Carlo of independent modes, the mean of the first over 24 skies scatters by 0.018, that of the second by
-    # 0.006: limits are four times that.
-    assert np.sqrt(np.mean(np.square(deviations))) == pytest.approx(1, abs=0.072)
-    assert np.mean(covered) == pytest.approx(0.951, abs=0.024)
+    # By Monte Carlo of independent modes, the mean of the first over 12 skies scatters by 0.025, that of the second by
+    # 0.008: limits are four times that.
+    assert np.sqrt(np.mean(np.square(deviations))) == pytest.approx(1, abs=0.1)
+    assert np.mean(covered) == pytest.approx(0.951, abs=0.032)
