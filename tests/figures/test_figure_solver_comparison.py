@@ -54,5 +54,5 @@ def test_the_bias_and_the_noise_are_within_the_axes(arrays):
 def test_the_legend_names_both_solvers(arrays):
     figure = draw_solver_comparison(arrays)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert texts[:2] == ["the paper's solver", "the minimum"]
+    assert texts[:2] == ["the paper's solver", "the default solver"]
     assert figure.get_figwidth() == style.TWO_COLUMNS
