@@ -50,7 +50,7 @@ def test_skies_scatter_by_the_sample_error_on_the_redundant_array():
         found = spectrum.power.real[bins] - put_in[bins]
         deviations.append(found / expected)
         covered.append(inside_bars(found, expected))
-    # By Monte Carlo of independent modes, the mean of the first over 12 skies scatters by 0.025, that of the second by
-    # 0.008: limits are four times that.
+    # By Monte Carlo of independent modes, for twelve skies the rms scatters by 0.025 and the part that is covered by
+    # 0.008. Limits are four times that.
     assert np.sqrt(np.mean(np.square(deviations))) == pytest.approx(1, abs=0.1)
     assert np.mean(covered) == pytest.approx(0.951, abs=0.032)
