@@ -130,8 +130,9 @@ def run_array(request: Mapping[str, Any]) -> dict[str, Any]:
     structure, solver = simulation.structure(), GaussNewton()
     seconds, steps, converged = [], [], True
     with use_device(request["device"]), Usage() as usage:
+        problem = simulation.problem(0, structure)
         start = clock()
-        solve(simulation.problem(0, structure), solver)
+        solve(problem, solver)
         first, warm = clock() - start, None
         for index in range(request["integrations"]):
             problem = simulation.problem(index, structure)

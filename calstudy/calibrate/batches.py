@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import tensorflow as tf
 
 # Different bases are padded to about this many sizes: more take longer to compile, fewer longer to run.
@@ -24,6 +25,8 @@ WIDEST = 4 / 3
 # Singular values kept in what bases span, relative to the largest: what is left out is an error of the Gauss-Newton
 # matrix.
 SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
+# Random products of columns from which their span is found, over the number of columns: it has about 1.2 times that.
+PRODUCT_SAMPLES = 2
 # One matrix product for each basis is faster than one for each model, if that many have it.
 ALIKE = 4
 
@@ -91,6 +94,37 @@ def make_batches(bases: Sequence[np.ndarray], sizes: Sequence[int], edges: np.nd
     return batches
 
 
+class ColumnProducts:
+    """Products of rows y with the products of each column of A with each of B, y -> sum_f y(f) A_i(f) B_j(f).
+
+    The products of smooth columns, as foreground vectors are, span little more than the columns of both together. An
+    orthonormal basis of what they span goes first, unless that is more work.
+
+    Parameters
+    ----------
+    left, right
+        A and B, (length, Nleft) and (length, Nright), float64.
+    span
+        What the products span, see `product_span`.
+    dtype
+        Of the rows.
+    """
+
+    def __init__(self, left: np.ndarray, right: np.ndarray, span: np.ndarray, dtype: np.dtype) -> None:
+        self.shape = left.shape[1], right.shape[1]
+        products = (left[:, :, None] * right[:, None, :]).reshape(len(left), -1)
+        factors = [products]
+        if span.shape[1] * (len(span) + products.shape[1]) < products.size:
+            factors = [span, span.T @ products]
+        self._factors = [tf.constant(factor, dtype) for factor in factors]
+
+    def apply(self, rows: tf.Tensor) -> tf.Tensor:
+        """Return (N, Nleft, Nright) for rows of shape (N, length)."""
+        for factor in self._factors:
+            rows = rows @ factor
+        return tf.reshape(rows, [-1, *self.shape])
+
+
 class Vectors:
     """Products with the vectors A of some rows, which are models or baselines.
 
@@ -115,6 +149,13 @@ class Vectors:
             self._rows_of_basis = np.bincount(index, minlength=len(bases)).tolist()
             self._bases = [tf.constant(basis.T) for basis in bases]
             self._overlaps = [tf.constant(overlap) for overlap in overlaps]
+            # Of the products of vectors with each other, and of vectors with D, the fewer are made.
+            many = [rows > self.n_vectors for rows in self._rows_of_basis]
+            span = product_span([(basis.T, basis.T) for basis in bases[many]], bases.dtype) if any(many) else None
+            self._products = [
+                None if span is None or not enough else ColumnProducts(basis.T, basis.T, span, bases.dtype)
+                for enough, basis in zip(many, bases, strict=True)
+            ]
         else:
             self._stack, self._stacked_overlaps = tf.constant(bases[index]), tf.constant(overlaps[index])
 
@@ -123,14 +164,14 @@ class Vectors:
         if not self._by_basis:
             return tf.matmul(curvature[:, None, :] * self._stack, self._stack, transpose_b=True)
         found = []
-        for rows, basis in zip(tf.split(curvature, self._rows_of_basis), self._bases, strict=True):
-            # Of the products of vectors with each other, and of vectors with D, the fewer are made.
-            if rows.shape[0] > self.n_vectors:
-                product = rows @ column_products(basis, basis)
-            else:
-                product = tf.reshape(rows[:, None, :] * tf.transpose(basis), [-1, self.length]) @ basis
+        split = tf.split(curvature, self._rows_of_basis)
+        for rows, basis, products in zip(split, self._bases, self._products, strict=True):
+            if products is not None:
+                found.append(products.apply(rows))
+                continue
+            product = tf.reshape(rows[:, None, :] * tf.transpose(basis), [-1, self.length]) @ basis
             found.append(tf.reshape(product, [-1, self.n_vectors, self.n_vectors]))
-        return _joined(found, 0)
+        return joined(found, 0)
 
     def reduce(self, values: tf.Tensor) -> tf.Tensor:
         """Return A^T y, (Nrows, Nvec, 2), for y of shape (2, Nrows, length)."""
@@ -140,7 +181,7 @@ class Vectors:
         for rows, basis in zip(tf.split(values, self._rows_of_basis, axis=1), self._bases, strict=True):
             product = tf.reshape(rows, [-1, self.length]) @ basis
             found.append(tf.reshape(product, [2, -1, self.n_vectors]))
-        return tf.transpose(_joined(found, 1), [1, 2, 0])
+        return tf.transpose(joined(found, 1), [1, 2, 0])
 
     def expand(self, coefficients: tf.Tensor) -> tf.Tensor:
         """Return A u, (2, Nrows, length), for coefficients u of shape (Nrows, Nvec, 2)."""
@@ -152,7 +193,7 @@ class Vectors:
         for rows, basis in zip(tf.split(columns, self._rows_of_basis, axis=1), self._bases, strict=True):
             product = tf.matmul(tf.reshape(rows, [-1, self.n_vectors]), basis, transpose_b=True)
             found.append(tf.reshape(product, [2, -1, self.length]))
-        return _joined(found, 1)
+        return joined(found, 1)
 
     def overlap(self, root: tf.Tensor) -> tf.Tensor:
         """Return R A^T Q, (Nrows, N, rank), for R of shape (Nrows, N, Nvec)."""
@@ -162,7 +203,7 @@ class Vectors:
         for rows, overlap in zip(tf.split(root, self._rows_of_basis), self._overlaps, strict=True):
             product = tf.reshape(rows, [-1, self.n_vectors]) @ overlap
             found.append(tf.reshape(product, [-1, root.shape[1], overlap.shape[1]]))
-        return _joined(found, 0)
+        return joined(found, 0)
 
 
 class Piece(NamedTuple):
@@ -207,13 +248,15 @@ class Piece(NamedTuple):
         return tf.reshape(tf.matmul(inner, self.span, transpose_b=True), [2, -1, n_frequencies])
 
 
-def make_piece(batch: Batch, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
+def make_piece(batch: Batch, span: np.ndarray, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
     """Return a batch with its vectors.
 
     Parameters
     ----------
     batch
         Which.
+    span
+        Orthonormal basis of what its vectors span, (Nfreqs, rank), float64.
     owner
         Position in the batch of the model of each baseline, ascending, (Nbls,); None if each baseline is its own model.
     with_own
@@ -222,11 +265,9 @@ def make_piece(batch: Batch, owner: np.ndarray | None, with_own: bool, dtype: tf
         Of the span and the overlaps.
     """
     kind = dtype.as_numpy_dtype
-    # A batch of short baselines spans little of what all bases do.
-    basis = span_of(batch.bases, dtype)
-    own = batch_vectors(batch, basis, owner, kind) if with_own else None
+    own = batch_vectors(batch, span, owner, kind) if with_own else None
     index = None if owner is None else tf.constant(owner, tf.int32)
-    return Piece(batch, tf.constant(basis, dtype), index, batch_vectors(batch, basis, None, kind), own)
+    return Piece(batch, tf.constant(span, dtype), index, batch_vectors(batch, span, None, kind), own)
 
 
 def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
@@ -244,6 +285,32 @@ def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
     triangle = np.asarray(np.linalg.qr(vectors.T, mode="r"))
     left, singular, _ = np.linalg.svd(triangle.T, full_matrices=False)
     return left[:, singular > SPAN_CUTOFF[dtype] * singular[0]]
+
+
+def product_span(pairs: Sequence[tuple[np.ndarray, np.ndarray]], dtype: tf.DType | np.dtype) -> np.ndarray:
+    """Return an orthonormal basis of what the products of columns span, (length, rank), float64.
+
+    It is found from products of random combinations of the columns (Halko, Martinsson & Tropp 2011, SIAM Rev. 53, 217).
+    If these are not more than they span, the basis is the identity.
+
+    Parameters
+    ----------
+    pairs
+        Each column of the first is multiplied with each of the second, (length, Nleft) and (length, Nright).
+    dtype
+        Precision that it is for.
+    """
+    rng = np.random.default_rng(1)
+    samples = []
+    for left, right in pairs:
+        count = PRODUCT_SAMPLES * (left.shape[1] + right.shape[1])
+        first, second = (side @ rng.standard_normal((side.shape[1], count)) for side in (left, right))
+        samples.append(first * second)
+    found = np.concatenate(samples, axis=1)
+    basis, triangle, _ = scipy.linalg.qr(found, mode="economic", pivoting=True)
+    diagonal = np.abs(np.diag(triangle))
+    kept = diagonal > SPAN_CUTOFF[tf.as_dtype(dtype)] * diagonal[0]
+    return np.eye(len(found)) if kept.all() else basis[:, kept]
 
 
 def batch_vectors(batch: Batch, span: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
@@ -288,5 +355,6 @@ def column_products(left: tf.Tensor, right: tf.Tensor) -> tf.Tensor:
     return tf.reshape(left[:, :, None] * right[:, None, :], [left.shape[0], -1])
 
 
-def _joined(parts: list[tf.Tensor], axis: int) -> tf.Tensor:
+def joined(parts: list[tf.Tensor], axis: int) -> tf.Tensor:
+    """Return tensors one after the other."""
     return parts[0] if len(parts) == 1 else tf.concat(parts, axis)

@@ -112,11 +112,11 @@ def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
     # Model, curvature and model on the baselines; roots.
     projection = 2 * DOUBLE * d.models * d.channels + 3 * SINGLE * d.samples + SINGLE * d.coefficients * d.rank
     at_once = min(settings.models_at_once, d.models)
-    pieces = 2 * DOUBLE * at_once * d.widest * d.channels
-    # S times the model of each baseline of a stretch, in the common basis; products of all pairs of its vectors; the
-    # blocks of all antennas, and their inversion in double precision.
-    seen = at_once * d.baselines / d.models
-    by_antenna += (12 * SINGLE * seen + SINGLE * d.channels + 10 * DOUBLE * d.antennas) * d.rank**2
+    # Of one batch: normal matrices, or S times the model of each baseline in the common basis and its squares.
+    squares = 12 * SINGLE * at_once * d.baselines / d.models * d.rank**2
+    pieces = max(2 * DOUBLE * at_once * d.widest * d.channels, squares)
+    # Products of all pairs of vectors; the blocks of all antennas, and their inversion in double precision.
+    by_antenna += (SINGLE * d.channels + 10 * DOUBLE * d.antennas) * d.rank**2
     while_projecting = 2 * projection + 7 * SINGLE * d.samples
     while_preparing = projection + 2 * SINGLE * d.samples + max(by_antenna, by_channel)
     result = projection + 8 * DOUBLE * d.samples

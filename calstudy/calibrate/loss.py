@@ -13,7 +13,7 @@ import tensorflow as tf
 
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import Prior
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.tensors import Ends, FitTensors
 
 # Real and imaginary parts stay apart here: stacking them would cost the compiled step a copy each time.
 RealImaginary = tuple[tf.Tensor, tf.Tensor]
@@ -86,7 +86,7 @@ def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tenso
 
 
 def likelihood(
-    antennas: tuple[tf.Tensor, tf.Tensor],
+    ends: Ends,
     gains: tf.Tensor,
     model: RealImaginary,
     visibilities: tf.Tensor,
@@ -96,8 +96,8 @@ def likelihood(
 
     Parameters
     ----------
-    antennas
-        a and b of each baseline, each of shape (Nbls,), int32.
+    ends
+        Of the baselines.
     gains
         Shape (2, Nants, Nfreqs).
     model
@@ -105,7 +105,7 @@ def likelihood(
     visibilities, weights
         Shapes (2, Nbls, Nfreqs) and (Nbls, Nfreqs).
     """
-    first, second = antennas
+    first, second = ends
     real, imaginary = tf.unstack(gains)
     a_real, a_imaginary = tf.gather(real, first), tf.gather(imaginary, first)
     b_real, b_imaginary = tf.gather(real, second), tf.gather(imaginary, second)
@@ -213,8 +213,8 @@ class JointLoss:
             if self._tensors.model_index is not None:
                 owner = self._tensors.model_index[first:last] - part.models[0]
                 model = tuple(tf.gather(values, owner) for values in model)
-        antennas = self._tensors.first[first:last], self._tensors.second[first:last]
-        return likelihood(antennas, gains, model, data.visibilities[:, first:last], data.weights[first:last])
+        ends = self._tensors.ends.slice(first, last)
+        return likelihood(ends, gains, model, data.visibilities[:, first:last], data.weights[first:last])
 
     def value(self, parameters: Parameters, data: FitData) -> tf.Tensor:
         """Return the likelihood, plus the sum prior where the problem has it."""

@@ -21,13 +21,16 @@ other: N = sum_m A_m^T D_m A_m.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.batches import Piece, make_piece, span_of
+from calstudy.calibrate.batches import ColumnProducts, Piece, joined, make_piece, product_span, span_of
+from calstudy.calibrate.elementwise import BaselineProducts, Ends
 from calstudy.calibrate.problem import FitStructure
 from calstudy.calibrate.tensors import FitTensors
 
@@ -39,10 +42,6 @@ KERNEL_RIDGE = {tf.float32: 1e-3, tf.float64: 1e-9}
 # A finite prior leaves nothing undetermined. Foregrounds that it holds where the data hardly do would converge slowly
 # with more.
 FINITE_KERNEL_RIDGE = {tf.float32: 1e-6, tf.float64: 1e-12}
-
-# From this many visibilities on, the elementwise products of a fit are compiled (XLA): one pass over the memory in
-# place of a dozen, for a second of compilation.
-LEAST_FUSED = 1_000_000
 
 
 class Roots(NamedTuple):
@@ -61,6 +60,24 @@ class Roots(NamedTuple):
     shared: tf.Tensor | None
 
 
+class Linearization(NamedTuple):
+    """What the Gauss-Newton matrix has of some consecutive baselines, in the precision of the inner products.
+
+    Attributes
+    ----------
+    curvature
+        D, (Nbls, Nfreqs).
+    model
+        F, (2, Nbls, Nfreqs).
+    roots
+        Of each of their batches.
+    """
+
+    curvature: tf.Tensor
+    model: tf.Tensor
+    roots: tuple[Roots, ...]
+
+
 class Projection(NamedTuple):
     """The reduced problem at given gains.
 
@@ -69,72 +86,43 @@ class Projection(NamedTuple):
     loss
         sum w |V - G F|^2 at the best foregrounds, plus the squares of coefficients that have a prior; scalar, float64.
     model
-        F on the baselines, shape (2, Nbls, Nfreqs), float64.
+        F on the baselines, float64, of one stretch of them after the other, each (2, Nbls, Nfreqs).
     descent
         Minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64.
-    curvature
-        D of each baseline, shape (Nbls, Nfreqs).
-    baseline_model
-        `model` in the precision of the inner products, like `curvature` and `roots`.
-    roots
-        Of each batch.
+    parts
+        Of the stretches.
     """
 
     loss: tf.Tensor
-    model: tf.Tensor
+    model: tuple[tf.Tensor, ...]
     descent: tf.Tensor
-    curvature: tf.Tensor
-    baseline_model: tf.Tensor
-    roots: tuple[Roots, ...]
+    parts: tuple[Linearization, ...]
+
+    def power(self) -> tf.Tensor:
+        """Return D |F|^2 of all baselines, (Nbls, Nfreqs)."""
+        return joined([part.curvature * pairs.squared_modulus(part.model) for part in self.parts], 0)
 
 
-class _BaselineProducts:
-    """Elementwise products of gains, models and data on all baselines, in the notation of the module.
+class Stretch(NamedTuple):
+    """Consecutive batches whose baselines have their elementwise products made at once.
 
-    Parameters
+    Attributes
     ----------
-    tensors
-        Index tensors of the fit. From `LEAST_FUSED` visibilities on the products are compiled.
+    baselines
+        First and one past the last, in the solvers' order.
+    ends
+        Their antennas.
+    pieces
+        The batches.
     """
 
-    def __init__(self, tensors: FitTensors) -> None:
-        self._tensors = tensors
-        fused = tensors.n_baselines * tensors.n_frequencies >= LEAST_FUSED
-        self.curvature, self.match, self.residual, self.change, self.pull = (
-            tf.function(function, jit_compile=fused, autograph=False)
-            for function in (self._curvature, self._match, self._residual, self._change, self._pull)
-        )
+    baselines: tuple[int, int]
+    ends: Ends
+    pieces: tuple[Piece, ...]
 
-    def _curvature(self, gains: tf.Tensor, weights: tf.Tensor) -> tf.Tensor:
-        """Return D, (Nbls, Nfreqs), for gains (2, Nants, Nfreqs); see the module."""
-        return weights * pairs.squared_modulus(self._tensors.gain_products(gains))
-
-    def _match(
-        self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, mean: tf.Tensor | None
-    ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return D, (Nbls, Nfreqs), and G* w V, less D m if there is a mean m, (2, Nbls, Nfreqs)."""
-        products = self._tensors.gain_products(gains)
-        curvature = weights * pairs.squared_modulus(products)
-        matched = pairs.conjugate_multiply(products, weights * visibilities)
-        return curvature, matched if mean is None else matched - curvature * mean
-
-    def _residual(
-        self, gains: tf.Tensor, model: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor
-    ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return sum w |V - G F|^2, and minus half its gradient in eta with F fixed, (2, Nants, Nfreqs)."""
-        products = self._tensors.gain_products(gains)
-        residual = visibilities - pairs.multiply(products, model)
-        pull = pairs.conjugate_multiply(model, weights * pairs.conjugate_multiply(products, residual))
-        return tf.reduce_sum(weights * pairs.squared_modulus(residual)), self._tensors.sum_over_antenna(pull)
-
-    def _change(self, eta: tf.Tensor, curvature: tf.Tensor, model: tf.Tensor) -> tf.Tensor:
-        """Return D F (eta_a + eta_b*), (2, Nbls, Nfreqs)."""
-        return curvature * pairs.multiply(model, self._tensors.relative_change(eta))
-
-    def _pull(self, change: tf.Tensor, answer: tf.Tensor | None, curvature: tf.Tensor, model: tf.Tensor) -> tf.Tensor:
-        """Return F* (y - D x) of a weighted change y that foregrounds answer by x, by antenna; (2, Nants, Nfreqs)."""
-        left = change if answer is None else change - curvature * answer
-        return self._tensors.sum_over_antenna(pairs.conjugate_multiply(model, left))
+    def slices(self) -> list[slice]:
+        """Return the baselines of each batch, counted from the first of the stretch."""
+        return [slice(*(edge - self.baselines[0] for edge in piece.batch.baselines)) for piece in self.pieces]
 
 
 class Projector:
@@ -152,24 +140,43 @@ class Projector:
 
     Attributes
     ----------
-    pieces
-        The batches, with their vectors.
+    stretches
+        The batches with their vectors. Of large fits each is worked on by itself, so that what it needs for a while
+        stays in the cache; others have their elementwise products made for all baselines at once, in fewer operations.
     common
         Orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`.
     """
 
     def __init__(self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
-        self.tensors, self.dtype, self._products = tensors, dtype, _BaselineProducts(tensors)
+        self.tensors, self.dtype, self._products = tensors, dtype, BaselineProducts(tensors)
         self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
         self._level = 0 if structure.prior == "own" else 1
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
-        self.common = tf.constant(span_of(distinct, dtype), dtype)
+        # A batch of short baselines spans little of what all bases do.
+        self._common, self._spans = span_of(distinct, dtype), [span_of(batch.bases, dtype) for batch in tensors.batches]
+        self.common = tf.constant(self._common, dtype)
         needed = tensors.shared or self._two_levels
-        self.pieces = [
-            make_piece(batch, tensors.owner(batch) if needed else None, self._two_levels, dtype)
-            for batch in tensors.batches
+        pieces = [
+            make_piece(batch, span, tensors.owner(batch) if needed else None, self._two_levels, dtype)
+            for batch, span in zip(tensors.batches, self._spans, strict=True)
         ]
+        together = [(piece,) for piece in pieces] if self._products.fused else [tuple(pieces)]
+        edges = [(group[0].batch.baselines[0], group[-1].batch.baselines[1]) for group in together]
+        self.stretches = [Stretch(e, tensors.ends.slice(*e), group) for e, group in zip(edges, together, strict=True)]
         self.project = tf.function(self._project, autograph=False)
+
+    @cached_property
+    def _block_products(self) -> list[ColumnProducts]:
+        kind, pairs_of_spans = self.dtype.as_numpy_dtype, [(span, self._common) for span in self._spans]
+        with tf.init_scope():
+            return [ColumnProducts(*pair, product_span([pair], self.dtype), kind) for pair in pairs_of_spans]
+
+    def of_pieces(self, projection: Projection) -> Iterator[tuple[Piece, ColumnProducts, Linearization]]:
+        """Return the batches, the products of their spans with the common basis, and their parts of a projection."""
+        products = iter(self._block_products)
+        for stretch, part in zip(self.stretches, projection.parts, strict=True):
+            for piece, rows, roots in zip(stretch.pieces, stretch.slices(), part.roots, strict=True):
+                yield piece, next(products), Linearization(part.curvature[rows], part.model[:, rows], (roots,))
 
     def _factor(self, normal: tf.Tensor, filled: np.ndarray) -> tuple[tf.Tensor, tf.Tensor]:
         """Return the Cholesky factors of N, and a root R of the kernel, N^-1 ~ R^T R; all (N, Nvec, Nvec).
@@ -215,29 +222,47 @@ class Projector:
         deviations
             t of the baselines' own coefficients and s of the shared ones, (2,), if the prior is finite.
         """
+        found: list[Projection] = []
+        for stretch in self.stretches:
+            start, end = stretch.baselines
+            data = visibilities[:, start:end], weights[start:end], None if mean is None else mean[:, start:end]
+            # Without this, all stretches would be worked on at once, and their temporaries add up.
+            with tf.control_dependencies([*found[-1].model, found[-1].descent] if found else []):
+                part = self._project_stretch(stretch, gains, data, deviations)
+            # The gradient is added up on the way, for the same reason.
+            found.append(part._replace(descent=part.descent + found[-1].descent) if found else part)
+        return Projection(
+            tf.add_n([part.loss for part in found]),
+            tuple(part.model[0] for part in found),
+            found[-1].descent,
+            tuple(part.parts[0] for part in found),
+        )
+
+    def _project_stretch(
+        self,
+        stretch: Stretch,
+        gains: tf.Tensor,
+        data: tuple[tf.Tensor, tf.Tensor, tf.Tensor | None],
+        deviations: tf.Tensor | None,
+    ) -> Projection:
+        """Return what a stretch has of the projection, for its visibilities, weights and mean."""
         eliminate = self._eliminate_both if self._two_levels else self._eliminate_one
-        curvature, matched = self._products.match(gains, visibilities, weights, mean)
+        visibilities, weights, mean = data
+        curvature, matched = self._products.match(gains, stretch.ends, visibilities, weights, mean)
         models: list[tf.Tensor] = []
         penalties: list[tf.Tensor] = []
         roots: list[Roots] = []
-        for piece in self.pieces:
-            first, last = piece.batch.baselines
-            # Without this, all batches would be worked on at once, and their temporaries add up.
+        for piece, rows in zip(stretch.pieces, stretch.slices(), strict=True):
+            # As for stretches.
             with tf.control_dependencies([models[-1], roots[-1].first] if models else []):
-                model, penalty, root = eliminate(piece, curvature[first:last], matched[:, first:last], deviations)
+                model, penalty, root = eliminate(piece, curvature[rows], matched[:, rows], deviations)
             models.append(model)
             penalties.append(penalty)
             roots.append(root)
-        model = tf.concat(models, axis=1) if mean is None else tf.concat(models, axis=1) + mean
-        loss, descent = self._products.residual(gains, model, visibilities, weights)
-        return Projection(
-            loss + tf.add_n(penalties),
-            model,
-            descent,
-            tf.cast(curvature, self.dtype),
-            tf.cast(model, self.dtype),
-            tuple(roots),
-        )
+        model = joined(models, 1) if mean is None else joined(models, 1) + mean
+        loss, descent = self._products.residual(gains, stretch.ends, visibilities, weights, model)
+        part = Linearization(tf.cast(curvature, self.dtype), tf.cast(model, self.dtype), tuple(roots))
+        return Projection(loss + tf.add_n(penalties), (model,), descent, (part,))
 
     def _eliminate_one(
         self, piece: Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
@@ -295,31 +320,23 @@ class Projector:
         )
         return vectors.expand(mine + own * d), penalty, roots
 
-    def answer(self, change: tf.Tensor, projection: Projection) -> tf.Tensor:
-        """Return how the foregrounds of the baselines answer a weighted change y of the visibilities.
+    def _answer(self, stretch: Stretch, change: tf.Tensor, part: Linearization) -> tf.Tensor:
+        """Return how the foregrounds of a stretch answer a weighted change y of its visibilities, (2, Nbls, Nfreqs).
 
         The product S^T S itself would not do in float32: where flags leave a foreground nearly undetermined it is
         large, and its rounding would be large for the others.
-
-        Parameters
-        ----------
-        change
-            (2, Nbls, Nfreqs).
-        projection
-            Whose curvature and roots count.
         """
         answers = []
-        for piece, roots in zip(self.pieces, projection.roots, strict=True):
-            first, last = piece.batch.baselines
-            part = change[:, first:last]
+        for piece, rows, roots in zip(stretch.pieces, stretch.slices(), part.roots, strict=True):
+            own = change[:, rows]
             if roots.shared is None:
-                answers.append(piece.to_baselines(piece.absorb(piece.to_models(part), roots.first)))
+                answers.append(piece.to_baselines(piece.absorb(piece.to_models(own), roots.first)))
                 continue
-            curvature = projection.curvature[first:last]
-            left = part - curvature * piece.absorb(part, roots.first)
+            curvature = part.curvature[rows]
+            left = own - curvature * piece.absorb(own, roots.first)
             common = piece.to_baselines(piece.absorb(piece.to_models(left), roots.shared))
-            answers.append(common + piece.absorb(part - curvature * common, roots.first))
-        return answers[0] if len(answers) == 1 else tf.concat(answers, axis=1)
+            answers.append(common + piece.absorb(own - curvature * common, roots.first))
+        return joined(answers, 1)
 
     def baseline_roots(self, piece: Piece, roots: Roots) -> tf.Tensor:
         """Return S of each baseline of a batch by itself, (Nbls, Nvec, rank)."""
@@ -331,9 +348,12 @@ class Projector:
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs)."""
-        curvature, model = projection.curvature, projection.baseline_model
-        change = self._products.change(eta, curvature, model)
-        return self._products.pull(change, self.answer(change, projection), curvature, model)
+        return self._over_stretches(self._hessian_part, eta, projection)
+
+    def _hessian_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+        change = self._products.change(eta, stretch.ends, part.curvature, part.model)
+        answer = self._answer(stretch, change, part)
+        return self._products.pull(change, answer, stretch.ends, part.curvature, part.model)
 
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return minus the product of the Jacobian with the second derivative of the residual along eta.
@@ -341,35 +361,25 @@ class Projector:
         Along g exp(t eta), with foregrounds that follow as F + t dF, the second derivative of G F in t is
         G ((eta_a + eta_b*)^2 F + 2 (eta_a + eta_b*) dF). Shape (2, Nants, Nfreqs).
         """
-        curvature, model = projection.curvature, projection.baseline_model
-        first = self._products.change(eta, curvature, model)
-        bent = pairs.multiply(model, self.tensors.relative_change(eta)) - 2 * self.answer(first, projection)
-        change = self._products.change(eta, curvature, bent)
-        return -self._products.pull(change, self.answer(change, projection), curvature, model)
+        return -self._over_stretches(self._second_derivative_part, eta, projection)
 
+    def _second_derivative_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+        ends, curvature, model = stretch.ends, part.curvature, part.model
+        first = self._products.change(eta, ends, curvature, model)
+        second = pairs.multiply(model, ends.relative_change(eta)) - 2 * self._answer(stretch, first, part)
+        change = self._products.change(eta, ends, curvature, second)
+        return self._products.pull(change, self._answer(stretch, change, part), ends, curvature, model)
 
-class FrozenForegrounds:
-    """Takes the place of `Projector` for a sky-based fit, whose foregrounds are known: there is nothing to eliminate.
-
-    Without foregrounds to respond, the Gauss-Newton matrix does not couple channels.
-    """
-
-    def __init__(self, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
-        self.tensors, self.dtype, self._products = tensors, dtype, _BaselineProducts(tensors)
-        self.project = tf.function(self._project, autograph=False)
-
-    def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
-        loss, descent = self._products.residual(gains, model, visibilities, weights)
-        curvature = tf.cast(self._products.curvature(gains, weights), self.dtype)
-        return Projection(loss, model, descent, curvature, tf.cast(model, self.dtype), ())
-
-    def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
-        """Return the Gauss-Newton matrix of the gains alone times eta, shape (2, Nants, Nfreqs)."""
-        curvature, model = projection.curvature, projection.baseline_model
-        return self._products.pull(self._products.change(eta, curvature, model), None, curvature, model)
-
-    def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
-        """Return what `Projector.curvature_descent` does; foregrounds do not follow."""
-        curvature, model = projection.curvature, projection.baseline_model
-        bent = pairs.multiply(model, self.tensors.relative_change(eta))
-        return -self._products.pull(self._products.change(eta, curvature, bent), None, curvature, model)
+    def _over_stretches(
+        self,
+        function: Callable[[tf.Tensor, Stretch, Linearization], tf.Tensor],
+        eta: tf.Tensor,
+        projection: Projection,
+    ) -> tf.Tensor:
+        """Return the sum over the stretches, which are worked on one after the other."""
+        sums: list[tf.Tensor] = []
+        for stretch, part in zip(self.stretches, projection.parts, strict=True):
+            with tf.control_dependencies(sums[-1:]):
+                found = function(eta, stretch, part)
+                sums.append(sums[-1] + found if sums else found)
+        return sums[-1]

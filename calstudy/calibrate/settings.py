@@ -12,7 +12,7 @@ from calstudy.base.schema import UNKEYED, Section, choice, fault
 from calstudy.base.units import Delay, FluxDensity, Length
 from calstudy.calibrate.interface import Calibrator
 
-MODELS_AT_ONCE = 512
+MODELS_AT_ONCE = 1024
 NOISE_UNKNOWN = (
     "calibration.foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; "
     "give the standard deviation of a sample, such as '1 Jy', or use `weights: autos`"

@@ -7,6 +7,7 @@ nothing after that needs to know.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -36,13 +37,48 @@ class SortedData(NamedTuple):
     scale: float
 
 
+class Ends(NamedTuple):
+    """Antennas a and b of some baselines, each (Nbls,), int32."""
+
+    first: tf.Tensor
+    second: tf.Tensor
+
+    def slice(self, start: int, end: int) -> Ends:
+        """Return those of a range of baselines."""
+        return Ends(self.first[start:end], self.second[start:end])
+
+    def gain_products(self, gains: tf.Tensor) -> tf.Tensor:
+        """Return g_a g_b* of the baselines, (2, Nbls, Nfreqs), for gains (2, Nants, Nfreqs)."""
+        first, second = (tf.gather(gains, index, axis=1) for index in self)
+        return pairs.conjugate_multiply(second, first)
+
+    def relative_change(self, eta: tf.Tensor) -> tf.Tensor:
+        """Return eta_a + eta_b*: the first-order relative change of g_a g_b* when g becomes g (1 + eta)."""
+        (a_real, a_imaginary), (b_real, b_imaginary) = (tf.unstack(tf.gather(eta, index, axis=1)) for index in self)
+        return tf.stack([a_real + b_real, a_imaginary - b_imaginary])
+
+    def sum_over_antenna(self, values: tf.Tensor, n_antennas: int) -> tf.Tensor:
+        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`.
+
+        (2, Nbls, Nfreqs) to (2, Nants, Nfreqs).
+        """
+
+        def scatter(part: tf.Tensor, index: tf.Tensor) -> tf.Tensor:
+            return tf.math.unsorted_segment_sum(part, index, n_antennas)
+
+        real, imaginary = tf.unstack(values)
+        of_real = scatter(real, self.first) + scatter(real, self.second)
+        of_imaginary = scatter(imaginary, self.first) - scatter(imaginary, self.second)
+        return tf.stack([of_real, of_imaginary])
+
+
 class FitTensors:
     """Index tensors of one `FitStructure`.
 
     Attributes
     ----------
-    first, second
-        Antennas of each baseline, shape (Nbls,), int32.
+    ends
+        Antennas of each baseline.
     shared
         Whether any baselines share a model.
     model_index
@@ -74,8 +110,7 @@ class FitTensors:
         self.n_baselines = structure.n_baselines
         self.n_frequencies = structure.n_frequencies
         self.n_models = structure.basis.n_models
-        self.first = tf.constant(pairs_sorted[:, 0], tf.int32)
-        self.second = tf.constant(pairs_sorted[:, 1], tf.int32)
+        self.ends = Ends(*(tf.constant(index, tf.int32) for index in pairs_sorted.T))
         self.shared = self.n_models < self.n_baselines
         self.model_index = tf.constant(position[self._order], tf.int32) if self.shared else None
         edges = np.cumsum([0, *(bucket.members.size for bucket in buckets)]).tolist()
@@ -110,9 +145,12 @@ class FitTensors:
         values = model[self._order] / scale
         return pairs.to_pair(np.where(self._conjugated[:, None], values.conj(), values), dtype)
 
-    def unload(self, model: tf.Tensor, scale: float) -> np.ndarray:
-        """Return a model (2, Nbls, Nfreqs) in the problem's order and orientation, (Nbls, Nfreqs), times `scale`."""
-        sorted_model = scale * pairs.to_complex(model)
+    def unload(self, model: Sequence[tf.Tensor], scale: float) -> np.ndarray:
+        """Return a model in the problem's order and orientation, (Nbls, Nfreqs), times `scale`.
+
+        It is given in parts that follow each other, each (2, N, Nfreqs).
+        """
+        sorted_model = scale * np.concatenate([pairs.to_complex(part) for part in model])
         result = np.empty_like(sorted_model)
         result[self._order] = np.where(self._conjugated[:, None], sorted_model.conj(), sorted_model)
         return result
@@ -143,34 +181,3 @@ class FitTensors:
         if self.model_index is None:
             return values
         return tf.stack([self.sum_over_group(part) for part in tf.unstack(values)])
-
-    def gain_products(self, gains: tf.Tensor) -> tf.Tensor:
-        """Return g_a g_b* of all baselines, (2, Nbls, Nfreqs), for gains (2, Nants, Nfreqs)."""
-        first, second = (tf.gather(gains, index, axis=1) for index in (self.first, self.second))
-        return pairs.conjugate_multiply(second, first)
-
-    def relative_change(self, eta: tf.Tensor) -> tf.Tensor:
-        """Return eta_a + eta_b*: the first-order relative change of g_a g_b* when g becomes g (1 + eta)."""
-        (a_real, a_imaginary), (b_real, b_imaginary) = (
-            tf.unstack(tf.gather(eta, index, axis=1)) for index in (self.first, self.second)
-        )
-        return tf.stack([a_real + b_real, a_imaginary - b_imaginary])
-
-    def sum_over_antenna(self, values: tf.Tensor, baselines: tuple[int, int] | None = None) -> tf.Tensor:
-        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`; (2, Nants, ...).
-
-        Parameters
-        ----------
-        values
-            Of all baselines, or of the range `baselines`, (2, Nbls, ...).
-        """
-        start, end = baselines or (0, self.n_baselines)
-        first, second = self.first[start:end], self.second[start:end]
-
-        def scatter(part: tf.Tensor, index: tf.Tensor) -> tf.Tensor:
-            return tf.math.unsorted_segment_sum(part, index, self.n_antennas)
-
-        real, imaginary = tf.unstack(values)
-        of_real = scatter(real, first) + scatter(real, second)
-        of_imaginary = scatter(imaginary, first) - scatter(imaginary, second)
-        return tf.stack([of_real, of_imaginary])

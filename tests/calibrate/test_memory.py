@@ -105,7 +105,7 @@ def test_what_cannot_fit_is_refused_before_it_starts():
 
 def test_the_bench_measures_one_solve():
     found = measure_solve(5, 64, 16e9, 2)
-    assert (found.antennas, found.baselines, found.models_at_once) == (5, 10, 512)
+    assert (found.antennas, found.baselines, found.models_at_once) == (5, 10, 1024)
     assert (found.n_steps, found.status) == (2, "max-steps")
     assert 0.5e9 < found.measured < 1.5 * found.planned
 

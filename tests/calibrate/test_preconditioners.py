@@ -124,18 +124,20 @@ def test_models_in_common_count_as_models_of_their_own(hexagon):
     structure = redundant_structure(hexagon)
     projector, projection, gains = at_random_gains(hexagon.problem(structure))
     found = antenna_blocks(projector, projection)
-    model, curvature = pairs.to_complex(projection.baseline_model), projection.curvature.numpy()
+    (part,) = projection.parts
+    model, curvature = pairs.to_complex(part.model), part.curvature.numpy()
     tensors, common = projector.tensors, projector.common.numpy()
     expected = np.zeros((gains.shape[0], common.shape[1], common.shape[1]), complex)
-    pieces = zip(projector.pieces, projection.roots, strict=True)
     roots = [
-        root @ piece.span.numpy().T for piece, part in pieces for root in projector.baseline_roots(piece, part).numpy()
+        root @ piece.span.numpy().T
+        for piece, _, part in projector.of_pieces(projection)
+        for root in projector.baseline_roots(piece, *part.roots).numpy()
     ]
-    for p, (a, b) in enumerate(zip(tensors.first.numpy(), tensors.second.numpy(), strict=True)):
+    for p, (a, b) in enumerate(np.transpose(tensors.ends)):
         mixed = (curvature[p] * model[p])[:, None] * common
-        part = (roots[p] @ mixed).conj().T @ (roots[p] @ mixed)
-        expected[a] += part
-        expected[b] += part.conj()
+        block = (roots[p] @ mixed).conj().T @ (roots[p] @ mixed)
+        expected[a] += block
+        expected[b] += block.conj()
     absorbed = pairs.to_complex(found.absorbed)
     assert np.abs(absorbed - expected).max() < 1e-5 * np.abs(expected).max()
 
@@ -145,13 +147,13 @@ def test_channel_inverse_solves_for_gains_under_fixed_foregrounds(toy):
     eta = complex_normal(np.random.default_rng(6), gains.shape)
     inverse = channel_inverse(projector.tensors, projection, tf.constant(DAMPING))
     solved = pairs.to_complex(inverse.apply(pairs.to_pair(eta, tf.float32)))
-    power = projection.curvature.numpy() * np.abs(pairs.to_complex(projection.baseline_model)) ** 2
+    power, ends = projection.power().numpy(), np.array(projector.tensors.ends)
     change = power * gain_changes(projector.tensors, solved)
     image = np.zeros(gains.shape, complex)
-    np.add.at(image, projector.tensors.first.numpy(), change)
-    np.add.at(image, projector.tensors.second.numpy(), change.conj())
+    np.add.at(image, ends[0], change)
+    np.add.at(image, ends[1], change.conj())
     degrees = np.zeros(gains.shape)
-    for index in (projector.tensors.first.numpy(), projector.tensors.second.numpy()):
+    for index in ends:
         np.add.at(degrees, index, power)
     image += DAMPING * degrees * solved
     # The common phase of each channel is lifted: it is compared without.
@@ -160,4 +162,4 @@ def test_channel_inverse_solves_for_gains_under_fixed_foregrounds(toy):
 
 
 def gain_changes(tensors, eta):
-    return eta[tensors.first.numpy()] + eta[tensors.second.numpy()].conj()
+    return eta[tensors.ends.first.numpy()] + eta[tensors.ends.second.numpy()].conj()

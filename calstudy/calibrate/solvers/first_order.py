@@ -145,7 +145,7 @@ class JointKernels:
             model = self.tensors.load_model(frozen, exact.scale, self.dtype)
         else:
             best = self.projector.project(start, exact.visibilities, exact.weights).model
-            coefficients = self.loss.coefficients(self.tensors.of_models(best))
+            coefficients = self.loss.coefficients(self.tensors.of_models(tf.concat(best, axis=1)))
         target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
         visibilities, weights = (tf.cast(part, self.dtype) for part in (exact.visibilities, exact.weights))
         summed = () if problem.frozen else self.loss.summed(exact.weights)
@@ -167,7 +167,7 @@ class JointKernels:
         model = data.model
         if model is None:
             model = self.loss.model(parameters.coefficients)
-        return Estimate(pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload(model, scale))
+        return Estimate(pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload([model], scale))
 
     def _descend(
         self, n_steps: tf.Tensor, done: tf.Tensor, descent: Descent, data: FitData

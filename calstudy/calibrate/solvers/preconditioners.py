@@ -23,7 +23,6 @@ from typing import NamedTuple, Protocol
 
 import tensorflow as tf
 
-from calstudy.calibrate import pairs
 from calstudy.calibrate.batches import column_products
 from calstudy.calibrate.projection import Projection, Projector
 from calstudy.calibrate.tensors import FitTensors
@@ -41,9 +40,9 @@ class Inverse(Protocol):
 
 def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
     """Return sum_b D |F|^2 of each antenna and channel, floored, shape (Nants, Nfreqs)."""
-    power = projection.curvature * pairs.squared_modulus(projection.baseline_model)
-    degree = tf.math.unsorted_segment_sum(power, tensors.first, tensors.n_antennas)
-    degree += tf.math.unsorted_segment_sum(power, tensors.second, tensors.n_antennas)
+    power, ends = projection.power(), tensors.ends
+    degree = tf.math.unsorted_segment_sum(power, ends.first, tensors.n_antennas)
+    degree += tf.math.unsorted_segment_sum(power, ends.second, tensors.n_antennas)
     return tf.maximum(degree, DEGREE_FLOOR * tf.reduce_mean(degree))
 
 
@@ -76,10 +75,8 @@ def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Ten
     damping
         Relative to the diagonal, scalar, in the precision of the projection.
     """
-    power = tf.transpose(projection.curvature * pairs.squared_modulus(projection.baseline_model))
-    index = tf.stack([tensors.first, tensors.second], axis=1)
     shape = [tensors.n_antennas, tensors.n_antennas, tensors.n_frequencies]
-    coupling = tf.transpose(tf.scatter_nd(index, tf.transpose(power), shape), [2, 0, 1])
+    coupling = tf.transpose(tf.scatter_nd(tf.stack(tensors.ends, axis=1), projection.power(), shape), [2, 0, 1])
     coupling += tf.transpose(coupling, [0, 2, 1])
     degree = tf.reduce_sum(coupling, -1)
     degree = tf.maximum(degree, DEGREE_FLOOR * tf.reduce_mean(degree))
@@ -121,24 +118,23 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     n_frequencies, rank = common.shape
     degrees = antenna_degrees(tensors, projection)
     gram = tf.reshape(degrees @ column_products(common, common), [-1, rank, rank])
-    weighted = projection.curvature * projection.baseline_model
-    absorbed: list[tf.Tensor] = []
-    for piece, batch_roots in zip(projector.pieces, projection.roots, strict=True):
+    firsts = seconds = tf.zeros([tensors.n_antennas, rank, rank], projector.dtype)
+    for piece, products, part in projector.of_pieces(projection):
         # Temporaries of several batches would add up.
-        with tf.control_dependencies(absorbed[-1:]):
-            start, end = piece.batch.baselines
-            products = column_products(piece.span, common)
-            mixed = tf.reshape(weighted[:, start:end], [-1, n_frequencies]) @ products
-            real, imaginary = tf.unstack(tf.reshape(mixed, [2, -1, piece.span.shape[1], rank]))
-            roots = projector.baseline_roots(piece, batch_roots)
-            real, imaginary = roots @ real, roots @ imaginary
-            square = tf.matmul(real, real, transpose_a=True) + tf.matmul(imaginary, imaginary, transpose_a=True)
-            crossed = tf.matmul(real, imaginary, transpose_a=True)
-            # Added up on the way: the sums of all batches at once would be large.
-            before = absorbed[-1] if absorbed else 0.0
-            absorbed.append(before + tensors.sum_over_antenna(tf.stack([square, crossed]), piece.batch.baselines))
-    square, crossed = tf.unstack(absorbed[-1])
-    return AntennaBlocks(degrees, common, gram, tf.stack([square, crossed - tf.linalg.matrix_transpose(crossed)]))
+        with tf.control_dependencies([firsts, seconds]):
+            mixed = products.apply(tf.reshape(part.curvature * part.model, [-1, n_frequencies]))
+            roots = projector.baseline_roots(piece, *part.roots)
+            real, imaginary = (roots @ values for values in tf.split(mixed, 2))
+            # Of (R + i I)^H (R + i I) the symmetric real and the antisymmetric imaginary part in one matrix.
+            left, right = tf.concat([real, imaginary], 1), tf.concat([real + imaginary, imaginary - real], 1)
+            both = tf.matmul(left, right, transpose_a=True)
+            ends = tensors.ends.slice(*piece.batch.baselines)
+            firsts += tf.math.unsorted_segment_sum(both, ends.first, tensors.n_antennas)
+            seconds += tf.math.unsorted_segment_sum(both, ends.second, tensors.n_antennas)
+    # The second antenna of a baseline sees the conjugate.
+    summed = firsts + tf.linalg.matrix_transpose(seconds)
+    turned = tf.linalg.matrix_transpose(summed)
+    return AntennaBlocks(degrees, common, gram, tf.stack([summed + turned, summed - turned]) / 2)
 
 
 class AntennaInverse(NamedTuple):

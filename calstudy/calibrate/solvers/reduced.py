@@ -22,9 +22,10 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
+from calstudy.calibrate.frozen_foregrounds import FrozenForegrounds
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
-from calstudy.calibrate.projection import FrozenForegrounds, Projection, Projector
+from calstudy.calibrate.projection import Projection, Projector
 from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.preconditioners import (
     AntennaBlocks,
