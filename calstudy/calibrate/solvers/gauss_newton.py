@@ -11,8 +11,8 @@ that are smaller. They matter where the noise is far below the foregrounds. Once
 precision does not resolve the damping, convergence is checked in double precision, with a hundredth of the damping and
 a solution of the normal equations. If more is predicted to go, the iteration is stalled, or goes on in double precision
 if that is asked for. In such directions steps are long and valleys curved: the damping then remembers what it was
-raised to, gains change by the exponential of a step, along which a phase is only a phase, and steps are bent by their
-geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885).
+raised to, gains change by the exponential of a step, along which a phase is only a phase, and steps have their
+geodesic acceleration added (Transtrum & Sethna 2012, arXiv:1201.5885).
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class GaussNewtonState:
 
     @property
     def curved(self) -> bool:
-        """Whether steps are bent, and the damping remembers."""
+        """Whether steps have their geodesic acceleration, and the damping remembers."""
         return self.relief < 1
 
     @property
@@ -262,15 +262,15 @@ class GaussNewton:
         return _Step(eta, float(promised), bool(iterations > CG_REFRESH))
 
     def _curved_step(self, state: GaussNewtonState) -> tuple[GaussNewtonState, _Step]:
-        """Return the state with the damping that keeps a step about straight, and the step, bent."""
+        """Return the state with the damping that keeps a step about straight, and the step with its acceleration."""
         while True:
             step = self._plain_step(state)
             inverse = None if state.preconditioner is None else state.preconditioner.inverse
             arguments = state.projection, state.gains, inverse, state.kernels.scalar(state.damping), step.eta
             acceleration = state.kernels.accelerate(*arguments)
-            bend = float(tf.norm(acceleration) / tf.norm(step.eta))
+            relative = float(tf.norm(acceleration) / tf.norm(step.eta))
             # Written so that what is no number counts as curved.
-            if bend < TOO_CURVED or state.damping > MAX_DAMPING:
+            if relative < TOO_CURVED or state.damping > MAX_DAMPING:
                 return state, step._replace(eta=step.eta + 0.5 * acceleration)
             state = self._prepared(replace(state, boost=RAISE * state.boost))
 
