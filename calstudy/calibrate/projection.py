@@ -190,17 +190,18 @@ class Projector:
         filled
             See `calstudy.calibrate.batches.Vectors`.
         """
-        identity = tf.eye(normal.shape[2], batch_shape=tf.shape(normal)[:1], dtype=normal.dtype)
+        # Only diagonals change: whole matrices of ridges would go through the memory several times.
         diagonal = tf.linalg.diag_part(normal)
-        mean = (tf.reduce_sum(diagonal * filled, -1) / filled.sum(-1))[:, None, None]
+        mean = tf.reduce_sum(diagonal * filled, -1, keepdims=True) / filled.sum(-1, keepdims=True)
         if not self._finite:
-            # A model without any data gets the identity, and with it coefficients of zero.
-            normal += tf.where(mean > 0, RIDGE * mean, 1.0) * identity
-            if not filled.all():
-                normal += tf.linalg.diag((1 - filled) * tf.where(mean > 0, mean, 1.0)[:, 0])
+            # A model without any data gets the identity, and with it coefficients of zero, as padding does.
+            diagonal += tf.where(mean > 0, RIDGE * mean, 1.0) + (1 - filled) * tf.where(mean > 0, mean, 1.0)
+            normal = tf.linalg.set_diag(normal, diagonal)
         ridge = (FINITE_KERNEL_RIDGE if self._finite else KERNEL_RIDGE)[self.dtype] * mean
-        root = tf.linalg.triangular_solve(tf.linalg.cholesky(normal + ridge * identity), identity)
-        again = tf.linalg.cholesky(identity + ridge * tf.matmul(root, root, transpose_b=True))
+        lower = tf.linalg.cholesky(tf.linalg.set_diag(normal, diagonal + ridge))
+        root = tf.linalg.triangular_solve(lower, tf.eye(normal.shape[2], dtype=normal.dtype))
+        more = ridge[:, None] * tf.matmul(root, root, transpose_b=True)
+        again = tf.linalg.cholesky(tf.linalg.set_diag(more, 1 + tf.linalg.diag_part(more)))
         return tf.linalg.cholesky(normal), tf.matmul(again, root, transpose_a=True)
 
     def _project(

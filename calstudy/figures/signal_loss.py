@@ -107,7 +107,7 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
     axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, _last_k(loss)), ylim=_limits(loss))
     handles, labels = axes.get_legend_handles_labels()
     # The line comes first otherwise; the points are what the figure is about.
-    axes.legend(handles[1:] + handles[:1], labels[1:] + labels[:1], loc="lower right")
+    axes.legend(handles[1:] + handles[:1], labels[1:] + labels[:1], loc="center right")
 
 
 def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, colour: str) -> None:
