@@ -112,7 +112,7 @@ def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
     # Model, curvature and model on the baselines; roots.
     projection = 2 * DOUBLE * d.models * d.channels + 3 * SINGLE * d.samples + SINGLE * d.coefficients * d.rank
     at_once = min(settings.models_at_once, d.models)
-    # Of one batch: normal matrices, or S times the model of each baseline in the common basis and its squares.
+    # Of one batch: vectors times D, or S times the model of each baseline in the common basis and its squares.
     squares = 12 * SINGLE * at_once * d.baselines / d.models * d.rank**2
     pieces = max(2 * DOUBLE * at_once * d.widest * d.channels, squares)
     # Products of all pairs of vectors; the blocks of all antennas, and their inversion in double precision.

@@ -23,16 +23,20 @@ class BaselineProducts:
     Attributes
     ----------
     fused
-        Whether the products are compiled. As many baselines share what is compiled.
+        Whether the products are compiled. Batches with equal numbers of baselines share one compilation.
     """
 
     def __init__(self, tensors: FitTensors) -> None:
         self._n_antennas = tensors.n_antennas
         self.fused = tensors.n_baselines * tensors.n_frequencies >= LEAST_FUSED
-        self.match, self.residual, self.change, self.pull = (
+        self.curvature, self.match, self.residual, self.change, self.pull = (
             tf.function(function, jit_compile=self.fused, autograph=False)
-            for function in (self._match, self._residual, self._change, self._pull)
+            for function in (self._curvature, self._match, self._residual, self._change, self._pull)
         )
+
+    def _curvature(self, gains: tf.Tensor, ends: Ends, weights: tf.Tensor) -> tf.Tensor:
+        """Return D, (Nbls, Nfreqs), for gains (2, Nants, Nfreqs)."""
+        return weights * pairs.squared_modulus(ends.gain_products(gains))
 
     def _match(
         self, gains: tf.Tensor, ends: Ends, visibilities: tf.Tensor, weights: tf.Tensor, mean: tf.Tensor | None

@@ -22,7 +22,7 @@ class FrozenForegrounds:
 
     def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
         loss, descent = self._products.residual(gains, self.tensors.ends, visibilities, weights, model)
-        curvature = weights * pairs.squared_modulus(self.tensors.ends.gain_products(gains))
+        curvature = self._products.curvature(gains, self.tensors.ends, weights)
         part = Linearization(tf.cast(curvature, self.dtype), tf.cast(model, self.dtype), ())
         return Projection(loss, (model,), descent, (part,))
 

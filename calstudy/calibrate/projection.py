@@ -29,10 +29,10 @@ import numpy as np
 import tensorflow as tf
 
 from calstudy.calibrate import pairs
-from calstudy.calibrate.batches import ColumnProducts, Piece, joined, make_piece, product_span, span_of
-from calstudy.calibrate.elementwise import BaselineProducts, Ends
+from calstudy.calibrate.batches import Piece, joined, make_piece, product_span, span_of
+from calstudy.calibrate.elementwise import BaselineProducts
 from calstudy.calibrate.problem import FitStructure
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.tensors import Ends, FitTensors
 
 # Regularizes N relative to its mean diagonal: far below any signal, enough for models with most channels flagged.
 RIDGE = 1e-12
@@ -166,17 +166,24 @@ class Projector:
         self.project = tf.function(self._project, autograph=False)
 
     @cached_property
-    def _block_products(self) -> list[ColumnProducts]:
-        kind, pairs_of_spans = self.dtype.as_numpy_dtype, [(span, self._common) for span in self._spans]
+    def _product_spans(self) -> list[tf.Tensor | None]:
+        """What the products of the span of each batch with the common basis span; None for batches of few baselines."""
+        found = []
         with tf.init_scope():
-            return [ColumnProducts(*pair, product_span([pair], self.dtype), kind) for pair in pairs_of_spans]
+            for batch, span in zip(self.tensors.batches, self._spans, strict=True):
+                few = 2 * (batch.baselines[1] - batch.baselines[0]) < len(span)
+                found.append(product_span([] if few else [(span, self._common)], self.dtype))
+        return found
 
-    def of_pieces(self, projection: Projection) -> Iterator[tuple[Piece, ColumnProducts, Linearization]]:
-        """Return the batches, the products of their spans with the common basis, and their parts of a projection."""
-        products = iter(self._block_products)
+    def of_pieces(self, projection: Projection) -> Iterator[tuple[Piece, tf.Tensor | None, Linearization]]:
+        """Yield each batch, what the products of its span with the common basis span, and its part of a projection.
+
+        The part has the roots of this batch alone.
+        """
+        spans = iter(self._product_spans)
         for stretch, part in zip(self.stretches, projection.parts, strict=True):
             for piece, rows, roots in zip(stretch.pieces, stretch.slices(), part.roots, strict=True):
-                yield piece, next(products), Linearization(part.curvature[rows], part.model[:, rows], (roots,))
+                yield piece, next(spans), Linearization(part.curvature[rows], part.model[:, rows], (roots,))
 
     def _factor(self, normal: tf.Tensor, filled: np.ndarray) -> tuple[tf.Tensor, tf.Tensor]:
         """Return the Cholesky factors of N, and a root R of the kernel, N^-1 ~ R^T R; all (N, Nvec, Nvec).
@@ -228,7 +235,8 @@ class Projector:
             start, end = stretch.baselines
             data = visibilities[:, start:end], weights[start:end], None if mean is None else mean[:, start:end]
             # Without this, all stretches would be worked on at once, and their temporaries add up.
-            with tf.control_dependencies([*found[-1].model, found[-1].descent] if found else []):
+            before = [tensor for tensor in tf.nest.flatten(found[-1:]) if tensor is not None]
+            with tf.control_dependencies(before):
                 part = self._project_stretch(stretch, gains, data, deviations)
             # The gradient is added up on the way, for the same reason.
             found.append(part._replace(descent=part.descent + found[-1].descent) if found else part)
@@ -352,6 +360,7 @@ class Projector:
         return self._over_stretches(self._hessian_part, eta, projection)
 
     def _hessian_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+        """Return what a stretch has of `hessian_product`."""
         change = self._products.change(eta, stretch.ends, part.curvature, part.model)
         answer = self._answer(stretch, change, part)
         return self._products.pull(change, answer, stretch.ends, part.curvature, part.model)
@@ -365,6 +374,7 @@ class Projector:
         return -self._over_stretches(self._second_derivative_part, eta, projection)
 
     def _second_derivative_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+        """Return what a stretch has of minus `curvature_descent`."""
         ends, curvature, model = stretch.ends, part.curvature, part.model
         first = self._products.change(eta, ends, curvature, model)
         second = pairs.multiply(model, ends.relative_change(eta)) - 2 * self._answer(stretch, first, part)

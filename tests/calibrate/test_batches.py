@@ -15,43 +15,45 @@ from toy import HEX, complex_normal, make_toy
 
 from calstudy.calibrate import elementwise, pairs
 from calstudy.calibrate.basis import dpss_vectors
-from calstudy.calibrate.batches import ALIKE, ColumnProducts, Vectors, product_span
+from calstudy.calibrate.batches import ALIKE, Vectors, column_products, product_span
 from calstudy.calibrate.solvers.reduced import ReducedKernels
 
 CHANNELS = 200
 
 
-# Each way of `Vectors.normal`: a basis for each row; few rows of one basis; more rows than it has vectors.
-@pytest.mark.parametrize("rows", [1, ALIKE, 60])
+# Each way of `Vectors.normal`, by rows of both bases: a basis for each row; few rows of one basis; more rows than it
+# has vectors, of both or of one; as many as there are channels.
+@pytest.mark.parametrize("rows", [(1, 1), (ALIKE, ALIKE), (60, 60), (60, 10), (CHANNELS, CHANNELS), (10, CHANNELS)])
 def test_normal_matrices_are_sums_over_channels(rows):
     short, long = dpss_vectors(CHANNELS, 4.0, 1e-12), dpss_vectors(CHANNELS, 6.0, 1e-12)
     assert ALIKE < short.shape[1] < long.shape[1] < 60
     bases = np.zeros((2, long.shape[1], CHANNELS))
     bases[0, : short.shape[1]], bases[1] = short.T, long.T
     index, widths = np.repeat([0, 1], rows), np.array([short.shape[1], long.shape[1]])
-    curvature = np.random.default_rng(1).exponential(size=(2 * rows, CHANNELS))
+    curvature = np.random.default_rng(1).exponential(size=(sum(rows), CHANNELS))
     found = Vectors(bases, bases, widths, index).normal(tf.constant(curvature)).numpy()
     expected = np.einsum("rf,rvf,rwf->rvw", curvature, bases[index], bases[index])
     assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
 
 
-def test_products_of_smooth_columns_span_little_more_than_both():
+# Vectors of a finite prior have norms down to 1e-5.
+@pytest.mark.parametrize("least", [1.0, 1e-5])
+def test_products_of_smooth_columns_span_little_more_than_both(least):
     short, long = dpss_vectors(CHANNELS, 4.0, 1e-12), dpss_vectors(CHANNELS, 6.0, 1e-12)
+    short = short * np.geomspace(1, least, short.shape[1])
     span = product_span([(short, long)], tf.float64)
     # Band-limited sequences multiply to the sum of their bands, with more vectors for the edges.
     assert span.shape[1] < 1.5 * (short.shape[1] + long.shape[1])
-    products = (short[:, :, None] * long[:, None, :]).reshape(CHANNELS, -1)
-    assert np.abs(products - span @ (span.T @ products)).max() < 1e-14
-    rows = np.random.default_rng(1).standard_normal((50, CHANNELS))
-    for basis in (span, np.eye(CHANNELS)):
-        found = ColumnProducts(short, long, basis, np.dtype(float)).apply(tf.constant(rows))
-        expected = np.einsum("rf,fi,fj->rij", rows, short, long)
-        assert np.abs(found - expected).max() < 1e-13 * np.abs(expected).max()
+    rows = np.random.default_rng(1).exponential(size=(50, CHANNELS))
+    found = column_products(tf.constant(rows), tf.constant(short), tf.constant(long), span)
+    expected = np.einsum("rf,fi,fj->rij", rows, short, long)
+    norms = np.linalg.norm(short, axis=0)[:, None] * np.linalg.norm(long, axis=0)
+    assert (np.abs(found - expected) / norms).max() < 1e-12
 
 
 def test_products_of_columns_that_are_not_smooth_have_no_span_of_their_own():
-    white = np.random.default_rng(1).standard_normal((CHANNELS, 30))
-    np.testing.assert_array_equal(product_span([(white, white)], tf.float64), np.eye(CHANNELS))
+    white = np.random.default_rng(1).standard_normal((CHANNELS, 40))
+    assert product_span([(white, white)], tf.float64) is None
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +92,8 @@ def test_fused_products_are_the_plain_ones(toy, case, dtype, monkeypatch):
             kernels.projector.hessian_product(direction, found),
             kernels.projector.curvature_descent(direction, found),
         )
-        return (found.loss, tf.concat(found.model, 1), found.descent), (found.power(), *images)
+        blocks = [] if case == "frozen" else kernels.blocks(found)[2:]
+        return (found.loss, tf.concat(found.model, 1), found.descent), (found.power(), *images, *blocks)
 
     plain = results()
     monkeypatch.setattr(elementwise, "LEAST_FUSED", 1)

@@ -117,12 +117,13 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     tensors, common = projector.tensors, projector.common
     n_frequencies, rank = common.shape
     degrees = antenna_degrees(tensors, projection)
-    gram = tf.reshape(degrees @ column_products(common, common), [-1, rank, rank])
+    gram = column_products(degrees, common, common)
     firsts = seconds = tf.zeros([tensors.n_antennas, rank, rank], projector.dtype)
-    for piece, products, part in projector.of_pieces(projection):
+    for piece, span, part in projector.of_pieces(projection):
         # Temporaries of several batches would add up.
         with tf.control_dependencies([firsts, seconds]):
-            mixed = products.apply(tf.reshape(part.curvature * part.model, [-1, n_frequencies]))
+            weighted = tf.reshape(part.curvature * part.model, [-1, n_frequencies])
+            mixed = column_products(weighted, piece.span, common, span)
             roots = projector.baseline_roots(piece, *part.roots)
             real, imaginary = (roots @ values for values in tf.split(mixed, 2))
             # Of (R + i I)^H (R + i I) the symmetric real and the antisymmetric imaginary part in one matrix.
