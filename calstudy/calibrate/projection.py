@@ -172,7 +172,7 @@ class Projector:
         with tf.init_scope():
             for batch, span in zip(self.tensors.batches, self._spans, strict=True):
                 few = 2 * (batch.baselines[1] - batch.baselines[0]) < len(span)
-                found.append(product_span([] if few else [(span, self._common)], self.dtype))
+                found.append(None if few else product_span([(span, self._common)], self.dtype))
         return found
 
     def of_pieces(self, projection: Projection) -> Iterator[tuple[Piece, tf.Tensor | None, Linearization]]:
