@@ -29,9 +29,9 @@ class BaselineProducts:
     def __init__(self, tensors: FitTensors) -> None:
         self._n_antennas = tensors.n_antennas
         self.fused = tensors.n_baselines * tensors.n_frequencies >= LEAST_FUSED
-        self.curvature, self.match, self.residual, self.change, self.pull = (
+        self.curvature, self.match, self.residual, self.unmatched, self.change, self.pull = (
             tf.function(function, jit_compile=self.fused, autograph=False)
-            for function in (self._curvature, self._match, self._residual, self._change, self._pull)
+            for function in (self._curvature, self._match, self._residual, self._unmatched, self._change, self._pull)
         )
 
     def _curvature(self, gains: tf.Tensor, ends: Ends, weights: tf.Tensor) -> tf.Tensor:
@@ -56,6 +56,13 @@ class BaselineProducts:
         pull = pairs.conjugate_multiply(model, weights * pairs.conjugate_multiply(products, residual))
         loss = tf.reduce_sum(weights * pairs.squared_modulus(residual))
         return loss, ends.sum_over_antenna(pull, self._n_antennas)
+
+    def _unmatched(
+        self, gains: tf.Tensor, ends: Ends, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor
+    ) -> tf.Tensor:
+        """Return G* w (V - G F), (2, Nbls, Nfreqs)."""
+        products = ends.gain_products(gains)
+        return pairs.conjugate_multiply(products, weights * (visibilities - pairs.multiply(products, model)))
 
     def _change(self, eta: tf.Tensor, ends: Ends, curvature: tf.Tensor, model: tf.Tensor) -> tf.Tensor:
         """Return D F (eta_a + eta_b*), (2, Nbls, Nfreqs)."""

@@ -151,6 +151,9 @@ class Projector:
         self.tensors, self.dtype, self._products = tensors, dtype, BaselineProducts(tensors)
         self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
         self._level = 0 if structure.prior == "own" else 1
+        # Of what is left of a change, rounding is a part that foregrounds would absorb. Gains that they can follow have
+        # derivatives below it. With a finite prior they have not, and foregrounds would answer to what is left.
+        self._answers_twice = dtype == tf.float64 and not self._finite
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
         # A batch of short baselines spans little of what all bases do.
         self._common, self._spans = span_of(distinct, dtype), [span_of(batch.bases, dtype) for batch in tensors.batches]
@@ -202,8 +205,8 @@ class Projector:
         mean = tf.reduce_sum(diagonal * filled, -1, keepdims=True) / filled.sum(-1, keepdims=True)
         if not self._finite:
             # A model without any data gets the identity, and with it coefficients of zero, as padding does.
-            diagonal += tf.where(mean > 0, RIDGE * mean, 1.0) + (1 - filled) * tf.where(mean > 0, mean, 1.0)
-            normal = tf.linalg.set_diag(normal, diagonal)
+            diagonal += tf.where(mean > 0, (1 - filled) * mean, 1.0)
+            normal = tf.linalg.set_diag(normal, diagonal + RIDGE * mean)
         ridge = (FINITE_KERNEL_RIDGE if self._finite else KERNEL_RIDGE)[self.dtype] * mean
         lower = tf.linalg.cholesky(tf.linalg.set_diag(normal, diagonal + ridge))
         root = tf.linalg.triangular_solve(lower, tf.eye(normal.shape[2], dtype=normal.dtype))
@@ -271,6 +274,9 @@ class Projector:
         model = joined(models, 1) if mean is None else joined(models, 1) + mean
         loss, descent = self._products.residual(gains, stretch.ends, visibilities, weights, model)
         part = Linearization(tf.cast(curvature, self.dtype), tf.cast(model, self.dtype), tuple(roots))
+        if self._answers_twice:
+            left = self._products.unmatched(gains, stretch.ends, visibilities, weights, model)
+            descent = self._pulled(left, stretch, part)
         return Projection(loss + tf.add_n(penalties), (model,), descent, (part,))
 
     def _eliminate_one(
@@ -362,7 +368,14 @@ class Projector:
     def _hessian_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
         """Return what a stretch has of `hessian_product`."""
         change = self._products.change(eta, stretch.ends, part.curvature, part.model)
+        return self._pulled(change, stretch, part)
+
+    def _pulled(self, change: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+        """Return F* (y - D x) of a weighted change y that foregrounds answer by x, by antenna, (2, Nants, Nfreqs)."""
         answer = self._answer(stretch, change, part)
+        if self._answers_twice:
+            change -= part.curvature * answer
+            answer = self._answer(stretch, change, part)
         return self._products.pull(change, answer, stretch.ends, part.curvature, part.model)
 
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
@@ -378,8 +391,7 @@ class Projector:
         ends, curvature, model = stretch.ends, part.curvature, part.model
         first = self._products.change(eta, ends, curvature, model)
         second = pairs.multiply(model, ends.relative_change(eta)) - 2 * self._answer(stretch, first, part)
-        change = self._products.change(eta, ends, curvature, second)
-        return self._products.pull(change, self._answer(stretch, change, part), ends, curvature, model)
+        return self._pulled(self._products.change(eta, ends, curvature, second), stretch, part)
 
     def _over_stretches(
         self,

@@ -28,9 +28,10 @@ from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
 from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
-from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, Inverse
+from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, CoupledBlocks, Inverse
 from calstudy.calibrate.solvers.reduced import (
     ROUNDING_LOSS,
+    ROUNDING_LOSS_IN_DOUBLE,
     ReducedKernels,
     compiled,
     newton_decrement_at,
@@ -45,7 +46,8 @@ CHECK = 1e-2
 # In the curved valleys that follow: what the damping is raised and lowered by; the length of an acceleration, relative
 # to its step, with which a step is too long; what a step gains of what it promises if the next is to be shorter, or may
 # be longer.
-RAISE = 4.0
+RAISE = 3.0
+LOWER = 1.5
 TOO_CURVED = 0.6
 POOR, GOOD = 0.25, 0.75
 # What of the loss may be predicted to go in directions that single precision does not resolve: small arrays with little
@@ -56,9 +58,9 @@ CG_REFRESH = 15
 
 
 class AntennaPreconditioner(NamedTuple):
-    """The channel blocks of each antenna, and their inverse at one damping."""
+    """The channel blocks of each antenna, or coupled blocks, and their inverse at one damping."""
 
-    blocks: AntennaBlocks
+    blocks: AntennaBlocks | CoupledBlocks
     damping: float
     inverse: Inverse
 
@@ -196,7 +198,7 @@ class GaussNewton:
             n_accepted=state.n_accepted + 1,
             boost=state.boost if state.curved else 1.0,
             checked=False,
-            preconditioner=None if step.outdated else state.preconditioner,
+            preconditioner=None if step.outdated or kernels.coupled else state.preconditioner,
             gained=state.history[-1] - loss,
             predicted=math.inf,
         )
@@ -211,7 +213,7 @@ class GaussNewton:
         loss, n_steps = state.history[-1], len(state.history) - 1
         if not math.isfinite(loss):
             return Verdict("failed", "the loss at the first gains is not finite")
-        if loss < ROUNDING_LOSS:
+        if loss < (ROUNDING_LOSS_IN_DOUBLE if self.precision == "double" else ROUNDING_LOSS):
             return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
         if self._settled(state) and (state.checked or not (state.beyond_single or state.curved)):
@@ -339,7 +341,7 @@ def _next_boost(boost: float, gain: float) -> float:
     """Return the factor on the damping after a step that lowered the loss by `gain` times what it promised."""
     if gain < POOR:
         return RAISE * boost
-    return max(1.0, boost / RAISE) if gain > GOOD else boost
+    return max(1.0, boost / LOWER) if gain > GOOD else boost
 
 
 def _in_double(state: GaussNewtonState) -> GaussNewtonState:

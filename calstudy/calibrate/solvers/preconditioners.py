@@ -1,7 +1,8 @@
-"""Two block-diagonal approximations of the Gauss-Newton matrix of the gains, and their inverses.
+"""Approximations of the Gauss-Newton matrix of the gains, and their inverses.
 
 Far from the minimum the couplings between antennas within a channel matter most; close to it, those between channels
-within an antenna, which the eliminated foregrounds bring in.
+within an antenna, which the eliminated foregrounds bring in. Where the damping is so small that smooth gains of all
+antennas together, which foregrounds can follow, are to be resolved, both matter.
 
 In the notation of `calstudy.calibrate.projection`, the block of one antenna is K - C. K is diagonal, the sum of D |F|^2
 over the antenna's baselines: its degrees. C is what the foregrounds of these baselines absorb, the sum of
@@ -15,17 +16,22 @@ of the block on that span, and is K on its complement in the metric of K:
 
 M is positive definite, because C nowhere exceeds K. With a damping relative to the diagonal, K stands for
 (1 + damping) K, which leaves L as it is.
+
+The coupled blocks have the same form, with all antennas in one: M has the values of the whole Gauss-Newton matrix on
+the span of Q, for gains of any antennas, and is K on its complement.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+import numpy as np
+import scipy.linalg
 import tensorflow as tf
 
-from calstudy.calibrate.batches import column_products
-from calstudy.calibrate.projection import Projection, Projector
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.batches import Piece, column_products, joined
+from calstudy.calibrate.projection import Linearization, Projection, Projector
+from calstudy.calibrate.tensors import Ends, FitTensors
 
 # Antennas and channels with hardly any data count as having this fraction of the mean.
 DEGREE_FLOOR = 1e-4
@@ -115,20 +121,14 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     Couplings between baselines that share a foreground model are left out; the blocks stay positive.
     """
     tensors, common = projector.tensors, projector.common
-    n_frequencies, rank = common.shape
+    rank = common.shape[1]
     degrees = antenna_degrees(tensors, projection)
     gram = column_products(degrees, common, common)
     firsts = seconds = tf.zeros([tensors.n_antennas, rank, rank], projector.dtype)
     for piece, span, part in projector.of_pieces(projection):
         # Temporaries of several batches would add up.
         with tf.control_dependencies([firsts, seconds]):
-            weighted = tf.reshape(part.curvature * part.model, [-1, n_frequencies])
-            mixed = column_products(weighted, piece.span, common, span)
-            roots = projector.baseline_roots(piece, *part.roots)
-            real, imaginary = (roots @ values for values in tf.split(mixed, 2))
-            # Of (R + i I)^H (R + i I) the symmetric real and the antisymmetric imaginary part in one matrix.
-            left, right = tf.concat([real, imaginary], 1), tf.concat([real + imaginary, imaginary - real], 1)
-            both = tf.matmul(left, right, transpose_a=True)
+            both = _absorbed(projector, piece, span, part)
             ends = tensors.ends.slice(*piece.batch.baselines)
             firsts += tf.math.unsorted_segment_sum(both, ends.first, tensors.n_antennas)
             seconds += tf.math.unsorted_segment_sum(both, ends.second, tensors.n_antennas)
@@ -136,6 +136,19 @@ def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlock
     summed = firsts + tf.linalg.matrix_transpose(seconds)
     turned = tf.linalg.matrix_transpose(summed)
     return AntennaBlocks(degrees, common, gram, tf.stack([summed + turned, summed - turned]) / 2)
+
+
+def _absorbed(projector: Projector, piece: Piece, span: tf.Tensor | None, part: Linearization) -> tf.Tensor:
+    """Return Q^T C Q of each baseline of a batch, for its first antenna, (Nbls, rank, rank).
+
+    It is Hermitian: its symmetric part is the real one, its antisymmetric part the imaginary one.
+    """
+    weighted = tf.reshape(part.curvature * part.model, [-1, projector.common.shape[0]])
+    mixed = column_products(weighted, piece.span, projector.common, span)
+    roots = projector.baseline_roots(piece, *part.roots)
+    real, imaginary = (roots @ values for values in tf.split(mixed, 2))
+    left, right = tf.concat([real, imaginary], 1), tf.concat([real + imaginary, imaginary - real], 1)
+    return tf.matmul(left, right, transpose_a=True)
 
 
 class AntennaInverse(NamedTuple):
@@ -173,6 +186,113 @@ def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse
     correction = _inverse(tf.complex(gram - real, -imaginary)) - tf.cast(_inverse(gram), tf.complex128)
     correction = tf.cast(tf.stack([tf.math.real(correction), tf.math.imag(correction)]), damping.dtype)
     return AntennaInverse(blocks.common, 1 / ((1 + damping) * blocks.degrees), correction)
+
+
+class CoupledBlocks(NamedTuple):
+    """The Gauss-Newton matrix on the span of the common basis, for baselines that each have their own model.
+
+    A baseline sees eta_a + eta_b*. Real parts of both antennas have the same matrix, `alike`, imaginary parts have its
+    negative between the two, and real parts have `crossed` with imaginary ones, negative for those of the second.
+
+    Attributes
+    ----------
+    degrees
+        K, (Nants, Nfreqs).
+    common
+        Q, (Nfreqs, rank).
+    gram
+        Q^T K Q, (Nants, rank, rank).
+    alike
+        Q^T (D |F|^2 - C) Q of each baseline, its symmetric part, (Nbls, rank, rank).
+    crossed
+        The antisymmetric part of what it absorbs.
+    """
+
+    degrees: tf.Tensor
+    common: tf.Tensor
+    gram: tf.Tensor
+    alike: tf.Tensor
+    crossed: tf.Tensor
+
+    def matrix(self, ends: Ends) -> np.ndarray:
+        """Return the matrix for real, then imaginary parts of all antennas, (2 * Nants * rank, 2 * Nants * rank)."""
+        n_antennas, rank = self.gram.shape[:2]
+        whole = np.zeros((2, n_antennas, rank, 2, n_antennas, rank))
+        baselines = zip(*(index.numpy() for index in ends), self.alike.numpy(), self.crossed.numpy(), strict=True)
+        for a, b, alike, crossed in baselines:
+            for antenna, other, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+                whole[0, antenna, :, 0, other] += alike
+                whole[1, antenna, :, 1, other] += sign * alike
+            for antenna, other, sign in ((a, a, 1), (b, b, -1), (a, b, -1), (b, a, 1)):
+                whole[0, antenna, :, 1, other] += sign * crossed
+                whole[1, other, :, 0, antenna] -= sign * crossed
+        return whole.reshape(2 * n_antennas * rank, -1)
+
+
+def coupled_blocks(projector: Projector, projection: Projection) -> CoupledBlocks:
+    """Return the Gauss-Newton matrix on the span of the common basis."""
+    common, degrees = projector.common, antenna_degrees(projector.tensors, projection)
+    both = joined([_absorbed(projector, *of_piece) for of_piece in projector.of_pieces(projection)], 0)
+    turned = tf.linalg.matrix_transpose(both)
+    alike = column_products(projection.power(), common, common) - (both + turned) / 2
+    return CoupledBlocks(degrees, common, column_products(degrees, common, common), alike, (both - turned) / 2)
+
+
+class CoupledInverse(NamedTuple):
+    """Inverse of the damped coupled blocks.
+
+    Attributes
+    ----------
+    common
+        Q, (Nfreqs, rank).
+    diagonal
+        1 / ((1 + damping) K), (Nants, Nfreqs).
+    factor
+        Cholesky factor of the damped matrix.
+    gram_inverse
+        Of (1 + damping) Q^T K Q, (Nants, rank, rank).
+    """
+
+    common: tf.Tensor
+    diagonal: tf.Tensor
+    factor: tf.Tensor
+    gram_inverse: tf.Tensor
+
+    def apply(self, values: tf.Tensor) -> tf.Tensor:
+        """Return the inverse times (2, Nants, Nfreqs)."""
+        inner = tf.einsum("caf,fr->car", values, self.common)
+        solved = tf.reshape(tf.linalg.cholesky_solve(self.factor, tf.reshape(inner, [-1, 1])), tf.shape(inner))
+        solved -= tf.linalg.matvec(self.gram_inverse, inner)
+        return self.diagonal * values + tf.einsum("car,fr->caf", solved, self.common)
+
+
+def coupled_inverse(blocks: CoupledBlocks, ends: Ends, damping: float) -> CoupledInverse:
+    """Return the inverse of the damped coupled blocks; one of no numbers if rounding has left them indefinite.
+
+    Parameters
+    ----------
+    blocks
+        In double precision.
+    ends
+        Antennas of the baselines.
+    damping
+        Relative to the diagonal.
+    """
+    matrix, gram = blocks.matrix(ends), blocks.gram.numpy()
+    n_antennas, rank = gram.shape[:2]
+    parts = matrix.reshape(2, n_antennas, rank, 2, n_antennas, rank)
+    for antenna in range(n_antennas):
+        for part in range(2):
+            parts[part, antenna, :, part, antenna] += damping * gram[antenna]
+    # The common phase of all antennas is an exact null; a constant matrix lifts it, as for the blocks of each channel.
+    parts[1, :, :, 1] += gram.mean(axis=0)[:, None] / n_antennas
+    try:
+        # LAPACK's is three times as fast as TensorFlow's.
+        factor = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        factor = np.full_like(matrix, np.nan)
+    diagonal, gram_inverse = 1 / ((1 + damping) * blocks.degrees), _inverse((1 + damping) * blocks.gram)
+    return CoupledInverse(blocks.common, diagonal, tf.constant(factor), gram_inverse)
 
 
 class CoordinateInverse(NamedTuple):

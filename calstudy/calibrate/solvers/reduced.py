@@ -29,12 +29,15 @@ from calstudy.calibrate.projection import Projection, Projector
 from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.preconditioners import (
     AntennaBlocks,
+    CoupledBlocks,
     Inverse,
     antenna_blocks,
     antenna_degrees,
     antenna_inverse,
     channel_inverse,
     coordinate_inverse,
+    coupled_blocks,
+    coupled_inverse,
 )
 from calstudy.calibrate.tensors import FitTensors
 
@@ -42,8 +45,14 @@ MOST_DAMPING = 1e-2
 CG_TOLERANCE = 1e-3
 CG_CHANNEL_ITERATIONS = 300
 CG_ANTENNA_ITERATIONS = 60
-# Loss relative to the data below which a residual is rounding: 3e-8 of the visibilities, float32's resolution.
+# With coupled blocks, which take fewer than that to this tolerance.
+CG_COUPLED_TOLERANCE = 1e-8
+# Rows of the coupled blocks at most: 0.5 GB in double precision, and some ten seconds to factorize.
+MOST_COUPLED = 8192
+# Loss relative to the data below which a residual is rounding: 3e-8 of the visibilities, float32's resolution, and as
+# much above float64's.
 ROUNDING_LOSS = 1e-15
+ROUNDING_LOSS_IN_DOUBLE = 1e-29
 
 
 class Dampings(NamedTuple):
@@ -64,7 +73,7 @@ class Dampings(NamedTuple):
     preconditioner: float
 
 
-FREE = {tf.float32: Dampings(10.0, 1e-6, 1e-5), tf.float64: Dampings(10.0, 1e-14, 1e-13)}
+FREE = {tf.float32: Dampings(10.0, 1e-6, 1e-5), tf.float64: Dampings(10.0, 1e-17, 1e-15)}
 # Smooth gains, which foregrounds can follow, have a curvature from a finite prior alone: the square of the noise over
 # the deviation, far below the damping of a fit that does not determine them at all.
 FINITE = {tf.float32: Dampings(0.1, 1e-7, 1e-6), tf.float64: Dampings(0.1, 1e-14, 1e-13)}
@@ -123,6 +132,10 @@ class ReducedKernels:
         the foregrounds are frozen.
     dampings
         Of the fit in its precision.
+    coupled
+        Whether the preconditioner has the couplings between smooth gains of all antennas, besides the blocks of each
+        antenna: in double precision, where dampings are small enough for them to matter, of arrays that are not too
+        large, and if each baseline has its own model.
     """
 
     def __init__(self, structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32) -> None:
@@ -132,15 +145,23 @@ class ReducedKernels:
         self.by_channel = ((self.tensors.coupled and not finite) or frozen) and structure.gain_vectors is None
         self.dampings = (FINITE if finite else FREE)[dtype]
         self.projector = FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype)
+        self.coupled = self._couples()
+        self.cg_tolerance = CG_COUPLED_TOLERANCE if self.coupled else CG_TOLERANCE
         self.space = GainSpace(structure.gain_vectors, dtype)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
         self.project = self.projector.project
         self.channel_step = tf.function(self._channel_step, autograph=False)
         self.antenna_step = tf.function(self._antenna_step, autograph=False)
         self.blocks = tf.function(self._blocks, autograph=False)
-        self.inverse = tf.function(self._inverse, autograph=False)
+        self._antenna_inverse = tf.function(self._inverse, autograph=False)
         self.accelerate = tf.function(self._accelerate, autograph=False)
         self.predicted_decrease = tf.function(self._predicted_decrease, autograph=False)
+
+    def _couples(self) -> bool:
+        if isinstance(self.projector, FrozenForegrounds) or self.dtype != tf.float64:
+            return False
+        rows = 2 * self.tensors.n_antennas * self.projector.common.shape[1]
+        return not self.tensors.coupled and self.structure.gain_vectors is None and rows <= MOST_COUPLED
 
     def in_double(self) -> ReducedKernels:
         """Return the kernels of the same fit whose inner products are float64."""
@@ -199,7 +220,7 @@ class ReducedKernels:
             inverse = channel_inverse(self.tensors, projection, damping)
         equations = NormalEquations(projection, gains, damping, inverse)
         descent = self.projector.curvature_descent(eta, projection)
-        return self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)[0]
+        return self.solve(equations, descent, self.cg_tolerance, CG_ANTENNA_ITERATIONS)[0]
 
     def _antenna_step(
         self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
@@ -207,7 +228,7 @@ class ReducedKernels:
         """Return eta, the decrease of the loss that its quadratic model promises, and the iterations it took."""
         descent = tf.cast(projection.descent, self.dtype)
         equations = NormalEquations(projection, gains, damping, inverse)
-        eta, iterations = self.solve(equations, descent, CG_TOLERANCE, CG_ANTENNA_ITERATIONS)
+        eta, iterations = self.solve(equations, descent, self.cg_tolerance, CG_ANTENNA_ITERATIONS)
         return eta, pairs.inner_product(descent, eta), iterations
 
     def solve(
@@ -242,10 +263,16 @@ class ReducedKernels:
         )
         return self.space.expand_relative(coordinates, gains), count
 
-    def _blocks(self, projection: Projection) -> AntennaBlocks:
+    def _blocks(self, projection: Projection) -> AntennaBlocks | CoupledBlocks:
         if isinstance(self.projector, FrozenForegrounds):
             return AntennaBlocks(antenna_degrees(self.tensors, projection))
-        return antenna_blocks(self.projector, projection)
+        return (coupled_blocks if self.coupled else antenna_blocks)(self.projector, projection)
+
+    def inverse(self, blocks: AntennaBlocks | CoupledBlocks, damping: tf.Tensor, gains: tf.Tensor) -> Inverse:
+        """Return the inverse of damped blocks, at gains (2, Nants, Nfreqs)."""
+        if isinstance(blocks, CoupledBlocks):
+            return coupled_inverse(blocks, self.tensors.ends, float(damping))
+        return self._antenna_inverse(blocks, damping, gains)
 
     def _inverse(self, blocks: AntennaBlocks, damping: tf.Tensor, gains: tf.Tensor) -> Inverse:
         if self.space.vectors is None:
