@@ -2,8 +2,7 @@
 
 The foregrounds are the simulated ones projected on the fit's basis, so that a perfect fit exists. In single precision
 the data are rounded to complex64, as stored data are, and the solver is the experiment's own; in double precision they
-are not, and the solver has the precision double as well. Among perfect fits it would go on without end: it makes 150
-steps.
+are not, and the solver has the precision double as well, and goes on until its residual is rounding.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from calstudy.validation.measurement import Findings, Inputs
 from calstudy.validation.single_integration import SingleIntegrationMeasurement
 from calstudy.verdicts.criterion import Finding
 
-PATIENT = {"precision": "double", "tolerance": 1e-14, "max_steps": 150}
+PATIENT = {"precision": "double", "tolerance": 1e-14, "max_steps": 300}
 
 
 class Noiseless(SingleIntegrationMeasurement):
