@@ -69,4 +69,4 @@ def _json(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-VALIDATE = Stage(name="validate", version=3, make=measure, cost=lambda task: Cost(60, 3e9, 1e6))
+VALIDATE = Stage(name="validate", version=4, make=measure, cost=lambda task: Cost(60, 3e9, 1e6))
