@@ -73,7 +73,7 @@ class Dampings(NamedTuple):
     preconditioner: float
 
 
-FREE = {tf.float32: Dampings(10.0, 1e-6, 1e-5), tf.float64: Dampings(10.0, 1e-17, 1e-15)}
+FREE = {tf.float32: Dampings(10.0, 1e-6, 1e-5), tf.float64: Dampings(10.0, 1e-14, 1e-13)}
 # Smooth gains, which foregrounds can follow, have a curvature from a finite prior alone: the square of the noise over
 # the deviation, far below the damping of a fit that does not determine them at all.
 FINITE = {tf.float32: Dampings(0.1, 1e-7, 1e-6), tf.float64: Dampings(0.1, 1e-14, 1e-13)}
