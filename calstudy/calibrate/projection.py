@@ -137,6 +137,10 @@ class Projector:
     dtype
         Of the inner products of the iteration, for which float32 is enough but close to a minimum far below the data.
         The loss, its gradient and N are always evaluated in float64: in float32 the scale of the gains drifts unseen.
+    twice
+        Whether foregrounds answer once more to what is left of the residual, or of a change. Its rounding has a part
+        that they absorb, and gains that they can follow have derivatives below it. Without effect if the prior is
+        finite: they would answer to what is left as well, and such derivatives are larger.
 
     Attributes
     ----------
@@ -147,13 +151,13 @@ class Projector:
         Orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`.
     """
 
-    def __init__(self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
+    def __init__(
+        self, structure: FitStructure, tensors: FitTensors, dtype: tf.DType = tf.float32, twice: bool = False
+    ) -> None:
         self.tensors, self.dtype, self._products = tensors, dtype, BaselineProducts(tensors)
         self._finite, self._two_levels = structure.prior != "none", structure.prior == "both"
         self._level = 0 if structure.prior == "own" else 1
-        # Of what is left of a change, rounding is a part that foregrounds would absorb. Gains that they can follow have
-        # derivatives below it. With a finite prior they have not, and foregrounds would answer to what is left.
-        self._answers_twice = dtype == tf.float64 and not self._finite
+        self._twice = twice and not self._finite
         distinct = list({id(basis): basis for basis in tensors.bases}.values())
         # A batch of short baselines spans little of what all bases do.
         self._common, self._spans = span_of(distinct, dtype), [span_of(batch.bases, dtype) for batch in tensors.batches]
@@ -274,7 +278,7 @@ class Projector:
         model = joined(models, 1) if mean is None else joined(models, 1) + mean
         loss, descent = self._products.residual(gains, stretch.ends, visibilities, weights, model)
         part = Linearization(tf.cast(curvature, self.dtype), tf.cast(model, self.dtype), tuple(roots))
-        if self._answers_twice:
+        if self._twice:
             left = self._products.unmatched(gains, stretch.ends, visibilities, weights, model)
             descent = self._pulled(left, stretch, part)
         return Projection(loss + tf.add_n(penalties), (model,), descent, (part,))
@@ -373,7 +377,7 @@ class Projector:
     def _pulled(self, change: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
         """Return F* (y - D x) of a weighted change y that foregrounds answer by x, by antenna, (2, Nants, Nfreqs)."""
         answer = self._answer(stretch, change, part)
-        if self._answers_twice:
+        if self._twice:
             change -= part.curvature * answer
             answer = self._answer(stretch, change, part)
         return self._products.pull(change, answer, stretch.ends, part.curvature, part.model)

@@ -34,7 +34,7 @@ def at_random_gains(problem, seed=9, dtype=tf.float32):
     """The projector, the projection at gains with errors, and those gains."""
     tensors = FitTensors(problem.structure)
     data = tensors.load(problem, tf.float64)
-    projector = Projector(problem.structure, tensors, dtype)
+    projector = Projector(problem.structure, tensors, dtype, twice=dtype == tf.float64)
     gains = 1 + 0.2 * complex_normal(np.random.default_rng(seed), problem.initial_gains.shape)
     return projector, projector.project(pairs.to_pair(gains, tf.float64), data.visibilities, data.weights), gains
 

@@ -402,7 +402,7 @@ def test_derivatives_of_gains_that_foregrounds_can_follow_are_not_rounding():
     small = make_toy(scattered(6), noise=0.0)
     problem = small.problem(visibilities=gain_products(small.gains, small.antennas) * in_the_span(small))
     gains = solve(problem, GaussNewton(max_steps=40, precision="double")).gains
-    kernels = compiled(problem.structure, False, tf.float64)
+    kernels = compiled(problem.structure, False, tf.float64, thorough=True)
     reduced = kernels.reduce(problem, gains)
     found = np.ravel(kernels.project(reduced.gains, *reduced.data).descent)
     residual, derivative = jacobian(problem, gains)

@@ -156,7 +156,7 @@ class GaussNewton:
         """Project at the first gains, and take over the preconditioner of the warm start."""
         memory: AntennaPreconditioner | None = None if warm is None else warm.memory
         dtype = tf.float32 if memory is None else memory.blocks.degrees.dtype
-        kernels = compiled(problem.structure, problem.frozen, dtype)
+        kernels = compiled(problem.structure, problem.frozen, dtype, dtype == tf.float64 and self.precision == "double")
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
         projection = kernels.project(reduced.gains, *reduced.data)
         state = GaussNewtonState(
@@ -249,7 +249,7 @@ class GaussNewton:
     def _checked(self, state: GaussNewtonState) -> GaussNewtonState:
         """Predict the decrease of the loss with a hundredth of the damping, from a solution of the normal equations."""
         if state.kernels.dtype == tf.float32:
-            state = _in_double(state)
+            state = _in_double(state, self.precision == "double")
         state = self._prepared(replace(state, relief=CHECK, boost=1.0))
         return replace(state, predicted=self._plain_step(state).promised, checked=True)
 
@@ -344,8 +344,8 @@ def _next_boost(boost: float, gain: float) -> float:
     return max(1.0, boost / LOWER) if gain > GOOD else boost
 
 
-def _in_double(state: GaussNewtonState) -> GaussNewtonState:
+def _in_double(state: GaussNewtonState, thorough: bool) -> GaussNewtonState:
     """Return a state whose products are made in double precision."""
-    kernels = state.kernels.in_double()
+    kernels = state.kernels.in_double(thorough)
     projection = kernels.project(state.gains, *state.data)
     return replace(state, kernels=kernels, projection=projection, preconditioner=None)

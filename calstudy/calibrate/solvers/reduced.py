@@ -134,18 +134,21 @@ class ReducedKernels:
         Of the fit in its precision.
     coupled
         Whether the preconditioner has the couplings between smooth gains of all antennas, besides the blocks of each
-        antenna: in double precision, where dampings are small enough for them to matter, of arrays that are not too
-        large, and if each baseline has its own model.
+        antenna: of thorough kernels, if the array is not too large and each baseline has its own model.
     """
 
-    def __init__(self, structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32) -> None:
+    def __init__(
+        self, structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32, thorough: bool = False
+    ) -> None:
         self.tensors = FitTensors(structure)
         self.structure, self.frozen, self.dtype = structure, frozen, dtype
         finite = structure.prior != "none" and not frozen
         self.by_channel = ((self.tensors.coupled and not finite) or frozen) and structure.gain_vectors is None
         self.dampings = (FINITE if finite else FREE)[dtype]
-        self.projector = FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype)
-        self.coupled = self._couples()
+        self.projector = (
+            FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype, thorough)
+        )
+        self.coupled = thorough and self._can_couple()
         self.cg_tolerance = CG_COUPLED_TOLERANCE if self.coupled else CG_TOLERANCE
         self.space = GainSpace(structure.gain_vectors, dtype)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
@@ -157,15 +160,15 @@ class ReducedKernels:
         self.accelerate = tf.function(self._accelerate, autograph=False)
         self.predicted_decrease = tf.function(self._predicted_decrease, autograph=False)
 
-    def _couples(self) -> bool:
-        if isinstance(self.projector, FrozenForegrounds) or self.dtype != tf.float64:
+    def _can_couple(self) -> bool:
+        if isinstance(self.projector, FrozenForegrounds):
             return False
         rows = 2 * self.tensors.n_antennas * self.projector.common.shape[1]
         return not self.tensors.coupled and self.structure.gain_vectors is None and rows <= MOST_COUPLED
 
-    def in_double(self) -> ReducedKernels:
-        """Return the kernels of the same fit whose inner products are float64."""
-        return compiled(self.structure, self.frozen, tf.float64)
+    def in_double(self, thorough: bool) -> ReducedKernels:
+        """Return the kernels of the same fit whose inner products are float64 (see `compiled`)."""
+        return compiled(self.structure, self.frozen, tf.float64, thorough)
 
     def scalar(self, value: float) -> tf.Tensor:
         """Return a number in the precision of the inner products."""
@@ -285,7 +288,9 @@ class ReducedKernels:
 
 
 @lru_cache(maxsize=6)
-def compiled(structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32) -> ReducedKernels:
+def compiled(
+    structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32, thorough: bool = False
+) -> ReducedKernels:
     """Return the kernels of a structure, compiled once for all its integrations.
 
     Parameters
@@ -294,8 +299,11 @@ def compiled(structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf
         Of the fit.
     dtype
         Of the inner products (see `calstudy.calibrate.projection.Projector`).
+    thorough
+        Whether gains that foregrounds can nearly follow are to be resolved, with coupled blocks and foregrounds that
+        answer twice: for an iteration in double precision, not for a look whether there is need of one.
     """
-    return ReducedKernels(structure, frozen, dtype)
+    return ReducedKernels(structure, frozen, dtype, thorough)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
