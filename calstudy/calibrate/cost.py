@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import (
+    MOST_COUPLED,
     BasisSettings,
     ForegroundFit,
     GainFit,
@@ -129,7 +130,10 @@ def _unknowns(dimensions: Dimensions, settings: GainFit) -> float:
     solver = settings.solver
     gains = 2 * dimensions.antennas * dimensions.channels
     if isinstance(solver, GaussNewtonSettings):
-        return 10 * SINGLE * gains
+        rows = 2 * dimensions.antennas * dimensions.rank
+        # The matrix that couples smooth gains of all antennas, its factor, and a copy.
+        coupled = solver.precision == "double" and isinstance(settings, ForegroundFit) and rows <= MOST_COUPLED
+        return 10 * SINGLE * gains + (3 * DOUBLE * rows**2 if coupled else 0)
     if isinstance(solver, LbfgsSettings):
         return (2 * solver.memory + 10) * DOUBLE * gains
     word = SINGLE if solver.precision == "single" else DOUBLE

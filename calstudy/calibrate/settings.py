@@ -13,6 +13,9 @@ from calstudy.base.units import Delay, FluxDensity, Length
 from calstudy.calibrate.interface import Calibrator
 
 MODELS_AT_ONCE = 1024
+# Antennas times vectors, for real and imaginary parts, up to which smooth gains of all antennas are coupled in double
+# precision: a matrix of 0.5 GB, and some ten seconds to factorize it.
+MOST_COUPLED = 8192
 NOISE_UNKNOWN = (
     "calibration.foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; "
     "give the standard deviation of a sample, such as '1 Jy', or use `weights: autos`"

@@ -26,6 +26,7 @@ from calstudy.calibrate.frozen_foregrounds import FrozenForegrounds
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.projection import Projection, Projector
+from calstudy.calibrate.settings import MOST_COUPLED
 from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.preconditioners import (
     AntennaBlocks,
@@ -47,8 +48,6 @@ CG_CHANNEL_ITERATIONS = 300
 CG_ANTENNA_ITERATIONS = 60
 # With coupled blocks, which take fewer than that to this tolerance.
 CG_COUPLED_TOLERANCE = 1e-8
-# Rows of the coupled blocks at most: 0.5 GB in double precision, and some ten seconds to factorize.
-MOST_COUPLED = 8192
 # Loss relative to the data below which a residual is left as it is: 3e-8 of the visibilities, float32's resolution. In
 # double precision 3e-10: gains that matter less are nearly degenerate with foregrounds to rounding.
 ROUNDING_LOSS = 1e-15
