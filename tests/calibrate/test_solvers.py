@@ -17,9 +17,11 @@ from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase, model_scale, sky_model_slope
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.settings import BasisSettings
+from calstudy.calibrate.solvers import reduced
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import WarmStart, solve, solve_warm
+from calstudy.calibrate.solvers.preconditioners import coupled_inverse
 from calstudy.calibrate.solvers.reduced import compiled
 from calstudy.instrument.layouts import GOLOMB_MARKS
 
@@ -413,3 +415,45 @@ def test_derivatives_of_gains_that_foregrounds_can_follow_are_not_rounding():
     assert tiny.sum() > 5
     error, value = directions[tiny] @ (found - expected), directions[tiny] @ expected
     assert np.linalg.norm(error) < 1e-3 * np.linalg.norm(value)
+
+
+def test_warm_starts_in_double_precision_go_on_as_far_as_cold_ones():
+    """With little noise both go on in double precision, with geodesic acceleration."""
+    small, rng = make_toy(scattered(6), noise=0.0), np.random.default_rng(3)
+    rms = np.sqrt(np.mean(np.abs(small.foregrounds) ** 2))
+    problems = []
+    for _ in range(2):
+        sky = in_the_span(small) + 1e-6 * rms * complex_normal(rng, small.foregrounds.shape)
+        problems.append(small.problem(visibilities=gain_products(small.gains, small.antennas) * sky))
+    solver = GaussNewton(max_steps=60, precision="double")
+    _, warm = solve_warm(problems[0], solver)
+    found, cold = solve_warm(problems[1], solver, warm)[0], solve(problems[1], solver)
+    assert found.loss_history[-1] < 1.05 * cold.loss_history[-1]
+
+
+def test_what_double_precision_leaves_is_not_said_to_be_nothing():
+    """Between the rounding of single precision and its own, the decrement is that of double precision."""
+    small = make_toy(scattered(6), noise=0.0)
+    problem = small.problem(visibilities=gain_products(small.gains, small.antennas) * in_the_span(small))
+    found = solve(problem, GaussNewton(max_steps=30, precision="double"))
+    assert found.status == "max-steps"
+    assert found.newton_decrement > 1e-3
+    assert found.decrement_rms > 0
+
+
+def test_a_spoiled_preconditioner_is_not_taken_for_the_minimum(monkeypatch):
+    """Blocks that rounding has left indefinite promise nothing in a check of convergence."""
+    small = make_toy(scattered(6), noise=1e-5)
+    calls = []
+
+    def spoiled(blocks, ends, damping):
+        calls.append(damping)
+        inverse = coupled_inverse(blocks, ends, damping)
+        return inverse._replace(factor=inverse.factor * math.nan) if len(calls) == 1 else inverse
+
+    monkeypatch.setattr(reduced, "coupled_inverse", spoiled)
+    problem, solver = small.problem(), GaussNewton(max_steps=40, precision="double")
+    found = solve(problem, solver)
+    monkeypatch.undo()
+    assert len(calls) > 1
+    assert found.loss_history[-1] < 1.5 * solve(problem, solver).loss_history[-1]

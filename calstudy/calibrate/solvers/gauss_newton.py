@@ -155,8 +155,7 @@ class GaussNewton:
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and take over the preconditioner of the warm start."""
         memory: AntennaPreconditioner | None = None if warm is None else warm.memory
-        dtype = tf.float32 if memory is None else memory.blocks.degrees.dtype
-        kernels = compiled(problem.structure, problem.frozen, dtype, dtype == tf.float64 and self.precision == "double")
+        kernels = compiled(problem.structure, problem.frozen)
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
         projection = kernels.project(reduced.gains, *reduced.data)
         state = GaussNewtonState(
@@ -213,7 +212,7 @@ class GaussNewton:
         loss, n_steps = state.history[-1], len(state.history) - 1
         if not math.isfinite(loss):
             return Verdict("failed", "the loss at the first gains is not finite")
-        if loss < (ROUNDING_LOSS_IN_DOUBLE if self.precision == "double" else ROUNDING_LOSS):
+        if loss < self._rounding:
             return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
         if self._settled(state) and (state.checked or not (state.beyond_single or state.curved)):
@@ -233,6 +232,11 @@ class GaussNewton:
             )
         return None
 
+    @property
+    def _rounding(self) -> float:
+        """Loss relative to the data below which a residual is left as it is."""
+        return ROUNDING_LOSS_IN_DOUBLE if self.precision == "double" else ROUNDING_LOSS
+
     def _settled(self, state: GaussNewtonState) -> bool:
         """Whether the loss will hardly fall, as far as the damping lets be seen."""
         loss = state.history[-1]
@@ -251,7 +255,9 @@ class GaussNewton:
         if state.kernels.dtype == tf.float32:
             state = _in_double(state, self.precision == "double")
         state = self._prepared(replace(state, relief=CHECK, boost=1.0))
-        return replace(state, predicted=self._plain_step(state).promised, checked=True)
+        promised = self._plain_step(state).promised
+        # A preconditioner that rounding has spoiled promises nothing, and says nothing.
+        return replace(state, predicted=promised if promised > 0 else math.inf, checked=True)
 
     def _plain_step(self, state: GaussNewtonState) -> _Step:
         """Solve the damped normal equations."""
@@ -294,15 +300,22 @@ class GaussNewton:
 
     def newton_decrement(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
         """Return the predicted decrease that convergence is judged by; looked up anew if the iteration has none yet."""
-        if state.history[-1] < ROUNDING_LOSS:
+        loss = state.history[-1]
+        if loss < self._rounding:
             return 0.0
         if math.isfinite(state.predicted):
-            return state.predicted / state.history[-1]
+            return state.predicted / loss
+        if state.curved and loss < ROUNDING_LOSS:
+            # Below what single precision resolves, in which it is looked up.
+            return self._checked(state).predicted / loss
         return newton_decrement_at(problem, pairs.to_complex(state.gains))
 
     def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
-        """Return the antenna blocks, which hardly change from one integration to the next."""
-        return state.preconditioner
+        """Return the antenna blocks, which hardly change from one integration to the next.
+
+        Those of double precision are not kept: each integration finds out by itself whether it goes on there.
+        """
+        return state.preconditioner if state.kernels.dtype == tf.float32 else None
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
         """Bring the antenna blocks to the damping of the state, or make them, and let them predict the next step."""

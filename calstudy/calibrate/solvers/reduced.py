@@ -133,7 +133,8 @@ class ReducedKernels:
         Of the fit in its precision.
     coupled
         Whether the preconditioner has the couplings between smooth gains of all antennas, besides the blocks of each
-        antenna: of thorough kernels, if the array is not too large and each baseline has its own model.
+        antenna: of thorough kernels, if the array is not too large and each baseline has a model and coefficients of
+        its own only.
     """
 
     def __init__(
@@ -163,7 +164,8 @@ class ReducedKernels:
         if isinstance(self.projector, FrozenForegrounds):
             return False
         rows = 2 * self.tensors.n_antennas * self.projector.common.shape[1]
-        return not self.tensors.coupled and self.structure.gain_vectors is None and rows <= MOST_COUPLED
+        alone = not self.tensors.coupled and self.structure.prior != "both"
+        return alone and self.structure.gain_vectors is None and rows <= MOST_COUPLED
 
     def in_double(self, thorough: bool) -> ReducedKernels:
         """Return the kernels of the same fit whose inner products are float64 (see `compiled`)."""
