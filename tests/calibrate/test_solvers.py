@@ -300,6 +300,7 @@ def test_structures_are_compiled_once_for_the_same_content(toy):
     assert hash(same) == hash(toy.structure)
     assert same != other
     assert compiled(same) is compiled(toy.structure)
+    assert compiled(same, False) is compiled(toy.structure)
 
 
 def test_bad_problems_are_refused_in_one_sentence(toy):
@@ -363,13 +364,19 @@ def test_double_precision_says_that_it_has_not_converged(quiet):
     assert few.status == "max-steps"
 
 
+def golomb(**case):
+    """An array without redundancy, and the structure of its fit."""
+    marks = np.array(GOLOMB_MARKS[9])
+    full = Case(antennas=9, channels=64, first=150e6, band=64 * 300e3, **case)
+    simulation = Simulation(full, 3.0 * np.column_stack([marks, 0 * marks, 0 * marks]))
+    return simulation, simulation.structure(BasisSettings(delay_step="100 ns"))
+
+
 @pytest.mark.parametrize("noise", [1e-4, 1e-6])
 def test_single_precision_says_where_it_does_not_reach(noise):
     """An array without redundancy and little noise: `converged` would be a tenth and more above the minimum."""
-    marks = np.array(GOLOMB_MARKS[9])
-    case = Case(antennas=9, channels=64, first=150e6, band=64 * 300e3, noise=noise)
-    simulation = Simulation(case, 3.0 * np.column_stack([marks, 0 * marks, 0 * marks]))
-    problem = simulation.problem(0, simulation.structure(BasisSettings(delay_step="100 ns")))
+    simulation, structure = golomb(noise=noise)
+    problem = simulation.problem(0, structure)
     single = solve(problem, GaussNewton())
     further = solve(problem, GaussNewton(precision="double", max_steps=60))
     assert single.status == "stalled"
@@ -377,6 +384,17 @@ def test_single_precision_says_where_it_does_not_reach(noise):
     fall = 1 - further.loss_history[-1] / single.loss_history[-1]
     # What is predicted is what steps would bring at first; it is a lower limit.
     assert 0.01 < single.newton_decrement < fall
+
+
+def test_warm_starts_say_what_cold_ones_say():
+    """One step from the solution before is enough for the loss, but not for the directions that damping hides."""
+    simulation, structure = golomb(noise=1e-5, eor=1e-4)
+    first, warm = solve_warm(simulation.problem(0, structure), GaussNewton())
+    problem = simulation.problem(1, structure)
+    found, cold = solve_warm(problem, GaussNewton(), warm)[0], solve(problem, GaussNewton())
+    assert first.status == cold.status == found.status == "stalled"
+    # Different points of the same valley: twice leaves room. Too few conjugate gradients would say a tenth of it.
+    assert 0.5 < found.newton_decrement / cold.newton_decrement < 2
 
 
 def jacobian(problem, gains):

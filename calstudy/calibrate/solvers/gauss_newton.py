@@ -37,7 +37,7 @@ from calstudy.calibrate.solvers.reduced import (
     newton_decrement_at,
 )
 
-# Accepted steps before the antenna blocks are made.
+# Accepted steps before the antenna blocks are made, far from the minimum.
 CHANNEL_STEPS = 2
 # With a larger damping, no step is small enough to lower the loss.
 MAX_DAMPING = 1e4
@@ -75,6 +75,9 @@ class GaussNewtonState:
         Unit of the visibilities, their weighted rms.
     data
         Visibilities, weights whose sum is one, and the model if it is frozen.
+    channel_steps
+        Steps that are still to be accepted before the antenna blocks are made: none near a minimum, where a warm start
+        is, and a check of convergence.
     boost
         Factor on the damping; grows whenever a step did not lower the loss.
     relief
@@ -96,7 +99,7 @@ class GaussNewtonState:
     gains: tf.Tensor
     projection: Projection
     history: tuple[float, ...]
-    n_accepted: int = 0
+    channel_steps: int = CHANNEL_STEPS
     boost: float = 1.0
     relief: float = 1.0
     checked: bool = False
@@ -166,6 +169,7 @@ class GaussNewton:
             reduced.gains,
             projection,
             (float(projection.loss),),
+            CHANNEL_STEPS if warm is None else 0,
             preconditioner=memory,
         )
         return self._prepared(state)
@@ -194,7 +198,7 @@ class GaussNewton:
             gains=gains,
             projection=trial,
             history=(*state.history, loss),
-            n_accepted=state.n_accepted + 1,
+            channel_steps=max(state.channel_steps - 1, 0),
             boost=state.boost if state.curved else 1.0,
             checked=False,
             preconditioner=None if step.outdated or kernels.coupled else state.preconditioner,
@@ -322,7 +326,7 @@ class GaussNewton:
         preconditioner = state.preconditioner
         kernels = state.kernels
         # Smooth gains couple all channels from the start.
-        early = state.n_accepted < CHANNEL_STEPS and kernels.space.vectors is None
+        early = state.channel_steps > 0 and kernels.space.vectors is None
         if kernels.by_channel or (preconditioner is None and early):
             return state
         damping = max(state.damping, kernels.dampings.preconditioner)
@@ -361,4 +365,4 @@ def _in_double(state: GaussNewtonState, thorough: bool) -> GaussNewtonState:
     """Return a state whose products are made in double precision."""
     kernels = state.kernels.in_double(thorough)
     projection = kernels.project(state.gains, *state.data)
-    return replace(state, kernels=kernels, projection=projection, preconditioner=None)
+    return replace(state, kernels=kernels, projection=projection, channel_steps=0, preconditioner=None)

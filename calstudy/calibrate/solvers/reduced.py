@@ -288,7 +288,6 @@ class ReducedKernels:
         return pairs.inner_product(descent, inverse.apply(descent))
 
 
-@lru_cache(maxsize=6)
 def compiled(
     structure: FitStructure, frozen: bool = False, dtype: tf.DType = tf.float32, thorough: bool = False
 ) -> ReducedKernels:
@@ -304,7 +303,11 @@ def compiled(
         Whether gains that foregrounds can nearly follow are to be resolved, with coupled blocks and foregrounds that
         answer twice: for an iteration in double precision, not for a look whether there is need of one.
     """
-    return ReducedKernels(structure, frozen, dtype, thorough)
+    return _kernels(structure, frozen, dtype, thorough)
+
+
+# By positional arguments alone, because a cache takes others for different ones.
+_kernels = lru_cache(maxsize=6)(ReducedKernels)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
