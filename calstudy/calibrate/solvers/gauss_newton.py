@@ -2,9 +2,9 @@
 
 Each step solves the damped normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`) by
 preconditioned conjugate gradients, with the damping tied to the loss, so that it vanishes towards the minimum. The
-first two steps use the antenna blocks of each channel as preconditioner, later ones the channel blocks of each antenna,
-which also predict how much the loss can still fall. Where baselines share models without a finite prior, the
-couplings between antennas remain the strong ones, and the antenna blocks of each channel are used throughout.
+first two steps of a cold start use the antenna blocks of each channel as preconditioner, all others the channel blocks
+of each antenna, which also predict how much the loss can still fall. Where baselines share models without a finite
+prior, the couplings between antennas remain the strong ones, and the antenna blocks of each channel are used throughout.
 
 Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
 that are smaller. They matter where the noise is far below the foregrounds. Once the loss is so small that single
