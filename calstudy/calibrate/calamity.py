@@ -109,6 +109,7 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
     n_polarizations = prepared.data.n_polarizations
     for p in range(n_polarizations):
         warm: WarmStart | None = None
+        anew = True
         for index, times in enumerate(groups):
             diagnostics: dict[str, float] = {}
             with Usage() as usage:
@@ -116,22 +117,34 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
                 if isinstance(problem, str):
                     solution = _skipped(repeat_structure(prepared.structure, times.stop - times.start), problem)
                 else:
-                    solution, warm = _solve(problem, solver, warm if settings.solver.warm_start else None)
+                    start = warm if settings.solver.warm_start else None
+                    solution, warm, anew = _solve(problem, solver, start, anew)
                     diagnostics = _diagnostics(solution, problem)
             yield Solve(times, p, solution, usage.peak_memory, diagnostics)
             if progress is not None:
                 progress(p * len(groups) + index + 1, len(groups) * n_polarizations)
 
 
-def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) -> tuple[Solution, WarmStart | None]:
-    """Solve from the warm start, and anew from the problem's own gains if that got stuck; the lower loss counts."""
+def _solve(
+    problem: CalibrationProblem, solver: Solver, warm: WarmStart | None, anew: bool
+) -> tuple[Solution, WarmStart | None, bool]:
+    """Solve from the warm start, and anew from the problem's own gains if that got stuck; the lower loss counts.
+
+    Parameters
+    ----------
+    anew
+        Whether it is done again if the first one stalled. It is returned as well: a solve anew that stalled, too, will
+        do so for the next integration.
+    """
     solution, next_warm = solve_warm(problem, solver, warm)
-    if warm is None or solution.status not in ("stalled", "failed"):
-        return solution, next_warm
+    stuck = solution.status == "failed" or (solution.status == "stalled" and anew)
+    if warm is None or not stuck:
+        return solution, next_warm, anew
     again, again_warm = solve_warm(problem, solver)
+    anew = again.status != "stalled"
     if not again.usable or (solution.usable and again.loss_history[-1] > solution.loss_history[-1]):
-        return solution, next_warm
-    return again, again_warm
+        return solution, next_warm, anew
+    return again, again_warm, anew
 
 
 def _skipped(structure: FitStructure, message: str) -> Solution:

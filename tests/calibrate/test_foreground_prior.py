@@ -15,6 +15,7 @@ from test_calibration_loss import redundant_structure
 from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
 from calstudy.base.visibilities import from_cube, to_cube
+from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis
 from calstudy.calibrate.calibrators.calamity import Calamity
@@ -24,7 +25,7 @@ from calstudy.calibrate.calibrators.unified import Unified
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
-from calstudy.calibrate.settings import ForegroundPrior
+from calstudy.calibrate.settings import BasisSettings, ForegroundPrior
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.solvers.reduced import ReducedKernels
@@ -318,6 +319,23 @@ def test_wide_priors_converge_to_the_minimum(hexagon, prior, own, shared):
     assert found.status == "converged", found.message
     further = solve(problem, GaussNewton(tolerance=1e-8, max_steps=300, precision="double"))
     assert found.loss_history[-1] < 1.01 * further.loss_history[-1]
+
+
+def test_refused_steps_are_the_exception_in_curved_valleys():
+    """Where damping that was raised is lowered again at once, every third step is refused."""
+    simulation = Simulation(Case(antennas=12, channels=96, noise=NOISE))
+    lengths = np.linalg.norm(np.diff(simulation.positions[simulation.antennas], axis=1)[:, 0], axis=1)
+    basis = make_basis(lengths, simulation.case.frequencies, BasisSettings(delay_step="50 ns"), prior=True)
+    structure = replace(FitStructure.per_baseline(simulation.antennas, 12, basis), prior="own")
+    sky = simulation.foregrounds(0)
+    rms = np.sqrt(np.mean(np.abs(sky) ** 2))
+    data = simulation.problem(0, simulation.structure()).visibilities
+    weights, start = np.full(data.shape, (NOISE * rms) ** -2), np.ones(simulation.gains.shape, complex)
+    problem = CalibrationProblem(structure, data, weights, start, sky, deviations=(rms, np.inf))
+    found = solve(problem, GaussNewton(tolerance=1e-5))
+    assert found.status == "converged", found.message
+    refused = np.diff(found.loss_history) == 0
+    assert refused.mean() < 0.15
 
 
 NOISE, ROUNDING = 1e-3, 3e-8

@@ -14,6 +14,7 @@ from test_calibration_loss import redundant_structure
 from toy import complex_normal, make_toy, scattered
 
 from calstudy.bench.calibration_case import Case, Simulation
+from calstudy.calibrate import calamity
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase, model_scale, sky_model_slope
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.settings import BasisSettings
@@ -395,6 +396,25 @@ def test_warm_starts_say_what_cold_ones_say():
     assert first.status == cold.status == found.status == "stalled"
     # Different points of the same valley: twice leaves room. Too few conjugate gradients would say a tenth of it.
     assert 0.5 < found.newton_decrement / cold.newton_decrement < 2
+
+
+def test_integrations_that_all_stall_are_not_all_solved_twice(monkeypatch):
+    """A solve from unity after the first that stalled shows that there is nothing to be gained by another."""
+    simulation, structure = golomb(noise=1e-5, eor=1e-4)
+    starts = []
+
+    def counted(problem, solver, warm=None):
+        starts.append(warm)
+        return solve_warm(problem, solver, warm)
+
+    monkeypatch.setattr(calamity, "solve_warm", counted)
+    warm, anew = None, True
+    for integration in range(3):
+        problem = simulation.problem(integration, structure)
+        solution, warm, anew = calamity._solve(problem, GaussNewton(), warm, anew)
+        assert solution.status == "stalled"
+    # The first integration, and the second once more.
+    assert sum(start is None for start in starts) == 2
 
 
 def jacobian(problem, gains):

@@ -4,7 +4,10 @@ Each step solves the damped normal equations of the reduced problem (`calstudy.c
 preconditioned conjugate gradients, with the damping tied to the loss, so that it vanishes towards the minimum. The
 first two steps of a cold start use the antenna blocks of each channel as preconditioner, all others the channel blocks
 of each antenna, which also predict how much the loss can still fall. Where baselines share models without a finite
-prior, the couplings between antennas remain the strong ones, and the antenna blocks of each channel are used throughout.
+prior, the couplings between antennas remain the strong ones, and antenna blocks of each channel are used throughout.
+
+With a finite prior, whose damping is smaller, it remembers what it was raised to after a step that did not lower the
+loss, and comes down as steps bring what they promise.
 
 Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
 that are smaller. They matter where the noise is far below the foregrounds. Once the loss is so small that single
@@ -87,7 +90,9 @@ class GaussNewtonState:
     preconditioner
         The antenna blocks, once they are in use.
     gained
-        Decrease of the loss by the last step that lowered it; infinite before the first.
+        Decrease of the loss by the last step that lowered it; infinite before the first. Where the damping remembers
+        what it was raised to, multiplied by that: what a step brings along slow directions is about inversely
+        proportional to the damping.
     predicted
         Decrease of the loss that is predicted for the next step; infinite while unknown.
     """
@@ -190,19 +195,18 @@ class GaussNewton:
         # Refused as well: a loss that is not a number, and no step at all, from blocks that are singular to float32.
         if not loss < state.history[-1]:
             return self._refused(state, step.promised)
-        boosted = state.boost > 1
-        if state.curved:
-            state = replace(state, boost=_next_boost(state.boost, (state.history[-1] - loss) / step.promised))
+        boosted, remembered = state.boost > 1, kernels.dampings.remembered
+        gained = state.history[-1] - loss
         state = replace(
             state,
             gains=gains,
             projection=trial,
             history=(*state.history, loss),
             channel_steps=max(state.channel_steps - 1, 0),
-            boost=state.boost if state.curved else 1.0,
+            boost=_next_boost(state.boost, gained / step.promised) if state.curved or remembered else 1.0,
             checked=False,
             preconditioner=None if step.outdated or kernels.coupled else state.preconditioner,
-            gained=state.history[-1] - loss,
+            gained=gained * state.boost if remembered and not state.curved else gained,
             predicted=math.inf,
         )
         if not kernels.by_channel:
@@ -335,11 +339,14 @@ class GaussNewton:
             inverse = kernels.inverse(blocks, kernels.scalar(damping), state.gains)
             preconditioner = AntennaPreconditioner(blocks, damping, inverse)
         state = replace(state, preconditioner=preconditioner)
-        # A boosted damping shrinks the prediction without bringing the minimum any closer.
+        inverse = preconditioner.inverse
         if state.boost > 1:
-            return state
-        fall = kernels.predicted_decrease(state.projection, state.gains, preconditioner.inverse)
-        return replace(state, predicted=float(fall))
+            if state.curved or math.isfinite(state.predicted):
+                return state
+            # A boosted damping would shrink the prediction without bringing the minimum any closer.
+            due = max(state.damping / state.boost, kernels.dampings.preconditioner)
+            inverse = kernels.inverse(preconditioner.blocks, kernels.scalar(due), state.gains)
+        return replace(state, predicted=float(kernels.predicted_decrease(state.projection, state.gains, inverse)))
 
 
 class _Step(NamedTuple):

@@ -65,17 +65,21 @@ class Dampings(NamedTuple):
         What products in a precision can resolve.
     preconditioner
         Blocks in a precision cannot be inverted with less.
+    remembered
+        Whether what the damping was raised to is kept for the next steps.
     """
 
     per_loss: float
     least: float
     preconditioner: float
+    remembered: bool = False
 
 
 FREE = {tf.float32: Dampings(10.0, 1e-6, 1e-5), tf.float64: Dampings(10.0, 1e-14, 1e-13)}
 # Smooth gains, which foregrounds can follow, have a curvature from a finite prior alone: the square of the noise over
-# the deviation, far below the damping of a fit that does not determine them at all.
-FINITE = {tf.float32: Dampings(0.1, 1e-7, 1e-6), tf.float64: Dampings(0.1, 1e-14, 1e-13)}
+# the deviation, far below the damping of a fit that does not determine them at all. Where it is small, valleys are
+# curved, and refused steps come one after the other.
+FINITE = {tf.float32: Dampings(0.1, 1e-7, 1e-6, True), tf.float64: Dampings(0.1, 1e-14, 1e-13, True)}
 
 
 class ReducedData(NamedTuple):
