@@ -222,6 +222,10 @@ def _explanation() -> list[str]:
         "and the mean of T in these bands. Rows are ordered by these two, added up over worlds. T is the part of the "
         "EoR's power that is left, the bias the power of the residual without EoR over that of the EoR; both are free "
         "of the flux scale. All columns of the tables are explained in the [guide](guide.md#comparisons).",
+        "",
+        "Built-in calibrators weight all visibilities equally unless `weights` says otherwise. Where the noise follows "
+        "gains that are white in frequency, as in the challenge, the order by bias then says little on the calibrators "
+        "themselves ([weights of the comparisons](calibrators.md#weights-of-the-comparisons)).",
     ]
 
 
