@@ -142,6 +142,7 @@ def simulate_eor(job: Job) -> Mapping[str, Any]:
 
     from calstudy.base.visibilities import antenna_pairs, from_cube
     from calstudy.instrument.beams import make_beam
+    from calstudy.instrument.interface import model_of
     from calstudy.instrument.telescope import subset_template
     from calstudy.power.cosmology import make_cosmology
     from calstudy.simulate.chunks import assemble, plan_chunks, simulate_chunk
@@ -157,7 +158,8 @@ def simulate_eor(job: Job) -> Mapping[str, Any]:
         raise ValueError("the template of the simulation has other baselines than the data")
     field = EorField(settings["eor"], template.freq_array, make_cosmology(settings["cosmology"]))
     beam, simulation = make_beam(settings["beam"], settings["channels"]), settings["simulation"]
-    chunks = plan_chunks(template, simulation, smooth_in_frequency=False)
+    accuracy = simulation.nodes.for_eor(smooth_beam=model_of(settings["beam"]).smooth)
+    chunks = plan_chunks(template, accuracy, simulation.chunks)
     cubes = [simulate_chunk(simulation.engine, field.sky(chunk.channels), beam, template, chunk) for chunk in chunks]
     found = from_cube(data, assemble(chunks, cubes))
     found.flag_array[:] = False
@@ -276,7 +278,8 @@ def expect(job: Job) -> Mapping[str, Any]:
 def _cost_of_eor(task: Task) -> Cost:
     size, settings = size_of(task), task.settings
     pixels, channels = 12 * settings["eor"].nside ** 2, size.channels.count
-    engine = settings["simulation"].engine.cost(SimulationSize(pixels, size.times * channels, size.antennas, 1))
+    slots = size.times * channels
+    engine = settings["simulation"].engine.cost(SimulationSize(pixels, slots, slots, size.antennas, 1))
     at_once = channels / min(settings["simulation"].chunks, channels)
     disk = size.samples * COMPLEX128
     memory = engine.memory + pixels * (300 + 55 * at_once) + 3 * disk
@@ -299,7 +302,7 @@ def _cost_of_expectation(task: Task) -> Cost:
     return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * samples * COMPLEX128, 1e6)
 
 
-SIMULATE_EOR = Stage(name="observed-eor", version=1, make=simulate_eor, cost=_cost_of_eor)
+SIMULATE_EOR = Stage(name="observed-eor", version=2, make=simulate_eor, cost=_cost_of_eor)
 SET_LEVEL = Stage(name="observed-level", version=1, make=set_level, cost=_cost_of_average)
 INJECT = Stage(name="inject", version=1, make=inject, cost=_cost_of_data)
 AVERAGE_EOR = Stage(name="observed-eor-average", version=1, make=average_eor, cost=_cost_of_average)

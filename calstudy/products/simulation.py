@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.instrument.distinct_beams import beam_count
@@ -14,7 +16,13 @@ from calstudy.products.files import VISIBILITIES, read_visibilities, write_json,
 from calstudy.products.graph import Graph, once
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
-from calstudy.simulate.nodes import node_counts
+from calstudy.simulate.nodes import (
+    SECONDS_PER_DAY,
+    chebyshev_count,
+    frequency_bandwidth,
+    patch_nside,
+    time_bandwidth,
+)
 from calstudy.sky.counts import FAINTEST, expected_sources
 from calstudy.sky.settings import Eor, Foregrounds, NoSources, PointSources, SyntheticSources
 
@@ -24,12 +32,15 @@ if TYPE_CHECKING:
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.component import Component
     from calstudy.simulate.floor import DelayFloor
+    from calstudy.simulate.settings import SimulationSettings
     from calstudy.sky.settings import SkySettings
 
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
 TOLERATED = 100
 """Interpolation errors up to this times the tolerance, which bounds a typical one, go without a warning."""
+TYPICAL_ERROR = 30
+"""Relative error that a typical patch may have, over the tolerance: most have a small share in the visibilities."""
 
 SOURCES = 546_000
 DRAWN_SOURCE = 152
@@ -77,8 +88,9 @@ def eor(graph: Graph) -> Task:
 def _simulation(graph: Graph, component: str, settings: Mapping[str, Any]) -> Task:
     experiment = graph.experiment
     settings = {**settings, "simulation": experiment.simulation}
-    count = min(experiment.simulation.chunks, experiment.instrument.channels.count)
-    pieces = {
+    pieces = experiment.simulation.pieces(isinstance(settings["sky"], Eor))
+    count = min(pieces, experiment.instrument.channels.count)
+    chunks = {
         f"chunk{index:03d}": Task(
             SIMULATE_CHUNK,
             f"{component} {index + 1}/{count}",
@@ -87,7 +99,7 @@ def _simulation(graph: Graph, component: str, settings: Mapping[str, Any]) -> Ta
         )
         for index in range(count)
     }
-    return Task(SIMULATE, component, settings, pieces=pieces)
+    return Task(SIMULATE, component, settings, pieces=chunks)
 
 
 def _component(job: Job) -> Component:
@@ -128,7 +140,7 @@ def assemble(job: Job) -> Mapping[str, Any]:
 
     component = _component(job)
     count = len(component.chunks)
-    cubes = [to_cube(read_visibilities(job.inputs[f"chunk{index:03d}"] / CHUNK)) for index in range(count)]
+    cubes = (to_cube(read_visibilities(job.inputs[f"chunk{index:03d}"] / CHUNK)) for index in range(count))
     data = from_cube(component.template, join(component.chunks, cubes))
     quality: dict[str, Any] = {"interpolation": component.interpolation_error(to_cube(data))}
     if not component.is_eor:
@@ -141,12 +153,13 @@ def assemble(job: Job) -> Mapping[str, Any]:
 
 def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
     """Warn of an interpolation error far above the tolerance, as a beam much wider than `beam_extent` makes."""
-    check, nodes = quality["interpolation"], component.simulation.nodes
-    if check is None or check["max_error"] <= TOLERATED * nodes.tolerance:
+    check, allowed = quality["interpolation"], component.accuracy.tolerance
+    if check is None or check["max_error"] <= TOLERATED * allowed:
         return []
+    field = "eor_tolerance" if component.is_eor else "tolerance"
     return [
         f"interpolation between simulation nodes errs by {check['max_error']:.1e} of the rms, where simulation.nodes."
-        f"tolerance is {nodes.tolerance:.0e}: raise simulation.nodes.beam_extent, or set simulation.nodes.enabled=false"
+        f"{field} is {allowed:.0e}: raise simulation.nodes.beam_extent, or set simulation.nodes.enabled=false"
     ]
 
 
@@ -185,28 +198,49 @@ def _as_json(floor: DelayFloor) -> dict[str, Any]:
 
 def _cost_of_chunk(task: Task) -> Cost:
     instrument, simulation, sky = (task.settings[name] for name in ("instrument", "simulation", "sky"))
-    size, channels = Size.of(instrument), instrument.channels.count
-    pieces = min(simulation.chunks, channels)
-    times, frequencies = node_counts(instrument, simulation.nodes)
-    if isinstance(sky, Eor):
-        sources, spectral, kept = 12 * sky.nside**2, channels / simulation.chunks, 0.0
-    else:
-        sources, spectral, kept = _sources(task.settings), 0.0, DRAWN_SOURCE * _drawn(task.settings["sky"])
-        channels = frequencies
+    size, eor = Size.of(instrument), isinstance(sky, Eor)
+    sources = 12 * sky.nside**2 if isinstance(sky, Eor) else _sources(task.settings)
+    kept = 0.0 if eor else DRAWN_SOURCE * _drawn(task.settings["sky"])
+    nodes = _node_counts(instrument, simulation, eor, size.longest)
+    patches = _node_counts(instrument, simulation, eor, size.longest * _patch_radius(sources), TYPICAL_ERROR)
+    pieces = min(simulation.pieces(eor), size.channels.count)
     beams = beam_count(instrument, size.antennas)
-    engine = simulation.engine.cost(SimulationSize(sources, times * channels / pieces, size.antennas, beams))
-    disk = size.samples / size.channels.count * channels / pieces * COMPLEX128
-    memory = engine.memory + kept + 300 * sources + 55 * sources * (spectral if spectral > 1 else 0) + 3 * disk
+    whole, in_patches = (counts[0] * counts[1] / pieces for counts in (nodes, patches))
+    engine = simulation.engine.cost(SimulationSize(sources, whole, in_patches, size.antennas, beams))
+    channels = nodes[1] / pieces if eor else nodes[1]
+    disk = size.samples / size.channels.count * channels * COMPLEX128
+    memory = engine.memory + kept + 300 * sources + (55 * sources * channels if eor else 0) + 4 * disk
     seconds = 6 + engine.seconds
     if beams > 1:
-        # Tables of the beams at the nodes; where times are interpolated, sources that rise or set have their own.
-        sets = 1 if times == instrument.times.count else 2
-        seconds += sets * beams * TABLE_SECONDS * size.polarizations * channels / pieces
-        memory += beams * (TABLE_MEMORY * size.polarizations * channels / pieces + 2e7)
+        seconds += beams * TABLE_SECONDS * size.polarizations * channels
+        memory += beams * (TABLE_MEMORY * size.polarizations * channels + 2e7)
     if instrument.as_built.dipoles.differ:
         seconds += DIPOLE_SECONDS * min(1, WORKERS / pieces)
         memory += DIPOLE_MEMORY
     return Cost(seconds, memory, disk)
+
+
+def _node_counts(
+    instrument: InstrumentSettings, simulation: SimulationSettings, eor: bool, length: float, error: float = 1.0
+) -> tuple[int, int]:
+    """Estimate the nodes in time and frequency for a length of baselines, m."""
+    times, channels, nodes = instrument.times, instrument.channels, simulation.nodes
+    if not nodes.enabled:
+        return times.count, channels.count
+    length, tolerance = length + nodes.beam_extent, error * (nodes.eor_tolerance if eor else nodes.tolerance)
+    days = np.array([0.0, times.integration * (times.count - 1) / SECONDS_PER_DAY])
+    low, high = channels.band
+    in_time = min(chebyshev_count(time_bandwidth(days, high, length), tolerance), times.count)
+    if eor:
+        return in_time, channels.count
+    in_frequency = chebyshev_count(frequency_bandwidth(np.array([low, high]), length), tolerance)
+    return in_time, min(in_frequency, channels.count)
+
+
+def _patch_radius(sources: float) -> float:
+    """Estimate the radius of the cells that are patches, rad."""
+    nside = patch_nside(sources)
+    return 0.7 / nside if nside else 1.0
 
 
 def _drawn(sky: Foregrounds) -> float:
@@ -228,5 +262,5 @@ def _cost(task: Task) -> Cost:
     return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 4 * disk, disk)
 
 
-SIMULATE_CHUNK = Stage(name="simulate-chunk", version=2, make=simulate_chunk, cost=_cost_of_chunk)
-SIMULATE = Stage(name="simulate", version=2, make=assemble, cost=_cost)
+SIMULATE_CHUNK = Stage(name="simulate-chunk", version=3, make=simulate_chunk, cost=_cost_of_chunk)
+SIMULATE = Stage(name="simulate", version=3, make=assemble, cost=_cost)

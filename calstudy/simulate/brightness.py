@@ -16,7 +16,7 @@ def is_polarized(sky: SkyModel) -> bool:
     return bool(np.any(sky.stokes[1:].value))
 
 
-def stokes_i(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray:
+def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice = slice(None)) -> np.ndarray:
     """Return Stokes I as pyuvsim sees it.
 
     HEALPix pixels count as points that hold the pixel's integral, and brightness temperatures are converted at the
@@ -28,6 +28,8 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray:
         Points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type.
     frequencies : (Nfreqs,) float
         Hz.
+    components
+        Which are wanted.
 
     Returns
     -------
@@ -42,28 +44,29 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray:
     """
     if sky.spectral_type == "subband":
         sky = sky.at_frequencies(frequencies * units.Hz, inplace=False, run_check=False)
-    spectrum = _stokes_values(sky, frequencies) * _jansky_factor(sky, frequencies)
-    return np.broadcast_to(spectrum, (len(frequencies), sky.Ncomponents))
+    spectrum = _stokes_values(sky, frequencies, components) * _jansky_factor(sky, frequencies, components)
+    return np.broadcast_to(spectrum, (len(frequencies), spectrum.shape[1]))
 
 
-def _stokes_values(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray:
+def _stokes_values(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice) -> np.ndarray:
     """Return Stokes I in the sky's own unit, (Nfreqs or 1, Ncomponents)."""
     values = sky.stokes[0].value
     if sky.spectral_type == "flat":
-        return values
+        return values[:, components]
     if sky.spectral_type == "spectral_index":
         if np.isnan(sky.spectral_index).any():
             raise InputError("the spectral index of a component of the sky is not a number, give it a value or drop it")
-        return values * (frequencies[:, None] / sky.reference_frequency.to_value("Hz")) ** sky.spectral_index
+        reference, index = sky.reference_frequency.to_value("Hz")[components], sky.spectral_index[components]
+        return values[:, components] * (frequencies[:, None] / reference) ** index
     available = sky.freq_array.to_value("Hz")
     nearest = np.abs(available - frequencies[:, None]).argmin(axis=1)
     missing = np.abs(available[nearest] - frequencies) > sky.freq_tol.to_value("Hz")
     if missing.any():
         raise InputError(f"the sky is given channel by channel and has none at {frequencies[missing][0]} Hz")
-    return values[nearest]
+    return np.stack([values[row, components] for row in nearest])
 
 
-def _jansky_factor(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray | float:
+def _jansky_factor(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice) -> np.ndarray | float:
     """Return what turns the sky's own unit into Jy, broadcastable to (Nfreqs, Ncomponents)."""
     solid_angle = nside_to_pixel_area(sky.nside) if sky.component_type == "healpix" else 1 * units.sr / units.sr
     unit = sky.stokes.unit * solid_angle.unit
@@ -71,5 +74,5 @@ def _jansky_factor(sky: SkyModel, frequencies: np.ndarray) -> np.ndarray | float
         return float(solid_angle.value * unit.to("Jy"))
     scale = float(solid_angle.value * unit.to("K sr"))
     if sky.spectral_type in ("flat", "spectral_index") and sky.reference_frequency is not None:
-        return scale / jy_to_ksr(sky.reference_frequency).value
+        return scale / jy_to_ksr(sky.reference_frequency[components]).value
     return scale / jy_to_ksr(frequencies * units.Hz).value[:, None]

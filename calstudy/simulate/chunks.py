@@ -1,13 +1,14 @@
-"""Simulation in chunks: nodes in time and frequency, sources that rise or set, and the check of the interpolation.
+"""Simulation in pieces, their assembly, and the check of the interpolation.
 
-A chunk is a block of consecutive frequency nodes at all integrations. Chunks are simulated independently, can be
-stored, and are assembled to the visibilities. The result does not depend on the number of chunks.
+A chunk is a block of consecutive frequency nodes at all integrations, of the whole sky or of one part of it. Chunks are
+simulated independently, can be stored, and are added up to the visibilities. The result does not depend on the number
+of chunks.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -15,46 +16,64 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.instrument.telescope import subset_template
-from calstudy.simulate.directions import split_by_horizon
+from calstudy.simulate.directions import sky_cells
 from calstudy.simulate.interface import BeamSource, Engine, simulate_with
-from calstudy.simulate.nodes import NodeGrid, integration_times, node_grid
+from calstudy.simulate.nodes import Accuracy, Axis, frequency_axis, integration_times, time_axis
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
     from calstudy.instrument.antenna_beams import AntennaBeams
-    from calstudy.simulate.settings import SimulationSettings
 
 logger = logging.getLogger(__name__)
+
+CHUNK_BYTES = 4e8
+"""Visibilities of one chunk at all integrations."""
+PART_NSIDE = 8
+"""Cells of the sky that parts consist of."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A block of a simulation's frequency nodes.
+    """A piece of a simulation.
 
     Attributes
     ----------
-    grid
-        All nodes of the simulation.
+    axis
+        All frequency nodes of the simulation.
     nodes
-        Which of `grid.frequencies` belong to this chunk.
+        Which of them belong to this chunk.
+    part
+        Which part of the sky, and of how many.
+    accuracy
+        Of the interpolation.
     """
 
-    grid: NodeGrid
+    axis: Axis
     nodes: slice
+    part: tuple[int, int]
+    accuracy: Accuracy
 
     @property
     def frequencies(self) -> np.ndarray:
         """Frequencies of the chunk's nodes, (Nf,), Hz."""
-        return self.grid.frequencies[self.nodes]
+        return self.axis.nodes[self.nodes]
 
     @property
     def channels(self) -> slice:
         """The channels that the chunk's nodes are; raises ValueError where nodes are not channels."""
-        if not self.grid.at_channels:
+        if not self.axis.at_samples:
             raise ValueError("the chunk's frequency nodes are not channels, the sky must be smooth in frequency for it")
         return self.nodes
+
+    def select(self, sky: SkyModel) -> SkyModel | None:
+        """Select the chunk's part of a sky: every n-th cell of a grid, so that parts take equal times; None: none."""
+        index, count = self.part
+        if count == 1:
+            return sky
+        chosen = np.flatnonzero(sky_cells(sky, PART_NSIDE) % count == index)
+        return sky.select(component_inds=chosen, inplace=False, run_check=False) if len(chosen) else None
 
 
 @dataclass(frozen=True)
@@ -81,23 +100,34 @@ class InterpolationCheck:
     frequency_nodes: int
 
 
-def plan_chunks(template: UVData, settings: SimulationSettings, smooth_in_frequency: bool) -> list[Chunk]:
-    """Split a simulation into chunks with nearly equal numbers of frequency nodes.
+def plan_chunks(template: UVData, accuracy: Accuracy, count: int) -> list[Chunk]:
+    """Split a simulation into pieces that take about equal times.
+
+    A sky given channel by channel (the EoR), or seen through a beam that is not smooth in frequency, is split by
+    channels. A smooth sky takes the fewer frequency nodes the wider the band is (`calstudy.simulate.patches`): it is
+    split into parts of the sky, and by frequency only where a chunk would be too large.
 
     Parameters
     ----------
     template
         The observation.
-    settings
-        Nodes and number of chunks; there are never more chunks than frequency nodes.
-    smooth_in_frequency
-        Whether sky and beam are smooth in frequency. If not (an EoR sky; a beam that is interpolated point to point),
-        every channel is simulated, and `Chunk.channels` says which a chunk needs of the sky.
+    accuracy
+        Of the interpolation.
+    count
+        The largest number of chunks.
     """
-    grid = node_grid(template, settings.nodes, smooth_in_frequency)
-    count = min(settings.chunks, len(grid.frequencies))
-    edges = np.linspace(0, len(grid.frequencies), count + 1).round().astype(int).tolist()
-    return [Chunk(grid, slice(start, stop)) for start, stop in pairwise(edges)]
+    axis = frequency_axis(template, accuracy)
+    blocks = min(count, len(axis.nodes))
+    if not axis.at_samples:
+        size = 16.0 * template.Nblts * template.Npols * len(axis.nodes)
+        blocks = min(blocks, int(np.ceil(size / CHUNK_BYTES)))
+    parts = 1 if axis.at_samples else count // blocks
+    edges = np.linspace(0, len(axis.nodes), blocks + 1).round().astype(int).tolist()
+    return [
+        Chunk(axis, slice(start, stop), (part, parts), accuracy)
+        for start, stop in pairwise(edges)
+        for part in range(parts)
+    ]
 
 
 def simulate_chunk(
@@ -105,15 +135,12 @@ def simulate_chunk(
 ) -> np.ndarray:
     """Simulate a chunk at all integrations.
 
-    Sources that stay above the horizon are simulated at the time nodes and interpolated. Sources that rise or set are
-    discontinuous in time, and are simulated at every integration.
-
     Parameters
     ----------
     engine
         Any.
     sky
-        For a sky given channel by channel, at least the chunk's channels.
+        The whole sky; if it is given channel by channel, at least the chunk's channels.
     beam
         Of all antennas, or of each.
     template
@@ -126,27 +153,22 @@ def simulate_chunk(
     (Ntimes, Nbls, Nf, Npols) complex128
         Visibilities in Jy at all integrations and the chunk's frequency nodes.
     """
-    grid, integrations = chunk.grid, integration_times(template)
-    if grid.at_integrations:
-        return simulate_with(engine, sky, beam, subset_template(template, integrations, chunk.frequencies))
-    times = np.concatenate([integrations, grid.times_jd])
-    always_up, crossing = split_by_horizon(sky, template.telescope.location, times)
-    logger.info("%d sources stay up, %d rise or set, of %d", len(always_up), len(crossing), sky.Ncomponents)
-    cube = np.zeros((len(integrations), template.Nbls, len(chunk.frequencies), template.Npols), dtype=np.complex128)
-    if len(always_up):
-        steady = sky.select(component_inds=always_up, inplace=False, run_check=False)
-        nodes = simulate_with(engine, steady, beam, subset_template(template, grid.times_jd, chunk.frequencies))
-        cube += grid.interpolate_times(nodes)
-        del steady
-    if len(crossing):
-        changing = sky.select(component_inds=crossing, inplace=False, run_check=False)
-        cube += simulate_with(engine, changing, beam, subset_template(template, integrations, chunk.frequencies))
-    return cube
+    frame = subset_template(template, integration_times(template), chunk.frequencies)
+    part = chunk.select(sky)
+    if part is None:
+        return np.zeros((frame.Ntimes, frame.Nbls, frame.Nfreqs, frame.Npols), dtype=np.complex128)
+    return simulate_with(engine, part, beam, frame, chunk.accuracy)
 
 
-def assemble(chunks: list[Chunk], cubes: list[np.ndarray]) -> np.ndarray:
+def assemble(chunks: list[Chunk], cubes: Iterable[np.ndarray]) -> np.ndarray:
     """Return the visibilities at all channels, (Ntimes, Nbls, Nfreqs, Npols), from the cubes of all chunks in order."""
-    return chunks[0].grid.interpolate_frequencies(np.concatenate(cubes, axis=2))
+    axis = chunks[0].axis
+    blocks: dict[int, np.ndarray] = {}
+    for chunk, cube in zip(chunks, cubes, strict=True):
+        start = chunk.nodes.start
+        blocks[start] = blocks[start] + cube if start in blocks else cube
+    whole = np.concatenate([blocks[start] for start in sorted(blocks)], axis=2)
+    return np.moveaxis(axis.interpolate(np.moveaxis(whole, 2, 0)), 0, 2)
 
 
 def simulate_visibilities(
@@ -154,8 +176,8 @@ def simulate_visibilities(
     sky: SkyModel,
     beam: BeamSource | AntennaBeams,
     template: UVData,
-    settings: SimulationSettings,
-    smooth_in_frequency: bool,
+    accuracy: Accuracy,
+    count: int = 1,
 ) -> np.ndarray:
     """Simulate a complete observation in this process; see `plan_chunks`, `simulate_chunk` and `assemble`.
 
@@ -169,25 +191,23 @@ def simulate_visibilities(
         Of all antennas, or of each.
     template
         The observation: antennas, baselines, times, channels, polarizations.
-    settings
-        Nodes and number of chunks.
-    smooth_in_frequency
-        Whether sky and beam are, so that channels may be interpolated between nodes.
+    accuracy, count
+        As for `plan_chunks`.
 
     Returns
     -------
     (Ntimes, Nbls, Nfreqs, Npols) complex128
         Visibilities in Jy.
     """
-    chunks = plan_chunks(template, settings, smooth_in_frequency)
-    return assemble(chunks, [simulate_chunk(engine, sky, beam, template, chunk) for chunk in chunks])
+    chunks = plan_chunks(template, accuracy, count)
+    return assemble(chunks, (simulate_chunk(engine, sky, beam, template, chunk) for chunk in chunks))
 
 
 def check_interpolation(
     simulate: Callable[[UVData], np.ndarray],
     template: UVData,
     cube: np.ndarray,
-    grid: NodeGrid,
+    chunk: Chunk,
     channels: slice = slice(None),
     count: int = 3,
 ) -> InterpolationCheck:
@@ -202,16 +222,17 @@ def check_interpolation(
         Of the simulation.
     cube : (Ntimes, Nbls, Nfreqs, Npols)
         Its result at all channels.
-    grid
-        Its nodes, `Chunk.grid`.
+    chunk
+        Any of its pieces: has the nodes.
     channels
         Channels to choose from: those that the sky has, if it is given channel by channel.
     count
         How many integrations and how many channels, spread over the observation, each as far from nodes as can be.
     """
     times, frequencies = integration_times(template), template.freq_array
-    at_times = _farthest(times, grid.times_jd, np.arange(len(times)), count)
-    at_channels = _farthest(frequencies, grid.frequencies, np.arange(len(frequencies))[channels], count)
+    nodes = time_axis(template, chunk.accuracy).nodes
+    at_times = _farthest(times, nodes, np.arange(len(times)), count)
+    at_channels = _farthest(frequencies, chunk.axis.nodes, np.arange(len(frequencies))[channels], count)
     direct = simulate(subset_template(template, times[at_times], frequencies[at_channels]))
     errors = np.abs(cube[at_times][:, :, at_channels] - direct)
     rms = np.sqrt(np.mean(np.abs(direct) ** 2))
@@ -220,8 +241,8 @@ def check_interpolation(
         rms_error=float(np.sqrt(np.mean(errors**2)) / rms),
         times_jd=times[at_times].tolist(),
         frequencies=frequencies[at_channels].tolist(),
-        time_nodes=len(grid.times_jd),
-        frequency_nodes=len(grid.frequencies),
+        time_nodes=len(nodes),
+        frequency_nodes=len(chunk.axis.nodes),
     )
 
 

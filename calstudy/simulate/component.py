@@ -14,6 +14,7 @@ from calstudy.instrument.telescope import make_template
 from calstudy.power.cosmology import make_cosmology
 from calstudy.simulate.chunks import Chunk, check_interpolation, plan_chunks
 from calstudy.simulate.interface import simulate_with
+from calstudy.simulate.nodes import Accuracy
 from calstudy.sky.eor import EorField
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import Eor
@@ -87,17 +88,19 @@ class Component:
         self.stand_ins = self._notes(foregrounds.stand_in)
         return foregrounds.sky
 
-    @property
-    def smooth(self) -> bool:
-        """Whether sky and beam vary smoothly from channel to channel, so that frequency nodes suffice."""
+    @cached_property
+    def accuracy(self) -> Accuracy:
+        """How exactly visibilities are interpolated, and whether beam and sky vary smoothly from channel to channel."""
         beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
-        smooth = all(model_of(beam).smooth for beam in beams)
-        return not self.is_eor and smooth and self._foregrounds.spectral_type in SMOOTH_SPECTRA
+        smooth_beam, nodes = all(model_of(beam).smooth for beam in beams), self.simulation.nodes
+        if self.is_eor:
+            return nodes.for_eor(smooth_beam)
+        return nodes.for_foregrounds(smooth_beam, smooth_sky=self._foregrounds.spectral_type in SMOOTH_SPECTRA)
 
     @cached_property
     def chunks(self) -> list[Chunk]:
         """The pieces of the simulation; there may be fewer than asked for."""
-        return plan_chunks(self.as_built, self.simulation, self.smooth)
+        return plan_chunks(self.as_built, self.accuracy, self.simulation.pieces(self.is_eor))
 
     def sky(self, channels: slice | np.ndarray) -> SkyModel:
         """Return the sky, of the EoR only the given channels."""
@@ -111,11 +114,12 @@ class Component:
         cube
             The visibilities, (Ntimes, Nbls, Nfreqs, Npols), Jy.
         """
-        grid = self.chunks[0].grid
-        if grid.at_integrations and grid.at_channels:
+        if not self.accuracy.tolerance:
             return None
         # Of the EoR, whose channels are independent, only the last block is drawn again.
         channels = slice(-CHECKED, None) if self.is_eor else slice(None)
         sky = self.sky(np.arange(self.template.Nfreqs)[channels])
         simulate = partial(simulate_with, self.engine, sky, self.beam)
-        return asdict(check_interpolation(simulate, self.as_built, cube, grid, channels=channels, count=CHECKED))
+        return asdict(
+            check_interpolation(simulate, self.as_built, cube, self.chunks[0], channels=channels, count=CHECKED)
+        )

@@ -1,7 +1,11 @@
-"""Directions of the components of a sky model against time, and which of them rise or set."""
+"""Directions of the components of a sky model against time, which of them rise or set, and which are neighbours."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
+
+import healpy
 import numpy as np
 from astropy.coordinates import AltAz, EarthLocation, SkyCoord
 from astropy.time import Time
@@ -19,40 +23,62 @@ from calstudy.simulate.nodes import (
 # A direction is a unit vector turning with the Earth: this error is its rounding.
 DIRECTION_TOLERANCE = 1e-15
 
+# Celestial frames that are defined by their name alone.
+FRAMES = ("icrs", "galactic")
+
 # A source this near the horizon may rise or set between two of the times looked at (rad).
 HORIZON_MARGIN = 1e-6
 
 
+@dataclass(frozen=True)
 class SourceTracks:
     """Direction of every component at any time within a span.
 
     The transformation is astropy's, the one pyuvsim uses, at a few Chebyshev times; directions in between are the
     interpolating polynomial, equal to rounding.
 
-    Parameters
+    Attributes
     ----------
-    sky
-        Components in any celestial frame; not changed.
-    location
-        Of the array.
-    times_jd : (Ntimes,) float
-        Julian dates (UTC) at which directions will be asked for.
+    nodes : (n,) float
+        Julian dates (UTC).
+    vectors : (n, 3, Ncomponents) float
+        Unit vectors in east, north, up at these times.
     """
 
-    def __init__(self, sky: SkyModel, location: EarthLocation, times_jd: np.ndarray) -> None:
-        use_bundled_earth_orientation()
+    nodes: np.ndarray
+    vectors: np.ndarray
+
+    @classmethod
+    def of(cls, sky: SkyModel, location: EarthLocation, times_jd: np.ndarray) -> SourceTracks:
+        """Follow the components of a sky.
+
+        Parameters
+        ----------
+        sky
+            Components in any celestial frame; not changed.
+        location
+            Of the array.
+        times_jd : (Ntimes,) float
+            Julian dates (UTC) at which directions will be needed.
+        """
         bandwidth = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.ptp(times_jd) / 2
         count = chebyshev_count(bandwidth, DIRECTION_TOLERANCE)
         distinct = np.unique(times_jd)
         nodes = distinct if count >= len(distinct) else chebyshev_nodes(distinct[0], distinct[-1], count)
-        self._nodes = nodes
-        coordinates = sky_coordinates(sky)
-        self._vectors = np.stack([_enu(coordinates, location, time) for time in nodes])
+        if sky.component_type == "healpix" and sky.Ncomponents == 12 * sky.nside**2 and sky.hpx_frame.name in FRAMES:
+            place = tuple(axis.to_value("m") for axis in location.geocentric)
+            return cls(nodes, _map_vectors(sky.nside, sky.hpx_order, sky.hpx_frame.name, place, tuple(nodes)))
+        return cls(nodes, _vectors(sky_coordinates(sky), location, nodes))
 
-    def at(self, time_jd: float, components: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Return unit vectors towards the components in east, north, up, (3, Ncomponents)."""
-        weights = interpolation_matrix(self._nodes, np.array([time_jd]))[0]
-        return np.tensordot(weights, self._vectors[:, :, components], axes=1)
+    def at(self, times_jd: float | np.ndarray, components: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return unit vectors towards the components in east, north, up, (3, Ncomponents), or (Nt, 3, Ncomponents)."""
+        vectors = self.vectors[:, :, components]
+        matrix = interpolation_matrix(self.nodes, np.atleast_1d(times_jd))
+        return (matrix @ vectors.reshape(len(vectors), -1)).reshape(*np.shape(times_jd), 3, vectors.shape[2])
+
+    def select(self, components: np.ndarray) -> SourceTracks:
+        """Return the tracks of some components, in that order."""
+        return SourceTracks(self.nodes, np.ascontiguousarray(self.vectors[:, :, components]))
 
 
 def sky_coordinates(sky: SkyModel) -> SkyCoord:
@@ -62,6 +88,24 @@ def sky_coordinates(sky: SkyModel) -> SkyCoord:
     return SkyCoord(*sky.get_lon_lat(), frame=sky.hpx_frame)
 
 
+# All channels of the EoR have the same pixels, whose transformation takes as long as a tenth of a piece.
+@lru_cache(maxsize=1)
+def _map_vectors(
+    nside: int, order: str, frame: str, place: tuple[float, float, float], nodes: tuple[float, ...]
+) -> np.ndarray:
+    """Return the directions of all pixels of a map, (Nnodes, 3, Npixels), read-only."""
+    longitude, latitude = healpy.pix2ang(nside, np.arange(12 * nside**2), nest=order == "nested", lonlat=True)
+    coordinates = SkyCoord(longitude, latitude, unit="deg", frame=frame)
+    vectors = _vectors(coordinates, EarthLocation.from_geocentric(*place, unit="m"), np.array(nodes))
+    vectors.flags.writeable = False
+    return vectors
+
+
+def _vectors(coordinates: SkyCoord, location: EarthLocation, nodes: np.ndarray) -> np.ndarray:
+    use_bundled_earth_orientation()
+    return np.stack([_enu(coordinates, location, time) for time in nodes])
+
+
 def _enu(coordinates: SkyCoord, location: EarthLocation, time_jd: float) -> np.ndarray:
     time = Time(time_jd, format="jd", scale="utc", location=location)
     local = coordinates.transform_to(AltAz(obstime=time, location=location))
@@ -69,32 +113,38 @@ def _enu(coordinates: SkyCoord, location: EarthLocation, time_jd: float) -> np.n
     return np.stack([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
 
 
-def split_by_horizon(sky: SkyModel, location: EarthLocation, times_jd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the components that stay above the horizon, and of those that rise or set.
+def split_by_horizon(tracks: SourceTracks, times_jd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Separate the components that stay above the horizon from those that rise or set.
+
+    Between two of the times that are looked at, an angle h apart, the height of a source, a sinusoid of at most unit
+    amplitude, leaves the range of its values there by at most h^2 / 8.
 
     Parameters
     ----------
-    sky
-        Not changed.
-    location
-        Of the array.
+    tracks
+        Of all components.
     times_jd : (Ntimes,) float
         All times that will be simulated or interpolated to.
 
     Returns
     -------
     always_up : (N,) int
-        Above the horizon at every time.
+        Indices of the components above the horizon at every time.
     crossing : (M,) int
-        Above it at some times only, or so close to it that they might be.
+        Of those above it at some times only, or so close to it that they might be.
     """
-    tracks = SourceTracks(sky, location, times_jd)
-    lowest = np.full(sky.Ncomponents, np.inf)
-    highest = -lowest
-    for time in np.unique(times_jd):
-        height = tracks.at(time)[2]
-        np.minimum(lowest, height, out=lowest)
-        np.maximum(highest, height, out=highest)
-    always_up = lowest > HORIZON_MARGIN
-    crossing = (highest > -HORIZON_MARGIN) & ~always_up
+    looked_at = np.unique(np.concatenate([tracks.nodes, [times_jd.min(), times_jd.max()]]))
+    heights = np.stack([tracks.at(time)[2] for time in looked_at])
+    spacing = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.diff(looked_at).max(initial=0.0)
+    margin = HORIZON_MARGIN + spacing**2 / 8
+    always_up = heights.min(axis=0) > margin
+    crossing = (heights.max(axis=0) > -margin) & ~always_up
     return np.flatnonzero(always_up), np.flatnonzero(crossing)
+
+
+def sky_cells(sky: SkyModel, nside: int) -> np.ndarray:
+    """Return the pixel of a coarse nested HEALPix grid in the sky's own frame that holds each component."""
+    if nside == 0:
+        return np.zeros(sky.Ncomponents, dtype=int)
+    longitude, latitude = sky.get_lon_lat()
+    return healpy.ang2pix(nside, longitude.deg, latitude.deg, nest=True, lonlat=True)

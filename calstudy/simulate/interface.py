@@ -12,6 +12,9 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.resources import Cost
+from calstudy.base.visibilities import require_rectangular
+from calstudy.instrument.telescope import subset_template
+from calstudy.simulate.nodes import EXACT, Accuracy, integration_times, time_axis
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
@@ -37,7 +40,9 @@ class SimulationSize:
     sources
         Components of the sky, above and below the horizon.
     slots
-        Combinations of time and frequency.
+        Combinations of time and frequency nodes.
+    patch_slots
+        The same for each patch of neighbouring sources (`calstudy.simulate.patches`).
     antennas
         Of the array.
     beams
@@ -46,6 +51,7 @@ class SimulationSize:
 
     sources: float
     slots: float
+    patch_slots: float
     antennas: int
     beams: int
 
@@ -102,12 +108,55 @@ class Engine(Plugin, ABC):
             Uncalibrated drift-scan visibilities in Jy, V_xx = 1/2 int A I, in the template's order.
         """
 
+    def interpolate(
+        self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
+    ) -> np.ndarray:
+        """Simulate as `simulate` does, to a tolerance.
+
+        By default sources that stay above the horizon are simulated at time nodes. Sources that rise or set are
+        discontinuous in time, and are simulated at every integration.
+
+        Parameters
+        ----------
+        sky, beam, template
+            As for `simulate`.
+        accuracy
+            Which errors are allowed.
+
+        Returns
+        -------
+        (Ntimes, Nbls, Nfreqs, Npols) complex128
+            Jy.
+        """
+        from calstudy.simulate.directions import SourceTracks, split_by_horizon
+
+        axis, integrations = time_axis(template, accuracy), integration_times(template)
+        if axis.at_samples:
+            return self.simulate(sky, beam, template)
+        tracks = SourceTracks.of(sky, template.telescope.location, integrations)
+        cube = np.zeros((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), dtype=np.complex128)
+        always_up, crossing = split_by_horizon(tracks, integrations)
+        if len(always_up):
+            steady = sky.select(component_inds=always_up, inplace=False, run_check=False)
+            at_nodes = subset_template(template, axis.nodes, template.freq_array)
+            cube += axis.interpolate(self.simulate(steady, beam, at_nodes))
+        if len(crossing):
+            changing = sky.select(component_inds=crossing, inplace=False, run_check=False)
+            cube += self.simulate(changing, beam, template)
+        return cube
+
     def cost(self, size: SimulationSize) -> Cost:
         """Return what a simulation takes, besides what sky and visibilities do; by default as for matrix products."""
         return Cost((3e-6 + 3.2e-9 * size.antennas**2) * size.sources * size.slots)
 
 
-def simulate_with(engine: Engine, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+def simulate_with(
+    engine: Engine,
+    sky: SkyModel,
+    beam: BeamSource | AntennaBeams,
+    template: UVData,
+    accuracy: Accuracy = EXACT,
+) -> np.ndarray:
     """Return an engine's visibilities, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy, checked.
 
     Parameters
@@ -116,17 +165,20 @@ def simulate_with(engine: Engine, sky: SkyModel, beam: BeamSource | AntennaBeams
         Any.
     sky, beam, template
         As for `Engine.simulate`.
+    accuracy
+        Errors that are allowed.
 
     Raises
     ------
     InputError
         If the engine refuses or fails, or returns visibilities of another shape or that are not finite.
     """
+    require_rectangular(template)
     with guarded(engine):
         reason = engine.refusal(sky, beam, template)
         if reason is not None:
             raise InputError(f"simulation.engine = {engine.label!r}: {reason}")
-        found = engine.simulate(sky, beam, template)
+        found = engine.interpolate(sky, beam, template, accuracy)
     shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
     if np.shape(found) != shape:
         raise InputError(f"engine {engine.label!r}: returned visibilities of shape {np.shape(found)}, expected {shape}")

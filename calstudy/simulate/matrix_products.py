@@ -1,4 +1,4 @@
-"""Visibilities by matrix products over sources, for any three-dimensional array.
+"""Sums over sources of the visibilities of all baselines, by matrix products.
 
 V_ab = sum_s w_s conj(E_as) E_bs with E = exp(2 pi i nu x.s / c) and w = A I / 2: the factorization of matvis
 (Kittiwisit et al. 2025). The visibilities of all pairs are Hermitian and have as many real numbers as one real matrix.
@@ -12,192 +12,160 @@ factor: V_ab = sum_s sum_c w conj(X_asc) X_bsc with X = E conj(J), components c 
 product over twice as many terms, however many beams there are. Sine and cosine are evaluated by polynomials in a loop
 the compiler vectorizes, which costs less than the complex multiplications of a recurrence over channels and allows any
 frequencies.
+
+The sources of one call are neighbours on the sky, and s is relative to a centre: fringes turn by few turns from the
+first to the last frequency. Turns at the first frequency are reduced to fractions in double precision; what the other
+frequencies add is a small number, which single precision holds to 1e-7.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
-from pyradiosky import SkyModel
-from pyuvdata import UVData
-from scipy.constants import speed_of_light
-from threadpoolctl import threadpool_limits
 
-from calstudy.base.errors import InputError
-from calstudy.base.visibilities import antenna_indices, require_rectangular
-from calstudy.instrument.antenna_beams import AntennaBeams, split_beams
-from calstudy.simulate.brightness import stokes_i
-from calstudy.simulate.directions import SourceTracks
-from calstudy.simulate.interface import BeamSource
-from calstudy.simulate.nodes import integration_times
-from calstudy.simulate.patterns import Pattern, power_pattern
+from calstudy.simulate.patterns import Pattern
 
-# Sources per block: the two factors of the matrix product then stay in a 2 MB cache for tens of antennas.
+# Of the two factors of a block: they then stay in a 2 MB cache.
 BLOCK_BYTES = 1_200_000
 
-# Taylor coefficients of cos(pi r) and sin(pi r) / r in r^2, exact to rounding for |r| <= 1/2.
-COSINE = tuple((-1) ** k * math.pi ** (2 * k) / math.factorial(2 * k) for k in range(12))
-SINE = tuple((-1) ** k * math.pi ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(11))
+
+def _taylor(dtype: type, terms: int) -> tuple[tuple, tuple]:
+    cosines = tuple(dtype((-1) ** k * math.pi ** (2 * k) / math.factorial(2 * k)) for k in range(terms))
+    sines = tuple(dtype((-1) ** k * math.pi ** (2 * k + 1) / math.factorial(2 * k + 1)) for k in range(terms - 1))
+    return cosines, sines
 
 
-def visibilities(sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, dtype: type) -> np.ndarray:
-    """Return the visibilities of an unpolarized sky in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128.
-
-    Parameters
-    ----------
-    sky, beam, template
-        As for `calstudy.simulate.interface.Engine.simulate`.
-    dtype
-        Of the inner products: float64 or float32.
-
-    Raises
-    ------
-    InputError
-        If a polarization is not xx or yy, or the beam is not of the kind `calstudy.simulate.patterns.power_pattern`
-        takes.
-    """
-    require_rectangular(template)
-    frequencies, feeds = template.freq_array, polarization_feeds(template)
-    beams, index = split_beams(beam, template)
-    patterns = [power_pattern(item.at(frequencies), frequencies, feeds) for item in beams]
-    flux = stokes_i(sky, frequencies)
-    times = integration_times(template)
-    tracks = SourceTracks(sky, template.telescope.location, times)
-    order = _order_on_sky(tracks.at(times[0]))
-    used, pairs = np.unique(antenna_indices(template), return_inverse=True)
-    first, second = pairs.reshape(-1, 2).T
-    delays = template.telescope.get_enu_antpos()[used] / speed_of_light
-    cube = np.empty((len(times), template.Nbls, len(frequencies), len(feeds)), dtype=np.complex128)
-    # The products are many and small: threads in each cost more than they gain, and workers share the cores.
-    with threadpool_limits(limits=1, user_api="blas"):
-        for step, time in enumerate(times):
-            vectors = tracks.at(time, order)
-            up = vectors[2] > 0
-            tracked = _Sources(vectors[:, up], flux, order[up])
-            if len(patterns) == 1:
-                sums = _sum_sources(tracked, delays, frequencies, patterns[0], dtype)
-            else:
-                sums = _sum_fields(tracked, delays, frequencies, (patterns, index[used]), dtype)
-            forward, backward = sums[..., first, second], sums[..., second, first]
-            # Shape (Nbls, Nfreqs, Nfeeds).
-            cube[step] = 0.5 * ((forward + backward) + 1j * (forward - backward)).transpose(2, 0, 1)
-    return cube
+TAYLOR: dict[type, tuple[tuple, tuple]] = {np.float64: _taylor(np.float64, 12), np.float32: _taylor(np.float32, 8)}
+"""Coefficients of cos(pi r) and sin(pi r) / r in r^2, exact to rounding for |r| <= 1/2."""
 
 
 @dataclass(frozen=True)
-class _Sources:
-    """Sources above the horizon at one time.
+class PairSums:
+    """An array whose visibilities are summed over sources.
 
     Attributes
     ----------
-    vectors
-        Where they are, (3, Nup).
-    flux
-        Of all sources, (Nfreqs, Ncomponents), Jy.
-    components
-        Which of all they are, (Nup,) int.
+    delays : (Nants, 3) float
+        Positions of the antennas over the speed of light, s, in east, north, up.
+    pairs : two arrays (Nbls,) int
+        First and second antenna of each baseline.
+    frequencies : (Nfreqs,) float
+        Hz, ascending.
+    patterns
+        Distinct beams at these frequencies.
+    index : (Nants,) int
+        Which of them each antenna has.
+    dtype
+        Of the products: float64 or float32.
     """
 
-    vectors: np.ndarray
-    flux: np.ndarray
-    components: np.ndarray
+    delays: np.ndarray
+    pairs: tuple[np.ndarray, np.ndarray]
+    frequencies: np.ndarray
+    patterns: list[Pattern]
+    index: np.ndarray
+    dtype: type
+
+    @cached_property
+    def n_feeds(self) -> int:
+        """Polarizations."""
+        return self.patterns[0].n_feeds
+
+    @cached_property
+    def _block(self) -> int:
+        """Sources of one product. With several beams factors have two components, and the fields are there as well."""
+        size = 4 if len(self.patterns) == 1 else 16
+        return max(64, BLOCK_BYTES // (size * np.dtype(self.dtype).itemsize * len(self.delays)) // 64 * 64)
+
+    def at(self, vectors: np.ndarray, centre: np.ndarray, flux: np.ndarray) -> np.ndarray:
+        """Sum the visibilities of sources, with fringes relative to a direction.
+
+        Parameters
+        ----------
+        vectors : (3, N) float
+            Unit vectors towards the sources, above the horizon.
+        centre : (3,) float
+            The direction.
+        flux : (Nfreqs, N) float
+            Jy.
+
+        Returns
+        -------
+        (Nfreqs, Nfeeds, Nbls) complex128
+            Jy.
+        """
+        n_ants = len(self.delays)
+        sums = np.zeros((len(self.frequencies), self.n_feeds, n_ants, n_ants))
+        delays = self.delays @ (vectors - centre[:, None])
+        azimuth, zenith_angle = angles(vectors)
+        for start in range(0, vectors.shape[1], self._block):
+            block = slice(start, start + self._block)
+            turns = self._turns(delays[:, block])
+            if len(self.patterns) == 1:
+                weights = self.patterns[0].at(azimuth[block], zenith_angle[block])
+                weights *= 0.5 * flux[:, block]
+                self._add_products(turns, np.ascontiguousarray(weights.transpose(1, 0, 2), self.dtype), sums)
+            else:
+                fields = self._fields(azimuth[block], zenith_angle[block])
+                self._add_field_products(turns, fields, (0.5 * flux[:, block]).astype(self.dtype), sums)
+        first, second = self.pairs
+        forward, backward = sums[..., first, second], sums[..., second, first]
+        return 0.5 * ((forward + backward) + 1j * (forward - backward))
+
+    def _turns(self, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the fractions of turns at the first frequency, and the turns from there to the last, (Nants, N)."""
+        base = delays * self.frequencies[0]
+        base -= np.round(base)
+        slope = delays * (self.frequencies[-1] - self.frequencies[0])
+        return base.astype(self.dtype, copy=False), slope.astype(self.dtype, copy=False)
+
+    @cached_property
+    def _steps(self) -> np.ndarray:
+        """Place of each frequency between the first, 0, and the last, 1."""
+        offsets = self.frequencies - self.frequencies[0]
+        return (offsets / (offsets[-1] or 1.0)).astype(self.dtype)
+
+    def _add_products(self, turns: tuple[np.ndarray, np.ndarray], weights: np.ndarray, sums: np.ndarray) -> None:
+        """Add to Z a block of sources with weights (Nfreqs, Nfeeds, N)."""
+        n_ants, n_sources = turns[0].shape
+        left = np.empty((self.n_feeds * n_ants, 2 * n_sources), dtype=self.dtype)
+        right = np.empty((n_ants, 2 * n_sources), dtype=self.dtype)
+        for channel, step in enumerate(self._steps):
+            _factors(turns, step, TAYLOR[self.dtype], weights[channel], left, right)
+            sums[channel] += (left @ right.T).reshape(self.n_feeds, n_ants, n_ants)
+
+    def _fields(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return parts of components of the fields of all beams, (Nfreqs, Nfeeds, Nbeams, 4, N)."""
+        shape = (len(self.frequencies), self.n_feeds, len(self.patterns), 4, len(azimuth))
+        table: np.ndarray = np.empty(shape, dtype=self.dtype)
+        for place, pattern in enumerate(self.patterns):
+            table[:, :, place] = pattern.fields(azimuth, zenith_angle).transpose(2, 1, 3, 0)
+        return table
+
+    def _add_field_products(
+        self, turns: tuple[np.ndarray, np.ndarray], fields: np.ndarray, flux: np.ndarray, sums: np.ndarray
+    ) -> None:
+        """Add to Z a block of sources with fields (Nfreqs, Nfeeds, Nbeams, 4, N) and fluxes (Nfreqs, N)."""
+        n_ants, n_sources = turns[0].shape
+        fringes: np.ndarray = np.empty((2, n_ants, n_sources), dtype=self.dtype)
+        left = np.empty((n_ants, 4 * n_sources), dtype=self.dtype)
+        right = np.empty((n_ants, 4 * n_sources), dtype=self.dtype)
+        for channel, step in enumerate(self._steps):
+            _all_fringes(turns, step, TAYLOR[self.dtype], fringes)
+            for feed in range(self.n_feeds):
+                _field_factors(fringes, fields[channel, feed], self.index, flux[channel], left, right)
+                sums[channel, feed] += left @ right.T
 
 
-def _sum_sources(
-    sources: _Sources, delays: np.ndarray, frequencies: np.ndarray, pattern: Pattern, dtype: type
-) -> np.ndarray:
-    """Return Z of every frequency and feed, (Nfreqs, Nfeeds, Nants, Nants), for antennas at delays (Nants, 3)."""
-    n_ants, vectors = len(delays), sources.vectors
-    azimuth, zenith_angle = np.arctan2(vectors[1], vectors[0]) % (2 * np.pi), _zenith_angles(vectors)
-    size = max(64, BLOCK_BYTES // (4 * 8 * n_ants) // 64 * 64)
-    sums = np.zeros((len(frequencies), pattern.n_feeds, n_ants, n_ants))
-    for start in range(0, len(sources.components), size):
-        block = slice(start, start + size)
-        weights = pattern.at(azimuth[block], zenith_angle[block])
-        weights *= 0.5 * sources.flux[:, sources.components[block]]
-        _add_products(delays @ vectors[:, block], weights, frequencies, sums, dtype)
-    return sums
-
-
-def _sum_fields(
-    sources: _Sources,
-    delays: np.ndarray,
-    frequencies: np.ndarray,
-    antennas: tuple[list[Pattern], np.ndarray],
-    dtype: type,
-) -> np.ndarray:
-    """Return Z as `_sum_sources` does, for antennas with several patterns and the index of that of each."""
-    patterns, index = antennas
-    n_ants, vectors = len(delays), sources.vectors
-    azimuth, zenith_angle = np.arctan2(vectors[1], vectors[0]) % (2 * np.pi), _zenith_angles(vectors)
-    # A quarter of that for one beam: factors have two components, and the fields are there as well.
-    size = max(64, BLOCK_BYTES // (16 * 8 * n_ants) // 64 * 64)
-    sums = np.zeros((len(frequencies), patterns[0].n_feeds, n_ants, n_ants))
-    for start in range(0, len(sources.components), size):
-        block = slice(start, start + size)
-        # Sources of one part of one component lie together.
-        table = np.empty((len(frequencies), patterns[0].n_feeds, len(patterns), 4, len(azimuth[block])))
-        for place, pattern in enumerate(patterns):
-            table[:, :, place] = pattern.fields(azimuth[block], zenith_angle[block]).transpose(2, 1, 3, 0)
-        fluxes = 0.5 * sources.flux[:, sources.components[block]]
-        _add_field_products(delays @ vectors[:, block], (table, index), fluxes, frequencies, sums, dtype)
-    return sums
-
-
-def _add_field_products(
-    delays: np.ndarray,
-    fields: tuple[np.ndarray, np.ndarray],
-    fluxes: np.ndarray,
-    frequencies: np.ndarray,
-    sums: np.ndarray,
-    dtype: type,
-) -> None:
-    """Add to Z a block of sources with delays (Nants, N), fields (Nfreqs, Nfeeds, Nbeams, 4, N), fluxes (Nfreqs, N)."""
-    table, index = fields
-    n_ants, n_sources = delays.shape
-    fringes = np.empty((2, n_ants, n_sources))
-    left = np.empty((n_ants, 4 * n_sources), dtype=dtype)
-    right = np.empty((n_ants, 4 * n_sources), dtype=dtype)
-    for channel, frequency in enumerate(frequencies):
-        _all_fringes(delays, frequency, fringes)
-        for feed in range(table.shape[1]):
-            _field_factors(fringes, table[channel, feed], index, fluxes[channel], left, right)
-            sums[channel, feed] += left @ right.T
-
-
-def _add_products(
-    delays: np.ndarray, weights: np.ndarray, frequencies: np.ndarray, sums: np.ndarray, dtype: type
-) -> None:
-    """Add to Z a block of sources with delays (Nants, N) and weights (Nweights, Nfreqs, N)."""
-    n_weights, (n_ants, n_sources) = len(weights), delays.shape
-    left = np.empty((n_weights * n_ants, 2 * n_sources), dtype=dtype)
-    right = np.empty((n_ants, 2 * n_sources), dtype=dtype)
-    for index, frequency in enumerate(frequencies):
-        _factors(delays, weights[:, index], frequency, left, right)
-        sums[index] += (left @ right.T).reshape(n_weights, n_ants, n_ants)
-
-
-def polarization_feeds(template: UVData) -> list[str]:
-    """Return the feed of each polarization; raises InputError for cross-hand or circular ones."""
-    feeds = {-5: "x", -6: "y"}
-    unknown = [int(number) for number in template.polarization_array if int(number) not in feeds]
-    if unknown:
-        raise InputError(f"polarization number {unknown[0]} is not xx (-5) or yy (-6)")
-    return [feeds[int(number)] for number in template.polarization_array]
-
-
-def _zenith_angles(vectors: np.ndarray) -> np.ndarray:
-    # Unlike the arc cosine of the height, exact near the zenith.
-    return np.arctan2(np.hypot(vectors[0], vectors[1]), vectors[2])
-
-
-def _order_on_sky(vectors: np.ndarray) -> np.ndarray:
-    """Return an order of the sources in which neighbours are near on the sky, for the beam table's sake."""
-    rings = np.floor(np.rad2deg(_zenith_angles(vectors)))
-    return np.lexsort((np.arctan2(vectors[1], vectors[0]), rings))
+def angles(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return azimuth from east through north and zenith angle of unit vectors (3, N), rad, each (N,)."""
+    # Unlike the arc cosine of the height, the arc tangent is exact near the zenith.
+    zenith_angle = np.arctan2(np.hypot(vectors[0], vectors[1]), vectors[2])
+    return np.arctan2(vectors[1], vectors[0]) % (2 * np.pi), zenith_angle
 
 
 @numba.njit(inline="always", fastmath={"contract"})
@@ -209,22 +177,30 @@ def _polynomial(coefficients: tuple, x: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _fringes(delays: np.ndarray, frequency: float, cosine: np.ndarray, sine: np.ndarray) -> None:
-    for source in range(delays.size):
-        turns = delays[source] * frequency
-        half = turns - np.floor(turns + 0.5)
-        square = half * half
-        c = _polynomial(COSINE, square)
-        s = half * _polynomial(SINE, square)
-        cosine[source] = 1.0 - 2.0 * s * s
-        sine[source] = 2.0 * s * c
+def _fringes(
+    base: np.ndarray, slope: np.ndarray, step: float, taylor: tuple, cosine: np.ndarray, sine: np.ndarray
+) -> None:
+    # The constants have the precision of the arrays; literals would make single precision double.
+    cosines, sines = taylor
+    one = cosines[0]
+    two = one + one
+    half = one / two
+    for source in range(base.size):
+        turns = base[source] + step * slope[source]
+        r = turns - np.floor(turns + half)
+        square = r * r
+        c = _polynomial(cosines, square)
+        s = r * _polynomial(sines, square)
+        cosine[source] = one - two * s * s
+        sine[source] = two * s * c
 
 
 @numba.njit(cache=True, nogil=True)
-def _all_fringes(delays: np.ndarray, frequency: float, fringes: np.ndarray) -> None:
-    """Fill `fringes` (2, Nants, N) with the cosines and sines of all antennas with delays (Nants, N)."""
-    for antenna in range(len(delays)):
-        _fringes(delays[antenna], frequency, fringes[0, antenna], fringes[1, antenna])
+def _all_fringes(turns: tuple, step: float, taylor: tuple, fringes: np.ndarray) -> None:
+    """Fill `fringes` (2, Nants, N) with the cosines and sines of all antennas with turns, two arrays (Nants, N)."""
+    base, slope = turns
+    for antenna in range(len(base)):
+        _fringes(base[antenna], slope[antenna], step, taylor, fringes[0, antenna], fringes[1, antenna])
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
@@ -235,13 +211,16 @@ def _weigh(cosine: np.ndarray, sine: np.ndarray, weights: np.ndarray, low: np.nd
 
 
 @numba.njit(cache=True, nogil=True)
-def _factors(delays: np.ndarray, weights: np.ndarray, frequency: float, left: np.ndarray, right: np.ndarray) -> None:
+def _factors(
+    turns: tuple, step: float, taylor: tuple, weights: np.ndarray, left: np.ndarray, right: np.ndarray
+) -> None:
     """Fill left (Nweights * Nants, 2 N) with w (C - S) and w (C + S), right (Nants, 2 N) with C and S."""
-    n_ants, n_sources = delays.shape
+    base, slope = turns
+    n_ants, n_sources = base.shape
     # One row at a time: on rows the compiler can rule out that input and output overlap, and vectorizes.
     for antenna in range(n_ants):
         cosine, sine = right[antenna, :n_sources], right[antenna, n_sources:]
-        _fringes(delays[antenna], frequency, cosine, sine)
+        _fringes(base[antenna], slope[antenna], step, taylor, cosine, sine)
         for index in range(len(weights)):
             row = left[index * n_ants + antenna]
             _weigh(cosine, sine, weights[index], row[:n_sources], row[n_sources:])

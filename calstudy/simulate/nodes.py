@@ -17,64 +17,89 @@ from scipy.special import jv
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.visibilities import baseline_vectors
-from calstudy.instrument.size import baseline_lengths
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
-    from calstudy.instrument.settings import InstrumentSettings
-    from calstudy.simulate.settings import Nodes
-
 EARTH_ROTATION_RATE = 7.2921158553e-5  # rad / s, sidereal
 SECONDS_PER_DAY = 86400.0
+PATCH_SOURCES = 700
+"""Sources of a patch of the sky, at least, on average: about those of one matrix product."""
 
 
 @dataclass(frozen=True)
-class NodeGrid:
-    """Times and frequencies to simulate, and the matrices that interpolate from them.
+class Accuracy:
+    """How exact interpolated visibilities must be, and what is smooth enough to be interpolated.
 
     Attributes
     ----------
-    times_jd : (Nt,) float
-        Julian dates (UTC) to simulate.
-    frequencies : (Nf,) float
-        Frequencies to simulate, Hz.
-    time_matrix : (Ntimes, Nt) float
-        Values at the nodes to values at the integrations.
-    frequency_matrix : (Nfreqs, Nf) float
-        Values at the nodes to values at the channels.
+    tolerance
+        Largest interpolation error of the fringe of any source, relative to its amplitude; 0: nothing is interpolated.
+    beam_extent
+        Length in m by which a baseline is extended for the structure of the beam in fringe rate and delay.
+    smooth_beam, smooth_sky
+        Whether the beam, and the fluxes of the sky, vary smoothly with frequency.
     """
 
-    times_jd: np.ndarray
-    frequencies: np.ndarray
-    time_matrix: np.ndarray
-    frequency_matrix: np.ndarray
+    tolerance: float
+    beam_extent: float
+    smooth_beam: bool = True
+    smooth_sky: bool = True
+
+
+EXACT = Accuracy(tolerance=0.0, beam_extent=0.0)
+"""Every source is simulated at every integration and channel."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Nodes along time or frequency, and the matrix that interpolates from them.
+
+    Attributes
+    ----------
+    nodes : (n,) float
+        Julian dates (UTC), or Hz.
+    matrix : (m, n) float
+        From values at the nodes to values at the m samples of the axis.
+    """
+
+    nodes: np.ndarray
+    matrix: np.ndarray
 
     @property
-    def at_integrations(self) -> bool:
-        """Whether the times are the integrations themselves."""
-        return _is_identity(self.time_matrix)
+    def at_samples(self) -> bool:
+        """Whether the nodes are the samples themselves, so that nothing is interpolated."""
+        return self.matrix.shape[0] == self.matrix.shape[1] and bool((self.matrix == np.eye(len(self.nodes))).all())
 
-    @property
-    def at_channels(self) -> bool:
-        """Whether the frequencies are the channels themselves."""
-        return _is_identity(self.frequency_matrix)
-
-    def interpolate_times(self, cube: np.ndarray) -> np.ndarray:
-        """Return a (Nt, ...) cube at all integrations, (Ntimes, ...)."""
-        return cube if self.at_integrations else np.tensordot(self.time_matrix, cube, axes=(1, 0))
-
-    def interpolate_frequencies(self, cube: np.ndarray) -> np.ndarray:
-        """Return a (Ntimes, Nbls, Nf, Npols) cube at all channels, (Ntimes, Nbls, Nfreqs, Npols)."""
-        return cube if self.at_channels else np.matmul(self.frequency_matrix, cube)
-
-    def interpolate(self, cube: np.ndarray) -> np.ndarray:
-        """Return a (Nt, Nbls, Nf, Npols) cube at all integrations and channels, (Ntimes, Nbls, Nfreqs, Npols)."""
-        return self.interpolate_frequencies(self.interpolate_times(cube))
+    def interpolate(self, values: np.ndarray) -> np.ndarray:
+        """Interpolate complex values (n, ...) at the nodes to the samples, (m, ...)."""
+        if self.at_samples:
+            return values
+        # As pairs of real numbers: NumPy would make the matrix complex.
+        pairs = np.ascontiguousarray(values).view(np.float64).reshape(len(self.nodes), -1)
+        return (self.matrix @ pairs).view(np.complex128).reshape(len(self.matrix), *values.shape[1:])
 
 
-def _is_identity(matrix: np.ndarray) -> bool:
-    return matrix.shape[0] == matrix.shape[1] and bool((matrix == np.eye(len(matrix))).all())
+def make_axis(samples: np.ndarray, bandwidth: float, tolerance: float) -> Axis:
+    """Choose the nodes from which phasors are interpolated to samples.
+
+    Parameters
+    ----------
+    samples : (m,) float
+        Ascending.
+    bandwidth, tolerance
+        As for `chebyshev_count`; a tolerance of 0 makes every sample a node.
+
+    Returns
+    -------
+    Axis
+        One that needs as many nodes as it has samples has its samples as nodes.
+    """
+    count = chebyshev_count(bandwidth, tolerance) if tolerance else len(samples)
+    if count >= len(samples):
+        return Axis(samples, np.eye(len(samples)))
+    nodes = chebyshev_nodes(samples.min(), samples.max(), count)
+    return Axis(nodes, interpolation_matrix(nodes, samples))
 
 
 @lru_cache(maxsize=256)
@@ -144,83 +169,58 @@ def interpolation_matrix(nodes: np.ndarray, samples: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def time_bandwidth(template: UVData, beam_extent: float) -> float:
-    """Return half the phase in radians through which the fastest fringe turns from the first to the last integration.
-
-    A source moves perpendicular to the Earth's axis only, so it is the baselines' component perpendicular to it that
-    counts, lengthened by `beam_extent` metres for the beam's own drift.
-    """
+def time_axis(template: UVData, accuracy: Accuracy) -> Axis:
+    """Choose the times at which sources that stay above the horizon are simulated."""
     times = integration_times(template)
+    bandwidth = time_bandwidth(times, template.freq_array.max(), turning_length(template) + accuracy.beam_extent)
+    return make_axis(times, bandwidth, accuracy.tolerance)
+
+
+def frequency_axis(template: UVData, accuracy: Accuracy) -> Axis:
+    """Choose the frequencies at which a sky is simulated: every channel, unless sky and beam are smooth."""
+    channels = template.freq_array
+    smooth = accuracy.smooth_beam and accuracy.smooth_sky
+    length = np.linalg.norm(baseline_vectors(template), axis=1).max() + accuracy.beam_extent
+    return make_axis(channels, frequency_bandwidth(channels, length), accuracy.tolerance if smooth else 0.0)
+
+
+def turning_length(template: UVData) -> float:
+    """Return the longest component (m) of a baseline perpendicular to the Earth's axis.
+
+    Sources move perpendicular to the axis only, so that it is this component that makes fringes turn.
+    """
     latitude = template.telescope.location.geodetic.lat.rad
     pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
-    length = np.linalg.norm(np.cross(baseline_vectors(template), pole), axis=1).max() + beam_extent
-    rotation = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.ptp(times)
-    return float(np.pi * template.freq_array.max() / SPEED_OF_LIGHT * length * rotation)
+    return float(np.linalg.norm(np.cross(baseline_vectors(template), pole), axis=1).max())
 
 
-def frequency_bandwidth(template: UVData, beam_extent: float) -> float:
-    """Return half the phase in radians through which the longest horizon delay turns across the band."""
-    length = np.linalg.norm(baseline_vectors(template), axis=1).max() + beam_extent
-    return float(np.pi * length / SPEED_OF_LIGHT * np.ptp(template.freq_array))
+def time_bandwidth(times_jd: np.ndarray, frequency: float, length: float) -> float:
+    """Return half the phase in radians through which the fastest fringe turns from the first to the last time.
+
+    Parameters
+    ----------
+    times_jd
+        Julian dates.
+    frequency
+        The highest, Hz.
+    length
+        Longest baseline perpendicular to the Earth's axis, m.
+    """
+    rotation = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.ptp(times_jd)
+    return float(np.pi * frequency / SPEED_OF_LIGHT * length * rotation)
+
+
+def frequency_bandwidth(frequencies: np.ndarray, length: float) -> float:
+    """Return half the phase in radians through which the delay of a length in m turns from end to end of a band."""
+    return float(np.pi * length / SPEED_OF_LIGHT * np.ptp(frequencies))
+
+
+def patch_nside(components: float) -> int:
+    """Return the resolution of the grid whose cells are patches, for a sky of so many components; 0: one patch."""
+    cells = components / PATCH_SOURCES
+    return int(2 ** np.floor(np.log2(cells / 12) / 2)) if cells >= 12 else 0
 
 
 def integration_times(template: UVData) -> np.ndarray:
     """Return the Julian date of each integration, (Ntimes,), of a time-major data set."""
     return template.time_array[:: template.Nbls]
-
-
-def _axis(samples: np.ndarray, bandwidth: float, settings: Nodes) -> tuple[np.ndarray, np.ndarray]:
-    count = chebyshev_count(bandwidth, settings.tolerance)
-    if count >= len(samples):
-        return samples, np.eye(len(samples))
-    nodes = chebyshev_nodes(samples.min(), samples.max(), count)
-    return nodes, interpolation_matrix(nodes, samples)
-
-
-def node_counts(instrument: InstrumentSettings, settings: Nodes) -> tuple[int, int]:
-    """Return how many time and frequency nodes a smooth sky takes, about, from the settings alone: for plans.
-
-    Parameters
-    ----------
-    instrument
-        The `instrument` section.
-    settings
-        Tolerance and extent of the beam, or `enabled=False` for every integration and channel.
-    """
-    times, channels = instrument.times, instrument.channels
-    if not settings.enabled:
-        return times.count, channels.count
-    length = baseline_lengths(instrument.layout)[0] + settings.beam_extent
-    low, high = channels.band
-    rotation = EARTH_ROTATION_RATE * times.integration * (times.count - 1)
-    in_time = chebyshev_count(np.pi * high / SPEED_OF_LIGHT * length * rotation, settings.tolerance)
-    in_frequency = chebyshev_count(np.pi * length / SPEED_OF_LIGHT * (high - low), settings.tolerance)
-    return min(in_time, times.count), min(in_frequency, channels.count)
-
-
-def node_grid(template: UVData, settings: Nodes, smooth_in_frequency: bool) -> NodeGrid:
-    """Choose the nodes for an observation.
-
-    Parameters
-    ----------
-    template
-        The observation to be simulated.
-    settings
-        Tolerance, extent of the beam, or `enabled=False` for every integration and channel.
-    smooth_in_frequency
-        Whether sky and beam vary smoothly in frequency. If not, every channel is a node.
-
-    Returns
-    -------
-    NodeGrid
-        An axis that needs as many nodes as it has samples gets its samples.
-    """
-    times, frequencies = integration_times(template), template.freq_array
-    if not settings.enabled:
-        return NodeGrid(times, frequencies, np.eye(len(times)), np.eye(len(frequencies)))
-    node_times, time_matrix = _axis(times, time_bandwidth(template, settings.beam_extent), settings)
-    if not smooth_in_frequency:
-        return NodeGrid(node_times, frequencies, time_matrix, np.eye(len(frequencies)))
-    bandwidth = frequency_bandwidth(template, settings.beam_extent)
-    node_frequencies, frequency_matrix = _axis(frequencies, bandwidth, settings)
-    return NodeGrid(node_times, node_frequencies, time_matrix, frequency_matrix)

@@ -74,6 +74,21 @@ def refusal(beam: UVBeam | AnalyticBeam, feeds: list[str]) -> str | None:
     return None
 
 
+class InterpolatedPattern:
+    """A pattern at the nodes of a frequency axis, interpolated by a matrix (Nfreqs, Nnodes) to its channels."""
+
+    def __init__(self, nodes: Pattern, matrix: np.ndarray) -> None:
+        self._nodes, self._matrix, self.n_feeds = nodes, matrix, nodes.n_feeds
+
+    def at(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return the pattern, (Nfeeds, Nfreqs, Ndirections)."""
+        return np.matmul(self._matrix, self._nodes.at(azimuth, zenith_angle))
+
+    def fields(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
+        """Return real and imaginary parts of both components of J, (Ndirections, Nfeeds, Nfreqs, 4)."""
+        return np.matmul(self._matrix, self._nodes.fields(azimuth, zenith_angle))
+
+
 class AnalyticPattern:
     """Power pattern of a closed-form beam."""
 

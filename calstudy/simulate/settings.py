@@ -10,6 +10,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 from calstudy.base.schema import UNKEYED, Section, fault
 from calstudy.base.units import Length
 from calstudy.simulate.interface import Engine
+from calstudy.simulate.nodes import EXACT, Accuracy
 
 ENGINES = Engine.registry
 
@@ -22,13 +23,32 @@ class Nodes(Section):
         1e-9,
         gt=0,
         lt=1e-2,
-        description="Largest interpolation error of the fringe of any source, relative to its amplitude.",
+        description="Largest interpolation error of the fringe of any source of the foregrounds, relative to its "
+        "amplitude.",
+    )
+    eor_tolerance: float = Field(
+        1e-4,
+        gt=0,
+        lt=1e-2,
+        description="The same for the EoR, which is far below the foregrounds. Errors of the visibilities are about a "
+        "hundredth of it.",
     )
     beam_extent: Length = Field(
         20.0,
         ge=0,
         description="Length added to the longest baseline, for the structure of the beam in fringe rate and delay.",
     )
+
+    def for_eor(self, smooth_beam: bool) -> Accuracy:
+        """Return the accuracy of the EoR, whose channels are independent."""
+        return self._accuracy(self.eor_tolerance, smooth_beam, smooth_sky=False)
+
+    def for_foregrounds(self, smooth_beam: bool, smooth_sky: bool) -> Accuracy:
+        """Return the accuracy of the foregrounds; arguments: what is smooth in frequency."""
+        return self._accuracy(self.tolerance, smooth_beam, smooth_sky)
+
+    def _accuracy(self, tolerance: float, smooth_beam: bool, smooth_sky: bool) -> Accuracy:
+        return Accuracy(tolerance, self.beam_extent, smooth_beam, smooth_sky) if self.enabled else EXACT
 
 
 class SimulationSettings(Section):
@@ -42,10 +62,14 @@ class SimulationSettings(Section):
     chunks: int = Field(
         16,
         ge=1,
-        description="Independent parts of a simulation, for resuming and for parallel workers; changes results by "
-        "rounding only.",
+        description="Independent parts of the simulation of the EoR, for resuming and for parallel workers; the "
+        "foregrounds have a quarter as many. Changes results by rounding only.",
         json_schema_extra=UNKEYED,
     )
+
+    def pieces(self, eor: bool) -> int:
+        """Return the largest number of pieces of the EoR, or of the foregrounds, which take a quarter of its time."""
+        return self.chunks if eor else max(1, self.chunks // 4)
 
     @model_validator(mode="before")
     @classmethod

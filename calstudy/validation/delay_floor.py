@@ -82,13 +82,13 @@ def compare_floors(
     times = integration_times(whole)
     template = subset_template(whole, times[len(times) // 2 :][:1], whole.freq_array)
     sky = make_foregrounds(experiment.sky.foregrounds, whole.freq_array, experiment.sky.diffuse).sky
-    settings = experiment.simulation
-    engine = settings.engine
+    engine = experiment.simulation.engine
+    accuracy = experiment.simulation.nodes.for_foregrounds(smooth_beam=False, smooth_sky=False)
     floors = {}
     for name in INTERPOLATIONS:
         announce(name)
         beam = interpolated(instrument.beam, instrument.channels, name)
-        cube = simulate_visibilities(engine, sky, beam, template, settings, smooth_in_frequency=False)
+        cube = simulate_visibilities(engine, sky, beam, template, accuracy)
         floors[name] = _measure(from_cube(template, cube))
     return floors
 

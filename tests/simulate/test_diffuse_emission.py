@@ -16,6 +16,7 @@ from calstudy.simulate.chunks import simulate_visibilities
 from calstudy.simulate.component import Component
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.nodes import Accuracy
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky import diffuse
 from calstudy.sky import settings as section
@@ -53,7 +54,7 @@ def test_map_and_sources_add_up(dipole_beam):
     template = observe(channels=8, width="1 MHz", times=12, integration="9 s")
     points, pixels = random_sky(template), diffuse.make_diffuse(HASLAM)
     both = diffuse.add_skies(points, pixels, template.freq_array)
-    cube = simulate_visibilities(DenseEngine(), both, dipole_beam, template, SimulationSettings(), True)
+    cube = simulate_visibilities(DenseEngine(), both, dipole_beam, template, Accuracy(1e-9, beam_extent=20.0))
     parts = [DenseEngine().simulate(sky, dipole_beam, template) for sky in (points, pixels)]
     assert relative_error(cube, sum(parts)) < 1e-7
 

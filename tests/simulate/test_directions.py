@@ -19,7 +19,8 @@ def test_directions_are_pyradioskys_at_every_time(integration):
     template = observe(times=30, integration=integration)
     sky = random_sky(template)
     location, times = template.telescope.location, integration_times(template)
-    tracks = SourceTracks(sky, location, times)
+    tracks = SourceTracks.of(sky, location, times)
+    np.testing.assert_allclose(tracks.at(times[3:5]), [tracks.at(time) for time in times[3:5]], atol=TOLERANCE)
     for time in times[[0, 1, 17, 29]]:
         sky.update_positions(Time(time, format="jd", scale="utc", location=location), location)
         np.testing.assert_allclose(tracks.at(time), sky.pos_lmn, rtol=0, atol=TOLERANCE)
@@ -30,7 +31,7 @@ def test_healpix_directions_are_pyradioskys():
     template = observe(times=2)
     sky = healpix_sky(template.freq_array)
     location, times = template.telescope.location, integration_times(template)
-    tracks = SourceTracks(sky, location, times)
+    tracks = SourceTracks.of(sky, location, times)
     sky.update_positions(Time(times[1], format="jd", scale="utc", location=location), location)
     np.testing.assert_allclose(tracks.at(times[1]), sky.pos_lmn, rtol=0, atol=TOLERANCE)
 
@@ -43,7 +44,7 @@ def test_sources_are_split_by_what_they_do_within_the_run():
     for time in times:
         sky.update_positions(Time(time, format="jd", scale="utc", location=location), location)
         up.append(sky.above_horizon)
-    always_up, crossing = split_by_horizon(sky, location, times)
+    always_up, crossing = split_by_horizon(SourceTracks.of(sky, location, times), times)
     np.testing.assert_array_equal(always_up, np.flatnonzero(np.all(up, axis=0)))
     np.testing.assert_array_equal(crossing, np.flatnonzero(np.any(up, axis=0) & ~np.all(up, axis=0)))
     rising = [index for index in crossing if up[-1][index]]

@@ -8,19 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulation_cases import observe
 
-from calstudy.instrument.settings import InstrumentSettings
-from calstudy.instrument.telescope import make_template
 from calstudy.simulate.nodes import (
+    EXACT,
+    Accuracy,
     chebyshev_count,
     chebyshev_nodes,
+    frequency_axis,
     frequency_bandwidth,
     integration_times,
     interpolation_matrix,
-    node_counts,
-    node_grid,
+    time_axis,
     time_bandwidth,
+    turning_length,
 )
-from calstudy.simulate.settings import Nodes
+
+DEFAULT = Accuracy(tolerance=1e-9, beam_extent=20.0)
 
 
 @given(bandwidth=st.floats(0, 250), exponent=st.floats(-12, -3))
@@ -69,13 +71,13 @@ def test_julian_dates_are_interpolated_below_their_own_rounding():
 
 def test_counts_of_the_paper_follow_from_its_baselines():
     template = observe(count=36, channels=384, width="80 kHz", times=56, integration="2 s", polarizations=("xx",))
-    grid = node_grid(template, Nodes(), smooth_in_frequency=True)
-    assert (len(grid.times_jd), len(grid.frequencies)) == (16, 94)
+    times, channels = time_axis(template, DEFAULT), frequency_axis(template, DEFAULT)
+    assert (len(times.nodes), len(channels.nodes)) == (16, 94)
     # 176 m and 20 m of beam: half the turns of the horizon delay over 30.64 MHz.
-    assert frequency_bandwidth(template, 20.0) == pytest.approx(np.pi * 196.15 / 299792458 * 30.64e6, rel=1e-4)
-    assert time_bandwidth(template, 20.0) < np.pi * 197.6e6 / 299792458 * 197 * 7.29e-5 * 110
-    assert not grid.at_integrations
-    assert not grid.at_channels
+    assert frequency_bandwidth(template.freq_array, 196.15) == pytest.approx(np.pi * 196.15 / 299792458 * 30.64e6)
+    assert turning_length(template) < 177
+    fastest = time_bandwidth(integration_times(template), 197.6e6, 197)
+    assert fastest == pytest.approx(np.pi * 197.6e6 / 299792458 * 197 * 7.29e-5 * 110, rel=1e-3)
 
 
 def test_east_west_baselines_turn_faster_than_polar_ones():
@@ -83,7 +85,7 @@ def test_east_west_baselines_turn_faster_than_polar_ones():
     vectors = template.telescope.get_enu_antpos()
     latitude = template.telescope.location.geodetic.lat.rad
     pole = np.array([0, np.cos(latitude), np.sin(latitude)])
-    assert time_bandwidth(template, 0.0) > 0
+    assert turning_length(template) > 1.0
     along = template.copy()
     # The same array laid out along the Earth's axis does not turn at all.
     distances = np.linspace(0, np.ptp(vectors[:, 0]), len(vectors))
@@ -92,34 +94,35 @@ def test_east_west_baselines_turn_faster_than_polar_ones():
     centre = np.array([axis.to_value("m") for axis in template.telescope.location.geocentric])
     ecef = utils.ECEF_from_ENU(distances[:, None] * pole, center_loc=template.telescope.location)
     along.telescope.antenna_positions = ecef - centre
-    assert time_bandwidth(along, 0.0) < 1e-6 * time_bandwidth(template, 0.0)
+    assert turning_length(along) < 1e-6 * turning_length(template)
 
 
-@pytest.mark.parametrize("settings", [Nodes(enabled=False), Nodes(beam_extent="100 km")])
-def test_without_nodes_every_sample_is_simulated(settings):
+@pytest.mark.parametrize("accuracy", [EXACT, Accuracy(tolerance=1e-9, beam_extent=1e5)])
+def test_without_nodes_every_sample_is_simulated(accuracy):
     template = observe(channels=12, times=5, integration="2 s")
-    grid = node_grid(template, settings, smooth_in_frequency=True)
-    assert grid.at_integrations
-    assert grid.at_channels
-    np.testing.assert_array_equal(grid.times_jd, integration_times(template))
-    np.testing.assert_array_equal(grid.frequencies, template.freq_array)
-    cube = np.random.default_rng(0).normal(size=(5, template.Nbls, 12, 2))
-    np.testing.assert_array_equal(grid.interpolate(cube), cube)
+    times, channels = time_axis(template, accuracy), frequency_axis(template, accuracy)
+    assert times.at_samples
+    assert channels.at_samples
+    np.testing.assert_array_equal(times.nodes, integration_times(template))
+    np.testing.assert_array_equal(channels.nodes, template.freq_array)
+    values = np.random.default_rng(0).normal(size=(5, template.Nbls))
+    np.testing.assert_array_equal(times.interpolate(values), values)
 
 
-def test_a_sky_that_is_not_smooth_has_every_channel_as_a_node():
+@pytest.mark.parametrize("rough", ["smooth_sky", "smooth_beam"])
+def test_what_is_not_smooth_has_every_channel_as_a_node(rough):
     template = observe(channels=64, width="80 kHz", times=40, integration="2 s")
-    grid = node_grid(template, Nodes(), smooth_in_frequency=False)
-    assert grid.at_channels
-    assert not grid.at_integrations
+    accuracy = Accuracy(tolerance=1e-9, beam_extent=20.0, **{rough: False})
+    assert frequency_axis(template, accuracy).at_samples
+    assert not frequency_axis(template, DEFAULT).at_samples
+    assert not time_axis(template, accuracy).at_samples
 
 
-@pytest.mark.parametrize("layout", ["mwa-compact-minredundant", "hera-19", "mwa-extended"])
-def test_plans_expect_the_nodes_that_there_are(layout):
-    """The plan takes baselines for perpendicular to the Earth's axis, so it may have more, but not many more."""
-    settings = InstrumentSettings.model_validate({"layout": {"kind": layout}, "times": {"integration": "10 s"}})
-    grid = node_grid(make_template(settings), Nodes(), smooth_in_frequency=True)
-    times, frequencies = node_counts(settings, Nodes())
-    assert frequencies == len(grid.frequencies)
-    assert len(grid.times_jd) <= times < 1.2 * len(grid.times_jd) + 2
-    assert node_counts(settings, Nodes(enabled=False)) == (56, 384)
+def test_axes_interpolate_arrays_of_any_shape():
+    template = observe(channels=64, width="80 kHz", times=40, integration="2 s")
+    axis = time_axis(template, DEFAULT)
+    rng = np.random.default_rng(4)
+    values = rng.normal(size=(len(axis.nodes), 2, 3)) + 1j * rng.normal(size=(len(axis.nodes), 2, 3))
+    expected = np.einsum("mn,nab->mab", axis.matrix, values)
+    np.testing.assert_allclose(axis.interpolate(values), expected, atol=1e-13)
+    np.testing.assert_allclose(axis.interpolate(values.swapaxes(1, 2)), expected.swapaxes(1, 2), atol=1e-13)

@@ -15,6 +15,7 @@ from calstudy.simulate.engines.fftvis import FftvisEngine
 from calstudy.simulate.engines.matvis import MatvisEngine
 from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
 from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
+from calstudy.simulate.nodes import Accuracy
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
@@ -28,13 +29,13 @@ logger = logging.getLogger(__name__)
 class FastestEngine(Engine):
     """The first of dense, matvis, fftvis and pyuvsim that supports a simulation: the fastest."""
 
-    precision: Literal["single", "double"] = Field(
-        "double", description="Of the engine that is chosen; pyuvsim's is always double."
+    precision: Literal["auto", "single", "double"] = Field(
+        "auto", description="Of the engine that is chosen; pyuvsim's is always double. auto: its default."
     )
 
     def engines(self) -> list[Engine]:
         """Return the engines that are tried, fastest first."""
-        precise = {"precision": self.precision}
+        precise = {} if self.precision == "auto" else {"precision": self.precision}
         return [DenseEngine(**precise), MatvisEngine(**precise), FftvisEngine(**precise), PyuvsimEngine()]
 
     def choose(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> Engine:
@@ -66,6 +67,12 @@ class FastestEngine(Engine):
     def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities of the fastest engine that supports the simulation; see `Engine.simulate`."""
         return self.choose(sky, beam, template).simulate(sky, beam, template)
+
+    def interpolate(
+        self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
+    ) -> np.ndarray:
+        """Return the visibilities of that engine to a tolerance; see `Engine.interpolate`."""
+        return self.choose(sky, beam, template).interpolate(sky, beam, template, accuracy)
 
     def cost(self, size: SimulationSize) -> Cost:
         """Return the cost of the first engine, which handles the skies and beams of experiment files."""

@@ -1,4 +1,4 @@
-"""The dense engine: matrix products over sources (`calstudy.simulate.matrix_products`)."""
+"""The dense engine: matrix products over patches of sources (`calstudy.simulate.patches`)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
 from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
+from calstudy.simulate.nodes import EXACT, Accuracy
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
@@ -19,13 +20,15 @@ if TYPE_CHECKING:
 
 
 class DenseEngine(Engine):
-    """Matrix products over blocks of sources; unpolarized sky, xx and yy, any three-dimensional array.
+    """Matrix products over patches of sources; unpolarized sky, xx and yy, any three-dimensional array.
 
     With several beams the products take three times as long as with one, and each beam is evaluated.
     """
 
-    precision: Literal["single", "double"] = Field(
-        "double", description="double agrees with pyuvsim to rounding, single to 2e-6 of the rms."
+    precision: Literal["auto", "single", "double"] = Field(
+        "auto",
+        description="Of the products. double agrees with pyuvsim to rounding, single to 1e-6 of the rms; auto: single "
+        "where the tolerance of the interpolation is 1e-6 or more.",
     )
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
@@ -33,7 +36,7 @@ class DenseEngine(Engine):
         from calstudy.instrument.antenna_beams import split_beams
         from calstudy.simulate import patterns
         from calstudy.simulate.brightness import is_polarized
-        from calstudy.simulate.matrix_products import polarization_feeds
+        from calstudy.simulate.patches import polarization_feeds
 
         if is_polarized(sky):
             return "the dense engine does not handle a polarized sky"
@@ -47,9 +50,16 @@ class DenseEngine(Engine):
 
     def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
-        from calstudy.simulate.matrix_products import visibilities
+        return self.interpolate(sky, beam, template, EXACT)
 
-        return visibilities(sky, beam, template, {"double": np.float64, "single": np.float32}[self.precision])
+    def interpolate(
+        self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
+    ) -> np.ndarray:
+        """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.interpolate`."""
+        from calstudy.simulate.patches import visibilities
+
+        dtype = {"auto": None, "double": np.float64, "single": np.float32}[self.precision]
+        return visibilities(sky, beam, template, accuracy, dtype)
 
     def cost(self, size: SimulationSize) -> Cost:
         """Return what a simulation takes; see `Engine.cost`."""
@@ -58,4 +68,4 @@ class DenseEngine(Engine):
         products = 1.2e-9 * size.antennas + 1.05e-10 * size.antennas**2
         # Fields of several beams: products over both components, with one more factor to make.
         each = 2e-8 + products if size.beams == 1 else 3.5e-8 * size.beams + 3 * products
-        return Cost(1.1 * up * size.slots * each + 4.5e-6 * size.sources)
+        return Cost(1.1 * up * size.patch_slots * each + 4.5e-6 * size.sources)

@@ -1,0 +1,296 @@
+"""Visibilities of sources in patches of the sky, whose fringes turn slowly.
+
+The sources of one patch of the sky turn together. With the direction s_0(t) of the patch's centre,
+
+    V_ab(nu, t) = sum_patches  exp(2 pi i nu x_ab . s_0(t) / c)  W_ab(nu, t),
+    W_ab(nu, t) = sum_{s in patch}  w_s(nu, t)  exp(2 pi i nu x_ab . (s(t) - s_0(t)) / c),
+
+and W turns more slowly than V by the radius of the patch in radians, in time as in frequency. It is therefore
+simulated at few Chebyshev nodes and interpolated: in time, and in frequency where sky and beam are smooth. The phase of
+the centre is exact, in double precision.
+
+Errors of patches are independent and add in quadrature, so that each may contribute the same variance: a patch in the
+sidelobes, with a hundredth of the signal, needs a hundredth of the relative accuracy.
+
+Patches are added up at the time nodes of the whole sky, and interpolated from there to the integrations. Sources that
+rise or set are discontinuous in time: their patches are simulated at every integration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numba
+import numpy as np
+from pyradiosky import SkyModel
+from pyuvdata import UVData
+from threadpoolctl import threadpool_limits
+
+from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import antenna_indices, baseline_vectors, require_rectangular
+from calstudy.instrument.antenna_beams import AntennaBeams, split_beams
+from calstudy.simulate.brightness import stokes_i
+from calstudy.simulate.directions import SourceTracks, sky_cells, split_by_horizon
+from calstudy.simulate.interface import BeamSource
+from calstudy.simulate.matrix_products import PairSums, angles
+from calstudy.simulate.nodes import (
+    Accuracy,
+    Axis,
+    frequency_bandwidth,
+    integration_times,
+    make_axis,
+    patch_nside,
+    time_axis,
+    time_bandwidth,
+    turning_length,
+)
+from calstudy.simulate.patterns import InterpolatedPattern, Pattern, power_pattern
+
+SINGLE_PRECISION = 1e-6
+"""Smallest tolerance to which products in single precision are exact."""
+COMMON = 0.1
+"""Tolerance of the interpolation of all patches together, over that of each: its nodes cost little."""
+LEAST, LOOSEST = 1e-30, 0.5
+"""Signal of a patch over the rms below which it does not count, and the largest relative error of a patch."""
+
+
+def visibilities(
+    sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy, dtype: type | None = None
+) -> np.ndarray:
+    """Simulate an unpolarized sky, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
+
+    Parameters
+    ----------
+    sky, beam, template
+        As for `calstudy.simulate.interface.Engine.simulate`.
+    accuracy
+        Errors that are allowed; with a tolerance of 0 every source is simulated at every integration and channel.
+    dtype
+        Of the products, float64 or float32; by default single precision if the tolerance allows it.
+
+    Raises
+    ------
+    InputError
+        If a polarization is not xx or yy, or the beam is not of the kind `calstudy.simulate.patterns.power_pattern`
+        takes.
+    """
+    array = PatchedArray(beam, template, accuracy)
+    dtype = dtype or (np.float32 if accuracy.tolerance >= SINGLE_PRECISION else np.float64)
+    times = integration_times(template)
+    common = time_axis(template, replace(accuracy, tolerance=COMMON * accuracy.tolerance))
+    tracks = SourceTracks.of(sky, template.telescope.location, times)
+    always_up, crossing = split_by_horizon(tracks, times)
+    total = np.zeros((template.Nfreqs, len(common.nodes), template.Npols, template.Nbls), dtype=np.complex128)
+    # The products are many and small: threads in each cost more than they gain, and workers share the cores.
+    with threadpool_limits(limits=1, user_api="blas"):
+        if len(always_up):
+            steady = Patches(sky, tracks, always_up, patch_nside(sky.Ncomponents))
+            patches = PatchSum(array, sky, steady, dtype)
+            for place, tolerance in enumerate(array.tolerances(steady, sky)):
+                axis = array.time_nodes(steady.radii[place], float(tolerance), common.nodes)
+                patches.add(total, place, axis, common.nodes)
+        # Axes: integrations, channels, feeds, baselines.
+        cube = common.interpolate(total.swapaxes(0, 1))
+        if len(crossing):
+            # They are few, and each takes part in every integration by itself: one patch.
+            patches = PatchSum(array, sky, Patches(sky, tracks, crossing, nside=0), dtype)
+            patches.add(cube.swapaxes(0, 1), 0, Axis(times, np.eye(len(times))), times)
+    return np.ascontiguousarray(cube.transpose(0, 3, 1, 2))
+
+
+class Patches:
+    """Sources in the order of the patches of the sky that they belong to.
+
+    Parameters
+    ----------
+    sky, tracks
+        All components, and their directions.
+    components : (N,) int
+        Which of them are divided into patches.
+    nside
+        Of the grid whose cells are the patches; 0: one patch.
+
+    Attributes
+    ----------
+    components : (N,) int
+        The same in the order of the patches.
+    tracks
+        Of these, in this order.
+    members
+        Where the sources of each patch are in this order.
+    centres
+        Mean directions of the patches, which like those of sources are fixed points of the sky.
+    radii : (Npatches,) float
+        Largest distance of a source from the centre of its patch, rad.
+    """
+
+    def __init__(self, sky: SkyModel, tracks: SourceTracks, components: np.ndarray, nside: int) -> None:
+        cells = sky_cells(sky, nside)[components]
+        order = np.argsort(cells, kind="stable")
+        self.components = components[order]
+        self.tracks = tracks.select(self.components)
+        starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
+        self.members = [slice(*ends) for ends in pairwise([*starts.tolist(), len(order)])]
+        sizes = np.diff(starts, append=len(order))
+        centres = np.add.reduceat(self.tracks.vectors, starts, axis=2) / sizes
+        self.centres = SourceTracks(tracks.nodes, centres)
+        offsets = self.tracks.vectors[0] - np.repeat(centres[0], sizes, axis=1)
+        self.radii = np.maximum.reduceat(np.linalg.norm(offsets, axis=0), starts)
+
+
+def polarization_feeds(template: UVData) -> list[str]:
+    """Return the feed of each polarization; raises InputError for cross-hand or circular ones."""
+    feeds = {-5: "x", -6: "y"}
+    unknown = [int(number) for number in template.polarization_array if int(number) not in feeds]
+    if unknown:
+        raise InputError(f"polarization number {unknown[0]} is not xx (-5) or yy (-6)")
+    return [feeds[int(number)] for number in template.polarization_array]
+
+
+class PatchedArray:
+    """The antennas of an observation and their beams, and at which times and frequencies patches are simulated.
+
+    Parameters
+    ----------
+    beam, template
+        As for `calstudy.simulate.interface.Engine.simulate`.
+    accuracy
+        Errors that are allowed.
+    """
+
+    def __init__(self, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy) -> None:
+        require_rectangular(template)
+        self.template, self.accuracy = template, accuracy
+        used, pairs = np.unique(antenna_indices(template), return_inverse=True)
+        self._beams, index = split_beams(beam, template)
+        self._index, self._feeds = index[used], polarization_feeds(template)
+        self.delays = template.telescope.get_enu_antpos()[used] / SPEED_OF_LIGHT
+        first, second = pairs.reshape(-1, 2).T
+        self.pairs = np.ascontiguousarray(first), np.ascontiguousarray(second)
+        self._turning = turning_length(template)
+        self._longest = np.linalg.norm(baseline_vectors(template), axis=1).max()
+
+    def frequency_nodes(self, radius: float) -> Axis:
+        """Choose the frequencies at which patches of a radius (rad) are simulated."""
+        channels, accuracy = self.template.freq_array, self.accuracy
+        bandwidth = frequency_bandwidth(channels, radius * self._longest + accuracy.beam_extent)
+        smooth = accuracy.smooth_beam and accuracy.smooth_sky
+        return make_axis(channels, bandwidth, accuracy.tolerance if smooth else 0.0)
+
+    def time_nodes(self, radius: float, tolerance: float, times: np.ndarray) -> Axis:
+        """Choose the times at which a patch is simulated, from which it is interpolated to `times` (Julian dates)."""
+        length = self._turning * radius + self.accuracy.beam_extent
+        return make_axis(times, time_bandwidth(times, self.template.freq_array.max(), length), tolerance)
+
+    def tolerances(self, patches: Patches, sky: SkyModel) -> np.ndarray:
+        """Return the relative error that each patch may have, (Npatches,), so that all contribute the same variance.
+
+        The variance of a patch is the sum of the squares of its sources, at the middle integration and channel through
+        the beam that sees most of each.
+        """
+        if not self.accuracy.tolerance:
+            return np.zeros(len(patches.members))
+        channel = self.template.freq_array[[self.template.Nfreqs // 2]]
+        time = integration_times(self.template)[self.template.Ntimes // 2]
+        directions = angles(patches.tracks.at(time))
+        response = np.maximum.reduce([pattern.at(*directions)[:, 0] for pattern in self._patterns(channel)])
+        weights = response * stokes_i(sky, channel, patches.components)
+        signal = np.sqrt([np.sum(weights[:, members] ** 2) for members in patches.members])
+        rms = np.sqrt(np.mean(signal**2))
+        return np.minimum(self.accuracy.tolerance * rms / np.maximum(signal, LEAST * rms), LOOSEST) if rms else signal
+
+    def pair_sums(self, frequencies: np.ndarray, dtype: type) -> PairSums:
+        """Return what sums the visibilities of sources at some frequencies."""
+        return PairSums(self.delays, self.pairs, frequencies, self._patterns(frequencies), self._index, dtype)
+
+    def _patterns(self, frequencies: np.ndarray) -> list[Pattern]:
+        """Return the patterns of the distinct beams, interpolated from fewer frequencies where they are smooth."""
+        bandwidth = frequency_bandwidth(frequencies, self.accuracy.beam_extent)
+        axis = make_axis(frequencies, bandwidth, self.accuracy.tolerance if self.accuracy.smooth_beam else 0.0)
+        found = [power_pattern(beam.at(axis.nodes), axis.nodes, self._feeds) for beam in self._beams]
+        return found if axis.at_samples else [*(InterpolatedPattern(pattern, axis.matrix) for pattern in found)]
+
+
+class PatchSum:
+    """Simulates patches and adds them up.
+
+    Parameters
+    ----------
+    array
+        The antennas.
+    sky
+        Has the sources.
+    patches
+        Some of them.
+    dtype
+        Of the products.
+    """
+
+    def __init__(self, array: PatchedArray, sky: SkyModel, patches: Patches, dtype: type) -> None:
+        self._array, self._patches = array, patches
+        self._channels = array.frequency_nodes(patches.radii.max())
+        self._sums = array.pair_sums(self._channels.nodes, dtype)
+        self._flux = stokes_i(sky, self._channels.nodes, patches.components)
+
+    def add(self, total: np.ndarray, place: int, axis: Axis, times: np.ndarray) -> None:
+        """Add a patch at all channels and some times.
+
+        Parameters
+        ----------
+        total : (Nfreqs, Nt, Nfeeds, Nbls) complex128
+            To which it is added.
+        place
+            Which patch.
+        axis
+            Its nodes in time. Where every time is a node nothing is interpolated, and sources may be below the horizon.
+        times : (Nt,) float
+            Of the total.
+        """
+        if not axis.at_samples:
+            self._add(total, place, axis, times)
+            return
+        for step in range(len(times)):
+            now = times[step : step + 1]
+            self._add(total[:, step : step + 1], place, Axis(now, np.eye(1)), now)
+
+    def _add(self, total: np.ndarray, place: int, axis: Axis, times: np.ndarray) -> None:
+        members, inner = self._patches.members[place], []
+        flux = self._flux[:, members]
+        centres = self._patches.centres.at(axis.nodes, slice(place, place + 1))[..., 0]
+        for vectors, centre in zip(self._patches.tracks.at(axis.nodes, members), centres, strict=True):
+            up = vectors[2] > 0
+            inner.append(
+                self._sums.at(vectors, centre, flux) if up.all() else self._sums.at(vectors[:, up], centre, flux[:, up])
+            )
+        at_channels = self._channels.interpolate(np.stack(inner, axis=1))
+        _add_turned(total, at_channels, axis.matrix, self._centre_fringes(place, times), *self._array.pairs)
+
+    def _centre_fringes(self, place: int, times: np.ndarray) -> np.ndarray:
+        """Return exp(2 pi i nu x.s_0 / c) of all antennas, (Nfreqs, Nt, Nants)."""
+        delays = self._array.delays @ self._patches.centres.at(times, slice(place, place + 1))[..., 0].T
+        turns = self._array.template.freq_array[:, None, None] * delays.T
+        return np.exp(2j * np.pi * (turns - np.round(turns)))
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _add_turned(
+    total: np.ndarray, inner: np.ndarray, matrix: np.ndarray, fringes: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> None:
+    """Add the interpolation of inner (Nfreqs, Nk, Nfeeds, Nbls) in time, times the fringes of the centre."""
+    turn, value = np.empty(first.size, dtype=np.complex128), np.empty(first.size, dtype=np.complex128)
+    for channel in range(total.shape[0]):
+        for time in range(total.shape[1]):
+            fringe = fringes[channel, time]
+            for pair in range(first.size):
+                turn[pair] = fringe[first[pair]].conjugate() * fringe[second[pair]]
+            for feed in range(total.shape[2]):
+                value[:] = 0.0
+                for node in range(inner.shape[1]):
+                    weight, row = matrix[time, node], inner[channel, node, feed]
+                    for pair in range(value.size):
+                        value[pair] += weight * row[pair]
+                row = total[channel, time, feed]
+                for pair in range(value.size):
+                    row[pair] += value[pair] * turn[pair]
