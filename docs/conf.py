@@ -52,7 +52,7 @@ apidoc_modules = [
         "path": "../calstudy",
         "destination": "docs/api",
         "exclude_patterns": [
-            f"**/{name}/**" for name in ("published", "bench", "cli", "papers", "regression", "report", "validation")
+            f"**/{name}/**" for name in ("published", "cli", "papers", "regression", "report", "validation")
         ],
         # Attributes of a class are described in its docstring, and not once more as its members.
         "automodule_options": ["members", "show-inheritance"],
