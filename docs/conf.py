@@ -30,6 +30,7 @@ root_doc = "docs/index"
 include_patterns = [
     "docs/**",
     "notebooks/*.ipynb",
+    "benchmarks/README.md",
     "figures/*.md",
     "figures/*/*.md",
     "data/README.md",
