@@ -30,6 +30,7 @@ root_doc = "docs/index"
 include_patterns = [
     "docs/**",
     "notebooks/*.ipynb",
+    "benchmarks/README.md",
     "figures/*.md",
     "figures/*/*.md",
     "data/README.md",
@@ -52,7 +53,7 @@ apidoc_modules = [
         "path": "../calstudy",
         "destination": "docs/api",
         "exclude_patterns": [
-            f"**/{name}/**" for name in ("published", "bench", "cli", "papers", "regression", "report", "validation")
+            f"**/{name}/**" for name in ("published", "cli", "papers", "regression", "report", "validation")
         ],
         # Attributes of a class are described in its docstring, and not once more as its members.
         "automodule_options": ["members", "show-inheritance"],

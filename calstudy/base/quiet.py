@@ -7,19 +7,8 @@ import os
 import sys
 
 
-def load_tensorflow(threads: int | None = None) -> None:
-    """Import TensorFlow without what its native code writes to standard error before any setting is heeded.
-
-    Parameters
-    ----------
-    threads
-        Processor cores that it, and numerical libraries loaded from now on, may use; all by default.
-    """
-    if threads is not None:
-        for name in ("OMP_NUM_THREADS", "TF_NUM_INTRAOP_THREADS", "TF_NUM_INTEROP_THREADS"):
-            os.environ[name] = str(threads)
-        if threads == 1:
-            os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
+def load_tensorflow() -> None:
+    """Import TensorFlow without what its native code writes to standard error before any setting is heeded."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if "tensorflow" in sys.modules:
         return

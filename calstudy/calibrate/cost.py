@@ -141,22 +141,6 @@ def _unknowns(dimensions: Dimensions, settings: GainFit) -> float:
     return 8 * word * (gains + 2 * dimensions.coefficients) + 10 * word * dimensions.samples
 
 
-def fit_models_at_once(dimensions: Dimensions, settings: GainFit, budget: float) -> GainFit:
-    """Return settings that work on as few models at a time as the memory demands, and as many as they say if it allows.
-
-    What does not fit even with `LEAST_MODELS` at a time comes back with that number.
-
-    Parameters
-    ----------
-    budget
-        Bytes for one solve, libraries included.
-    """
-    while settings.models_at_once > LEAST_MODELS and solve_memory(dimensions, settings) > budget:
-        fewer = max(settings.models_at_once // 2, LEAST_MODELS)
-        settings = settings.model_copy(update={"models_at_once": fewer})
-    return settings
-
-
 def basis_vectors(length: float, channels: Channels, basis: BasisSettings) -> int:
     """Return how many foreground vectors a baseline of this length (m) has, about.
 

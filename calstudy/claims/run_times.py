@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calstudy.bench.scaling import PowerLaw, fit_power_law
-from calstudy.products.run_times import RUNTIME
+from calstudy.products.run_times import RUNTIME, PowerLaw, fit_power_law
 from calstudy.verdicts.statement import Unevaluated
 
 RUN_TIME = "run_time"

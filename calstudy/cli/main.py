@@ -19,7 +19,6 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base import ranks
 from calstudy.base.errors import ExperimentError, InputError, refusal_of_disk
-from calstudy.cli.bench import bench_app
 from calstudy.cli.calibrate import calibrate
 from calstudy.cli.check import check_app
 from calstudy.cli.compare_gains import compare_gains
@@ -50,7 +49,6 @@ app.command()(init)
 app.command()(schema)
 app.command()(runs)
 app.command()(store)
-app.add_typer(bench_app, name="bench")
 app.add_typer(check_app, name="check")
 
 EXIT_INPUT = 2

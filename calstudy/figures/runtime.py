@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from calstudy.bench.scaling import RuntimeSeries, summarize_runtime
+import numpy as np
+from numpy.typing import ArrayLike
+
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.products.files import read_json
 from calstudy.products.graph import Graph
-from calstudy.products.run_times import CASE
+from calstudy.products.run_times import CASE, QUANTILES, PowerLaw, fit_power_law
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import MACHINE
 
@@ -31,6 +34,37 @@ AXES = {"rows": ("number of antennas", r"N_\mathrm{ant}"), "line": ("longest bas
 CLOCKS = {"cpu": "one core", "gpu": "GPU"}
 MOST = 2 * len(COLOURS)
 """Series in one figure; the second four have open markers and broken lines."""
+
+
+@dataclass(frozen=True)
+class RuntimeSeries:
+    """Run times of one machine or solver.
+
+    Attributes
+    ----------
+    label
+        Machine or solver.
+    size
+        Number of antennas, or longest baseline in m, (Nsizes,), increasing.
+    median, low, high
+        Median and ends of the central 95 % of the run times, (Nsizes,), s.
+    fit
+        The medians as a power of the size.
+    """
+
+    label: str
+    size: np.ndarray
+    median: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    fit: PowerLaw
+
+
+def summarize_runtime(label: str, size: ArrayLike, seconds: Sequence[Sequence[float]]) -> RuntimeSeries:
+    """Reduce the run times of every size to medians, 95 % bands and a power law; raises what `fit_power_law` raises."""
+    sizes = np.asarray(size, dtype=float)
+    low, median, high = np.array([np.quantile(item, QUANTILES) for item in seconds]).T
+    return RuntimeSeries(label, sizes, median, low, high, fit_power_law(sizes, median))
 
 
 @style.journal_style()

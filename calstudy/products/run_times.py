@@ -1,12 +1,12 @@
-"""Run times of the solvers: measured for one array after the other, and their table."""
+"""Run times of the solvers: measured for one array after the other, their table, and how they scale."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
 from calstudy.base.schema import Section
@@ -18,12 +18,17 @@ from calstudy.instrument.size import antenna_count
 from calstudy.products.files import read_json, write_json
 from calstudy.run.task import Job, Stage, Task
 
+if TYPE_CHECKING:
+    import numpy as np
+
 CASE, LOSSES, DESCENT, RUNTIME = "case.json", "losses.npz", "descent.json", "runtime.json"
 # The paper's padded step, per byte of its basis.
 PADDED_SECONDS = 1e-9
 PADDED_COPIES = 7
 EXCESSES = ("0.05", "0.01", "0.002")
 """Fractions above the minimum to which steps are counted."""
+QUANTILES = (0.025, 0.5, 0.975)
+"""The ends of the central 95 %, and the median."""
 COLUMNS = ("panel", "size", "device", "antennas", "baselines", "longest [m]", "vectors", "coefficients", "timed")
 
 
@@ -39,7 +44,7 @@ def time_steps(job: Job) -> Mapping[str, Any]:
     """Time all solvers on one array, in a process of its own."""
     import numpy as np
 
-    from calstudy.bench.step_times import Samples, time_steps_apart
+    from calstudy.products.step_times import Samples, time_steps_apart
 
     settings = job.settings
     array = settings["array"].model_dump(mode="json")
@@ -53,7 +58,7 @@ def count_steps(job: Job) -> Mapping[str, Any]:
     """Run the paper's solver for all its steps, and count how many it needs."""
     import numpy as np
 
-    from calstudy.bench.step_times import descend_apart
+    from calstudy.products.step_times import descend_apart
 
     found = descend_apart(job.settings["array"].model_dump(mode="json"), job.settings["max_steps"])
     np.savez(job.output / LOSSES, allow_pickle=False, losses=found.losses, floor=found.floor)
@@ -82,8 +87,6 @@ def summarize(job: Job) -> Mapping[str, Any]:
 def _quantiles(samples: Sequence[float]) -> dict[str, float]:
     import numpy as np
 
-    from calstudy.bench.scaling import QUANTILES
-
     low, median, high = (float(value) for value in np.quantile(samples, QUANTILES))
     return {"median": median, "low": low, "high": high, "count": len(samples)}
 
@@ -96,6 +99,36 @@ def _write_csv(path: Path, cases: Sequence[Mapping[str, Any]]) -> None:
             known = [case[name.partition(" ")[0]] for name in COLUMNS[:-1]]
             for name, found in case["seconds"].items():
                 writer.writerow([*known, name, *(found[key] for key in ("median", "low", "high", "count"))])
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """value = amplitude · size^exponent; the error is one standard deviation of the exponent."""
+
+    amplitude: float
+    exponent: float
+    error: float
+
+    def at(self, size: np.ndarray | float) -> np.ndarray | float:
+        """Return the value at a size."""
+        return self.amplitude * size**self.exponent
+
+
+def fit_power_law(size: np.ndarray, value: np.ndarray) -> PowerLaw:
+    """Fit a straight line to the logarithms of positive values at three sizes or more, (Nsizes,).
+
+    Raises
+    ------
+    ValueError
+        If there are fewer sizes, or a number is not positive.
+    """
+    import numpy as np
+    from scipy.stats import linregress
+
+    if len(size) != len(value) or np.unique(size).size < 3 or min(*size, *value) <= 0:
+        raise ValueError(f"a power law needs positive values at three sizes or more, got {len(value)} at {len(size)}")
+    line = linregress(np.log(size), np.log(value))
+    return PowerLaw(float(np.exp(line.intercept)), float(line.slope), float(line.stderr))
 
 
 def _cost_of_timing(task: Task) -> Cost:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +13,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as TerminalTable
 
-from calstudy.base.errors import InputError
 from calstudy.verdicts.criterion import Verdict
 
 OUTCOMES = ("PASS", "FAIL", "not evaluated")
@@ -30,7 +28,6 @@ COLOURS = {
 CLAIMS_JSON, CLAIMS_MARKDOWN = "claims.json", "claims.md"
 BY_SOLVER_JSON, BY_SOLVER_MARKDOWN = "claims-by-solver.json", "claims-by-solver.md"
 CLAIMS_FILES = (CLAIMS_JSON, CLAIMS_MARKDOWN, BY_SOLVER_JSON, BY_SOLVER_MARKDOWN)
-SUFFIXES = (".csv", ".md")
 LARGE = 1e5
 """Numbers beyond this have an exponent."""
 
@@ -67,23 +64,6 @@ class Table:
         marks = ["---", *["--:" if numbers else "---"] * (len(self.headings) - 1)]
         rows = ([cell.replace("|", "\\|") for cell in row] for row in (self.headings, marks, *self.rows))
         return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
-
-    def write(self, path: Path) -> None:
-        """Write it as CSV or Markdown, whichever the path's ending says; see `require_writable`."""
-        require_writable(path)
-        if path.suffix == ".csv":
-            with path.open("w", newline="", encoding="utf-8") as file:
-                csv.writer(file).writerows([self.headings, *self.rows])
-        else:
-            path.write_text(self.markdown(), encoding="utf-8")
-
-
-def require_writable(path: Path) -> None:
-    """Raise InputError unless a table can be written to this path; called before anything is measured."""
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"--output {path}: the name must end in {' or '.join(SUFFIXES)}")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"--output {path}: there is no folder {path.absolute().parent}")
 
 
 def coloured(text: str) -> str:

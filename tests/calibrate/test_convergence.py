@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
-from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.calibrate.agreement import Baselines
 from calstudy.calibrate.bias import Realization, cross_power, ratio_over_antennas
 from calstudy.calibrate.problem import gain_products
@@ -17,6 +16,7 @@ from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve, solve_warm
 from calstudy.calibrate.solvers.lbfgs import Lbfgs
 from calstudy.calibrate.solvers.reduced import newton_decrement_at
+from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.calibrate.trace import trace
 
 

@@ -15,7 +15,6 @@ from test_calibration_loss import redundant_structure
 from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
 from calstudy.base.visibilities import from_cube, to_cube
-from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis
 from calstudy.calibrate.calibrators.calamity import Calamity
@@ -29,6 +28,7 @@ from calstudy.calibrate.settings import BasisSettings, ForegroundPrior
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.solvers.reduced import ReducedKernels
+from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.measured.defaults import defaults
 
 SIGMA = 0.05

@@ -13,12 +13,12 @@ import pytest
 from toy import complex_normal, scattered
 
 from calstudy.base.observation import Frame
-from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.settings import BasisSettings, DelayStart
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
+from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import GOLOMB_MARKS
 
 SOLVER = GaussNewton(tolerance=1e-4, max_steps=200)

@@ -1,14 +1,13 @@
-"""What a solve is planned to take: against what it takes, and how it is made to fit."""
+"""The planned memory of a solve: against the measured one, and how it is made to fit."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from calstudy.base.errors import InputError
-from calstudy.bench.calibration_case import Case, Simulation
-from calstudy.bench.solve_memory import measure_solve, plan_solve
 from calstudy.calibrate.basis import make_basis
 from calstudy.calibrate.calibrators.calamity import Calamity
 from calstudy.calibrate.cost import (
@@ -16,10 +15,9 @@ from calstudy.calibrate.cost import (
     TENSORFLOW_MEMORY,
     Dimensions,
     dimensions_of,
-    fit_models_at_once,
     solve_memory,
 )
-from calstudy.cli.bench import bench_app
+from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.size import Size, baseline_lengths
@@ -28,15 +26,15 @@ DEFAULT = Calamity()
 LARGE = Dimensions(antennas=350, baselines=61_075, models=61_075, channels=384, widest=53, coefficients=1.95e6)
 
 
-def test_less_memory_means_fewer_models_at_a_time():
-    whole = solve_memory(LARGE, DEFAULT)
-    assert fit_models_at_once(LARGE, DEFAULT, whole) == DEFAULT
-    fewer = fit_models_at_once(LARGE, DEFAULT, whole - 1e8)
-    assert LEAST_MODELS <= fewer.models_at_once < DEFAULT.models_at_once
-    assert solve_memory(LARGE, fewer) <= whole - 1e8
-    least = fit_models_at_once(LARGE, DEFAULT, 1e9)
-    assert least.models_at_once == LEAST_MODELS
-    assert 1e9 < solve_memory(LARGE, least) < solve_memory(LARGE, fewer)
+def test_fewer_models_at_a_time_take_less_memory():
+    sizes, fit = [], DEFAULT
+    while fit is not None:
+        sizes.append((fit.models_at_once, solve_memory(LARGE, fit)))
+        fit = fit.leaner()
+    assert [count for count, _ in sizes] == [1024, 512, 256, 128, 64, LEAST_MODELS]
+    memory = [size for _, size in sizes]
+    assert memory == sorted(memory, reverse=True)
+    assert 1e9 < memory[-1] < memory[0] - 1e8
 
 
 def test_350_antennas_are_planned_within_16_gb():
@@ -93,28 +91,28 @@ def test_every_solver_has_its_own_time():
     assert seconds(cold) > 3 * found["gauss-newton"]
 
 
-def test_what_cannot_fit_is_refused_before_it_starts():
-    with pytest.raises(
-        InputError, match=r"--antennas 60: a solve of 1770 baselines x 64 channels needs about 1\.\d GB"
-    ):
-        plan_solve(60, 64, 1e9)
-    for text in ("36;128", "2,36", "", "36,"):
-        result = CliRunner().invoke(bench_app, ["memory", "--antennas", text])
-        assert isinstance(result.exception, InputError)
-
-
-def test_the_bench_measures_one_solve():
-    found = measure_solve(5, 64, 16e9, 2)
-    assert (found.antennas, found.baselines, found.models_at_once) == (5, 10, 1024)
-    assert (found.n_steps, found.status) == (2, "max-steps")
-    assert 0.5e9 < found.measured < 1.5 * found.planned
+MEASURE = """
+import sys
+from calstudy.base.resources import Usage
+from calstudy.calibrate.solvers.gauss_newton import GaussNewton
+from calstudy.calibrate.solvers.interface import solve
+from calstudy.calibrate.synthetic import Case, Simulation
+simulation = Simulation(Case(antennas=int(sys.argv[1])))
+problem = simulation.problem(0, simulation.structure())
+with Usage() as usage:
+    solve(problem, GaussNewton())
+print(usage.peak_memory)
+"""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("antennas", [36, 96])
 def test_what_is_planned_is_what_it_takes(antennas):
-    found = measure_solve(antennas, 384, 16e9, 100)
-    assert found.planned / 1.5 < found.measured < 1.5 * found.planned
+    """In a process of its own, whose memory is that of one cold solve."""
+    command = [sys.executable, "-c", MEASURE, str(antennas)]
+    measured = int(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
+    planned = solve_memory(Dimensions.of(Simulation(Case(antennas=antennas)).structure()), DEFAULT)
+    assert planned / 1.5 < measured < 1.5 * planned
 
 
 def test_dimensions_are_those_of_the_structure():

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from test_calibration_loss import redundant_structure
 from toy import complex_normal, make_toy, scattered
 
-from calstudy.bench.calibration_case import Case, Simulation
 from calstudy.calibrate import calamity
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase, model_scale, sky_model_slope
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
@@ -24,6 +23,7 @@ from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import WarmStart, solve, solve_warm
 from calstudy.calibrate.solvers.preconditioners import coupled_inverse
 from calstudy.calibrate.solvers.reduced import compiled
+from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import GOLOMB_MARKS
 
 

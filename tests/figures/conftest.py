@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calstudy.bench.scaling import summarize_runtime
 from calstudy.figures.baselines import BaselineSpectra, draw_baselines
 from calstudy.figures.data import draw_data
 from calstudy.figures.gains import compare_gains, draw_gains
 from calstudy.figures.layout import LayoutPanel, draw_layouts
 from calstudy.figures.model import draw_model
 from calstudy.figures.reflections import draw_reflections
-from calstudy.figures.runtime import draw_runtime
+from calstudy.figures.runtime import draw_runtime, summarize_runtime
 from calstudy.figures.solver_comparison import draw_solver_comparison
 from calstudy.figures.spherical import SphericalColumn, draw_spherical
 from calstudy.figures.spherical_comparison import draw_spherical_comparison

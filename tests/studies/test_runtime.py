@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.bench.step_times import Descent, StepTimes
 from calstudy.claims.folders import evaluate_folder
+from calstudy.products.step_times import Descent, StepTimes
 from calstudy.studies import runtime
 from calstudy.studies.load import load_study
 from calstudy.studies.runtime import RuntimeStudy
@@ -45,8 +45,8 @@ def pretend_to_descend(array, max_steps):
 
 @pytest.fixture
 def study(tmp_path, monkeypatch) -> RuntimeStudy:
-    monkeypatch.setattr("calstudy.bench.step_times.time_steps_apart", pretend_to_time)
-    monkeypatch.setattr("calstudy.bench.step_times.descend_apart", pretend_to_descend)
+    monkeypatch.setattr("calstudy.products.step_times.time_steps_apart", pretend_to_time)
+    monkeypatch.setattr("calstudy.products.step_times.descend_apart", pretend_to_descend)
     places = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
     monkeypatch.setattr(sys.modules[__name__], "PLACES", places)
     return reload()

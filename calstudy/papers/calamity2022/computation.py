@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calstudy.bench.scaling import PowerLaw, fit_power_law
 from calstudy.claims.run_times import RunTimes
+from calstudy.products.run_times import PowerLaw, fit_power_law
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
 from calstudy.verdicts.statement import Source
 

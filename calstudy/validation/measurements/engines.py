@@ -6,6 +6,7 @@ The closed form: one source of flux I at s, seen by dishes of power beam A, give
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -17,18 +18,31 @@ from pyradiosky import SkyModel
 from scipy.constants import speed_of_light
 
 from calstudy.base.visibilities import baseline_vectors
-from calstudy.bench.engines import CANDIDATES, REFERENCE, Work, time_engines
+from calstudy.corrupt.levels import rms
 from calstudy.instrument.beam_models.gaussian import GaussianBeam
 from calstudy.instrument.beams import make_beam
-from calstudy.instrument.settings import InstrumentSettings
-from calstudy.instrument.telescope import make_template
+from calstudy.instrument.settings import InstrumentSettings, MwaLayout
+from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate.interface import Engine
+from calstudy.simulate.nodes import integration_times
+from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.sky.settings import SyntheticSources
 from calstudy.validation.measurement import Findings, Inputs, Measurement
 from calstudy.verdicts.criterion import Finding
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
+REFERENCE = ("pyuvsim", "double")
+CANDIDATES = (
+    ("dense", "double"),
+    ("dense", "single"),
+    ("matvis", "double"),
+    ("fftvis", "single"),
+    ("fftvis", "double"),
+    REFERENCE,
+)
+"""Engines and precisions that are compared. matvis in single precision rounds its phases to 1e-4 and is left out."""
 FLUX = 3.0
 BEAM = GaussianBeam(kind="gaussian")
 OFFSETS = ((0.0, 0.0), (6.0, 20.0), (15.0, 200.0), (40.0, 310.0))
@@ -47,9 +61,8 @@ class Engines(Measurement):
     def measure(self, inputs: Inputs) -> Findings:
         """Run all engines on the same work, and on single sources."""
         del inputs
-        timings = time_engines(Work(self.sources, self.antennas, self.channels, self.times), list(self.engines))
-        errors = {(item.engine, item.precision): item.error for item in timings if item.engine != REFERENCE}
-        closed = {item: closed_form_error(*item) for item in CANDIDATES if item[0] in self.engines}
+        compared = [item for item in CANDIDATES if item[0] in self.engines]
+        errors, closed = self.errors(compared), {item: closed_form_error(*item) for item in compared}
         both = {**errors, **{key: max(errors.get(key, 0.0), value) for key, value in closed.items()}}
         values = {
             f"{precision}_{what}": Finding(max(value for (_, kind), value in found.items() if kind == precision), 0.0)
@@ -60,6 +73,26 @@ class Engines(Measurement):
         return Findings(
             values, tuple(f"{name} ({kind}): {value:.1e} of the rms" for (name, kind), value in both.items())
         )
+
+    def errors(self, compared: Sequence[tuple[str, str]]) -> dict[tuple[str, str], float]:
+        """Return the largest difference from pyuvsim over the rms of the visibilities, by engine and precision."""
+        instrument = InstrumentSettings(layout=MwaLayout(count=self.antennas))
+        whole = make_template(instrument)
+        times, channels = _spread(whole.Ntimes, self.times), _spread(whole.Nfreqs, self.channels)
+        template = subset_template(whole, integration_times(whole)[times], whole.freq_array[channels])
+        beam = make_beam(instrument.beam, instrument.channels)
+        sky = make_foregrounds(SyntheticSources(count=self.sources), whole.freq_array).sky
+        cubes = {item: _make(*item).simulate(sky, beam, template) for item in dict.fromkeys([*compared, REFERENCE])}
+        reference = cubes.pop(REFERENCE)
+        return {item: float(np.abs(cube - reference).max()) / rms(reference) for item, cube in cubes.items()}
+
+
+def _make(engine: str, precision: str) -> Engine:
+    return Engine.registry.make({"kind": engine, "precision": precision})
+
+
+def _spread(length: int, count: int) -> np.ndarray:
+    return np.unique(np.linspace(0, length - 1, count + 2).round().astype(int)[1:-1])
 
 
 def closed_form_error(engine: str, precision: str) -> float:
@@ -74,7 +107,7 @@ def closed_form_error(engine: str, precision: str) -> float:
     )
     template = make_template(settings)
     beam = make_beam(settings.beam, settings.channels)
-    simulator = Engine.registry.make({"kind": engine, "precision": precision})
+    simulator = _make(engine, precision)
     worst = 0.0
     for zenith_angle, azimuth in OFFSETS:
         angles = np.radians([zenith_angle, azimuth])

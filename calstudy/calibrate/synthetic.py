@@ -11,7 +11,6 @@ from calstudy.calibrate.basis import make_basis
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.settings import BasisSettings
 
-FIRST_CHANNEL, BAND = 167.075e6, 30.72e6
 SIDEREAL_RATE = 7.2921e-5
 SOURCES = 150
 
@@ -25,22 +24,20 @@ class Case:
     antennas, channels
         Their numbers.
     extent
-        Diameter of the array in m, where it is a random one.
+        Diameter of a random array, m.
     first, band
-        Centre of the first channel, and number of channels times their width, Hz; the paper's by default.
+        Centre of the first channel, and number of channels times their width, Hz; by default the paper's.
     gain_scatter, noise, eor
-        Scatter of the gains per channel, noise and EoR over the rms of the foregrounds.
+        Scatter of the gains per channel; noise and EoR over the rms of the foregrounds.
     integration
-        Seconds between integrations.
-    seed
-        Of all that is random.
+        Time between integrations, s.
     """
 
     antennas: int = 36
     channels: int = 384
     extent: float = 176.0
-    first: float = FIRST_CHANNEL
-    band: float = BAND
+    first: float = 167.075e6
+    band: float = 30.72e6
     gain_scatter: float = 0.1
     noise: float = 1e-3
     eor: float = 0.0
@@ -54,14 +51,14 @@ class Case:
 
 
 class Simulation:
-    """Antennas, sky and gains of a case.
+    """Array, sky and gains of a case.
 
     Parameters
     ----------
     case
-        Size, band, noise, seed.
+        What is simulated.
     positions
-        East, north, up of `case.antennas` antennas in m, (Nants, 3); by default at random within `case.extent`.
+        East, north, up of the antennas in m, (Nants, 3); by default at random within `case.extent`.
 
     Attributes
     ----------
@@ -90,7 +87,7 @@ class Simulation:
         return FitStructure.per_baseline(self.antennas, self.case.antennas, found)
 
     def foregrounds(self, integration: int) -> np.ndarray:
-        """Return the foregrounds F of one integration as the sky drifts, (Nbls, Nfreqs), complex."""
+        """Return the foregrounds F of one integration under the drifting sky, (Nbls, Nfreqs), complex."""
         angle = SIDEREAL_RATE * self.case.integration * integration
         east = self._east + angle * np.sqrt(np.maximum(1 - self._east**2 - self._north**2, 0))
         up = np.sqrt(np.maximum(1 - east**2 - self._north**2, 0))
@@ -105,31 +102,18 @@ class Simulation:
             result[:, channel] = matrix[second, first]
         return result
 
-    def signal(self, integration: int) -> np.ndarray:
-        """Return a stand-in for the EoR, white in frequency and independent by baseline, (Nbls, Nfreqs)."""
-        del integration
-        rng = np.random.default_rng([self.case.seed, 17])
-        return self.case.eor * self._rms * _complex_normal(rng, (len(self.antennas), self.case.channels))
-
     def problem(self, integration: int, structure: FitStructure, realization: int = 0) -> CalibrationProblem:
-        """Return the problem of one integration, from unity gains; realizations differ in their noise.
+        """Return the problem of one integration with one realization of the noise, from unity gains.
 
-        Parameters
-        ----------
-        integration
-            Its index, from which foregrounds, signal and noise are drawn.
-        structure
-            Of the fit.
-        realization
-            Of the noise.
+        The EoR is white in frequency, independent by baseline, and the same in all integrations.
         """
-        rng = np.random.default_rng([self.case.seed, 3, integration, realization])
         shape = (len(self.antennas), self.case.channels)
-        sky = self.foregrounds(integration) + self.signal(integration)
-        measured = sky + self.case.noise * self._rms * _complex_normal(rng, shape)
+        eor = self.case.eor * self._rms * _complex_normal(np.random.default_rng([self.case.seed, 17]), shape)
+        rng = np.random.default_rng([self.case.seed, 3, integration, realization])
+        noise = self.case.noise * self._rms * _complex_normal(rng, shape)
         return CalibrationProblem(
             structure,
-            gain_products(self.gains, self.antennas) * measured,
+            gain_products(self.gains, self.antennas) * (self.foregrounds(integration) + eor + noise),
             flag_weights(np.zeros(shape, bool)),
             np.ones(self.gains.shape, complex),
         )
@@ -139,7 +123,7 @@ def _disc(case: Case, rng: np.random.Generator) -> np.ndarray:
     """Return antennas at random in a flat disc, (Nants, 3), m."""
     radius = case.extent / 2 * np.sqrt(rng.uniform(0, 1, case.antennas))
     angle = rng.uniform(0, 2 * np.pi, case.antennas)
-    # Two antennas at the rim make the longest baseline what it is said to be.
+    # The longest baseline is between two antennas at the rim.
     radius[:2], angle[:2] = case.extent / 2, (0.0, np.pi)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(case.antennas)])
 
@@ -149,6 +133,6 @@ def _complex_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndar
 
 
 def _sky(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return direction cosines and flux densities of sources all over the sky but its rim, where they would set."""
+    """Return direction cosines and flux densities of sources that do not set."""
     radius, angle = 0.98 * np.sqrt(rng.uniform(0, 1, SOURCES)), rng.uniform(0, 2 * np.pi, SOURCES)
     return radius * np.cos(angle), radius * np.sin(angle), rng.pareto(1.5, SOURCES) + 1

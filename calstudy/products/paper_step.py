@@ -1,10 +1,9 @@
-"""One Adamax step as the paper's own code takes it: what the calibrator is timed against.
+"""One Adamax step as the paper's own code takes it.
 
 All baselines share one basis tensor padded with zeros to the widest (Nvec, Nbls, 1, Nfreqs); the model is a broadcast
 product summed over the first axis; real and imaginary parts are separate; the optimizer is Keras' Adamax; single
-precision. Written from the paper's equations and description. The step is one TensorFlow graph or, as is the default of
-the authors' code, executed operation by operation. Either takes as long as the loss function of that code with the same
-optimizer (docs/calibration.md).
+precision. Written from the paper's equations and description, as one TensorFlow graph. It takes as long as the loss
+function of the authors' code with the same optimizer (benchmarks/README.md).
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ LEARNING_RATE = 0.01
 
 
 class PaperStep:
-    """Unknowns and graph of one problem with per-baseline models.
+    """The unknowns of one problem with a foreground model of every baseline, and the graph of a step.
 
     Parameters
     ----------
     problem
-        Starts at unity gains and at the foregrounds that fit the data best in unweighted least squares.
+        The start is at unity gains and at the foregrounds of an unweighted least-squares fit.
     """
 
     def __init__(self, problem: CalibrationProblem) -> None:
@@ -47,7 +46,7 @@ class PaperStep:
         self.variables = [tf.Variable(values, dtype=tf.float32) for values in start]
         self._optimizer = tf.keras.optimizers.Adamax(LEARNING_RATE)
         self._optimizer.build(self.variables)
-        self.step = tf.function(self.eager_step)
+        self.step = tf.function(self._step)
         self.model_sum = tf.function(self._model_sum)
 
     @property
@@ -61,8 +60,8 @@ class PaperStep:
             parts = [tf.reduce_sum(u * self._basis, axis=0) for u in self.variables[2:]]
         return tuple(tape.gradient(parts, self.variables[2:], output_gradients=self._data))
 
-    def eager_step(self) -> tf.Tensor:
-        """Take one step without a graph, and return the loss before it."""
+    def _step(self) -> tf.Tensor:
+        """Take one step, and return the loss before it."""
         with tf.GradientTape() as tape:
             loss = self._loss()
         gradients = tape.gradient(loss, self.variables)
@@ -84,10 +83,3 @@ class PaperStep:
         prior = tf.square(tf.reduce_sum(f_real * self._weights) - self._target[0])
         prior += tf.square(tf.reduce_sum(f_imaginary * self._weights) - self._target[1])
         return tf.reduce_sum(misfit * self._weights) + prior
-
-
-def padded_memory(problem: CalibrationProblem) -> float:
-    """Return the bytes that the padded step takes at its peak: about seven tensors of the size of the basis."""
-    structure = problem.structure
-    widest = max(bucket.vectors.shape[1] for bucket in structure.basis.buckets)
-    return 7 * 4.0 * widest * structure.n_baselines * structure.n_frequencies

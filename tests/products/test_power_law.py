@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calstudy.bench.scaling import fit_power_law
+from calstudy.products.run_times import fit_power_law
 
 
 def test_the_scatter_of_exponents_is_what_the_fit_says():

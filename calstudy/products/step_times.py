@@ -1,11 +1,13 @@
-"""What steps and solves of one array take, measured in a process of its own: ``python -m calstudy.bench.step_times``.
+"""Times of steps and solves of one array, measured in a process of its own: ``python -m calstudy.products.step_times``.
 
-Such a process has the number of threads that it was given, and its memory is that of this work alone.
+The process has one thread, and its memory is that of this work alone.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 import time
 import warnings
@@ -14,33 +16,49 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import tensorflow as tf
 from pydantic import TypeAdapter
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Usage, resident_memory
-from calstudy.bench.calibration import Clock, clock_of, use_device
-from calstudy.bench.calibration_case import Case, Simulation
-from calstudy.bench.paper_step import PaperStep
-from calstudy.bench.process import run_module
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.settings import BasisSettings
 from calstudy.calibrate.solvers.first_order import STEPS_PER_CALL, FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
+from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Channels, Layout
+from calstudy.products.paper_step import PaperStep
 
-PROCESS = "calstudy.bench.step_times"
+THREADS = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "TF_NUM_INTRAOP_THREADS",
+    "TF_NUM_INTEROP_THREADS",
+)
+ENVIRONMENT = {
+    **dict.fromkeys(THREADS, "1"),
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "TF_CPP_MIN_LOG_LEVEL": "3",
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+}
+"""One thread, no start-up messages, and huge pages for large temporary arrays where the system has them: the allocation
+of small pages can take longer than the measured work."""
 ROUNDS = 10
-"""Into this many rounds the samples of every solver are divided, so that a busy spell of the machine meets all."""
+"""The samples of all solvers are divided into this many rounds, so that other work on the machine affects all alike."""
 FLOOR_TOLERANCE, FLOOR_STEPS = 1e-5, 200
 SETTLED = 0.5
 """Seconds."""
 
+Clock = Callable[[], float]
+
 
 @dataclass(frozen=True)
 class Samples:
-    """How much is timed.
+    """Number of samples.
 
     Attributes
     ----------
@@ -49,7 +67,7 @@ class Samples:
     calls
         Calls of our Adamax, of `STEPS_PER_CALL` steps each, whose mean is one sample.
     solves
-        Whole cold solves of the default solver, each with noise of its own.
+        Complete cold solves of the default solver, each with noise of its own.
     """
 
     steps: int
@@ -59,7 +77,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class StepTimes:
-    """What the solvers take for one array.
+    """Run time and memory of the solvers for one array.
 
     Attributes
     ----------
@@ -72,7 +90,7 @@ class StepTimes:
     coefficients
         Foreground vectors of all baselines together.
     seconds
-        Samples by what was timed: ``paper-step``, ``paper-sum`` (the sum over the basis alone), ``adamax-step``,
+        Samples by name: ``paper-step``, ``paper-sum`` (the sum over the basis alone), ``adamax-step``,
         ``default-step``, ``default-solve``; processor seconds of one core, or elapsed seconds on a GPU.
     basis_bytes
         Size of the paper's padded basis.
@@ -92,17 +110,7 @@ class StepTimes:
 
 @dataclass(frozen=True)
 class Descent:
-    """How the paper's solver approaches the minimum of one problem.
-
-    Attributes
-    ----------
-    antennas
-        Of the array.
-    floor
-        Loss at the minimum.
-    losses
-        Loss before the first step and after each, (Nsteps + 1,), in the same unit.
-    """
+    """Losses of the paper's solver on one problem: at the minimum, and before the first step and after each."""
 
     antennas: int
     floor: float
@@ -115,33 +123,47 @@ class Descent:
 
 
 def time_steps_apart(array: Mapping[str, Any], samples: Samples, device: str) -> StepTimes:
-    """Time the solvers side by side on one array.
+    """Time the solvers in a process of its own.
 
     Parameters
     ----------
     array
         JSON-able sections `layout`, `channels` and `basis`; every baseline has a foreground model of its own.
     samples
-        How much is timed.
+        Number of samples.
     device
         ``cpu`` (one core) or ``gpu``.
 
     Raises
     ------
     InputError
-        If the process fails, with the last line that it wrote.
+        If the process fails, with the last line of its output.
     """
-    return StepTimes(**run_module(PROCESS, {"array": dict(array), "samples": asdict(samples), "device": device}))
+    return StepTimes(**_run_apart({"array": dict(array), "samples": asdict(samples), "device": device}))
 
 
 def descend_apart(array: Mapping[str, Any], max_steps: int) -> Descent:
-    """Run the paper's solver, Adamax at a fixed rate of 0.01 from unity, for all of `max_steps` on one array."""
-    answer = run_module(PROCESS, {"array": dict(array), "max_steps": max_steps})
+    """Run `descend` in a process of its own; array and errors as for `time_steps_apart`."""
+    answer = _run_apart({"array": dict(array), "max_steps": max_steps})
     return Descent(**{**answer, "losses": np.array(answer["losses"])})
 
 
+def _run_apart(request: Mapping[str, Any]) -> dict[str, Any]:
+    result = subprocess.run(
+        [sys.executable, "-m", "calstudy.products.step_times", json.dumps(request)],
+        env={**os.environ, **ENVIRONMENT},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if result.returncode:
+        reason = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
+        raise InputError(f"the measurement of {json.dumps(request)} failed: {reason}")
+    return json.loads(result.stdout.splitlines()[-1])
+
+
 def make_simulation(layout: Layout, channels: Channels) -> Simulation:
-    """Return an array under the bench's sky, with gains and noise, over the given channels."""
+    """Return synthetic data of an array over the given channels."""
     positions = make_layout(layout).enu
     band = channels.count * channels.width
     case = Case(antennas=len(positions), channels=channels.count, first=channels.first, band=band)
@@ -149,27 +171,13 @@ def make_simulation(layout: Layout, channels: Channels) -> Simulation:
 
 
 def time_steps(layout: Layout, channels: Channels, basis: BasisSettings, samples: Samples, device: str) -> StepTimes:
-    """Time all solvers on one array.
-
-    Parameters
-    ----------
-    layout, channels, basis
-        The array, its channels and the foreground model of every baseline by itself.
-    samples
-        How much.
-    device
-        ``cpu`` or ``gpu``.
-
-    Raises
-    ------
-    InputError
-        If there is no such device.
-    """
-    with use_device(device):
+    """Time all solvers on one array, in this process; see `time_steps_apart`."""
+    # Other work on the machine does not stretch processor time.
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    with tf.device(f"/{device.upper()}:0"):
         simulation = make_simulation(layout, channels)
         structure = simulation.structure(basis)
         problem = simulation.problem(0, structure)
-        clock = clock_of(device)
         before = resident_memory()
         with Usage() as usage:
             paper = PaperStep(problem)
@@ -192,7 +200,7 @@ def time_steps(layout: Layout, channels: Channels, basis: BasisSettings, samples
 
 
 def _settle(call: Callable[[], object]) -> None:
-    """Compile a step and run it for long enough that the sampling of memory meets its peak."""
+    """Compile a step, and run it long enough for the sampling of memory to find its peak."""
     call()
     end = time.perf_counter() + SETTLED
     call()
@@ -203,7 +211,7 @@ def _settle(call: Callable[[], object]) -> None:
 def _all_samples(
     simulation: Simulation, structure: FitStructure, paper: PaperStep, samples: Samples, clock: Clock
 ) -> Iterator[tuple[str, float]]:
-    """Yield samples by name, in rounds that each hold some of every kind; what is compiled first is not counted."""
+    """Yield samples by name, without compilation, in rounds that each have some of every kind."""
     problem = simulation.problem(0, structure)
     solver = GaussNewton()
     adamax = FirstOrder(Optimizer(max_steps=10**6), tolerance=0.0)
@@ -212,10 +220,11 @@ def _all_samples(
         call()
     for number in range(ROUNDS):
         for _ in range(_share(samples.steps, number)):
+            # The loss is read, because a GPU returns before it has finished.
             yield "paper-step", _seconds(lambda: float(paper.step()), clock)
             yield "paper-sum", _seconds(lambda: [part.numpy() for part in paper.model_sum()], clock)
         for _ in range(_share(samples.calls, number)):
-            # Its history, and so this state, is as short at every call.
+            # Every call starts from the same state.
             yield "adamax-step", _seconds(lambda: adamax.step(state), clock) / STEPS_PER_CALL
         for index in range(_share(samples.solves, number)):
             realization = 1 + number * samples.solves + index
@@ -245,15 +254,7 @@ def _solve_in_steps(problem: CalibrationProblem, solver: GaussNewton, clock: Clo
 
 
 def descend(layout: Layout, channels: Channels, basis: BasisSettings, max_steps: int) -> Descent:
-    """Run the paper's solver, Adamax at a fixed rate of 0.01 from unity, for all of `max_steps`; see `time_steps`.
-
-    Parameters
-    ----------
-    layout, channels, basis
-        Of the simulated array and of the fit.
-    max_steps
-        Steps that are taken.
-    """
+    """Run the paper's solver, Adamax at a fixed rate of 0.01 from unity, for all of `max_steps`."""
     simulation = make_simulation(layout, channels)
     structure = simulation.structure(basis)
     problem = simulation.problem(0, structure)
@@ -275,7 +276,4 @@ def _answer(request: Mapping[str, Any]) -> dict[str, Any]:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    try:
-        print(json.dumps(_answer(json.loads(sys.argv[1]))))
-    except InputError as error:
-        sys.exit(str(error))
+    print(json.dumps(_answer(json.loads(sys.argv[1]))))

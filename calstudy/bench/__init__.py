@@ -1,1 +1,0 @@
-"""Timings of engines, calibrators and solvers, and the scaling laws that are fitted to them."""
