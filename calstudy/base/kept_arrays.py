@@ -43,7 +43,7 @@ def kept_arrays(
     """
     path = default_directory() / f"{name}-{digest_json(identity)}.npz"
     try:
-        with path.open("rb") as stream, np.load(stream) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = dict(file)
     except FileNotFoundError:
         logger.info("%s: computed, for %s is not there", name, path)
