@@ -53,6 +53,13 @@ SLOW_TO_IMPORT = (
 )
 
 
+def test_calibrators_leave_keras_to_those_who_use_it(tmp_path):
+    code = "import calstudy.calibrate.calamity"
+    assert imported_by(code, ("tensorflow", "keras", "sklearn"), tmp_path) == ["tensorflow"]
+    used = f"{code}\nimport tensorflow\ntensorflow.keras.optimizers.Adamax(0.1)"
+    assert "keras" in imported_by(used, ("keras",), tmp_path)
+
+
 def test_plans_import_no_library_that_only_stages_need(tmp_path):
     """Of an experiment, a sweep, a collection, a run-time study and a quick start, one after the other."""
     names = ("minredundant", "signalloss", "paper", "runtime", "quickstart")

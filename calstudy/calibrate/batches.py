@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-import tensorflow as tf
+
+from calstudy.base.tensorflow import tf
 
 # Different bases are padded to about this many sizes: more take longer to compile, fewer longer to run.
 BATCHES = 8

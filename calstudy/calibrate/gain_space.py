@@ -7,8 +7,8 @@ coordinates eta = (c B^T) / g.
 from __future__ import annotations
 
 import numpy as np
-import tensorflow as tf
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 
 

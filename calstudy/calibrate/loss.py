@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import tensorflow as tf
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import Prior
 from calstudy.calibrate.tensors import Ends, FitTensors

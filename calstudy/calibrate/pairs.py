@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import tensorflow as tf
+
+from calstudy.base.tensorflow import tf
 
 
 def to_pair(values: np.ndarray, dtype: tf.DType) -> tf.Tensor:

@@ -26,8 +26,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import tensorflow as tf
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.batches import Piece, joined, make_piece, product_span, span_of
 from calstudy.calibrate.elementwise import BaselineProducts

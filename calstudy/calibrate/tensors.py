@@ -12,8 +12,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import tensorflow as tf
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.batches import Batch, make_batches
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure

@@ -149,7 +149,6 @@ def _weights(text: str | None) -> Any:
 
 
 def _run(request: _Request, calibrator: Calibrator) -> int:
-    from calstudy.base.quiet import load_tensorflow
     from calstudy.calibrate.settings import NOISE_UNKNOWN, ForegroundFit, GainFit
     from calstudy.measured.selection import parse_selection
     from calstudy.observed.output import EXPECTED, describe, require_free, write_result
@@ -178,9 +177,6 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
         console.print(plan, markup=False)
         if request.dry_run:
             return 0
-        # Seconds, after all that can be refused.
-        if isinstance(calibrator, GainFit):
-            load_tensorflow()
         context: dict[str, Any] = {
             "data": [str(path) for path in request.paths],
             "sky_model": None if request.sky_path is None else str(request.sky_path),

@@ -6,6 +6,7 @@ a visibility is V_xx = ½ ∫ A I exp(−2πi ν b·s/c) dΩ.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -119,12 +120,21 @@ class GriddedBeam:
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
         """Return Ω_p and Ω_pp in sr, each of shape (Nfreqs,); see `Beam`."""
-        zenith_angle = self._table.zenith_angles
-        angles = []
-        for frequency in frequencies:
-            jones = self._table.jones(np.array([frequency], dtype=float))[:, FEEDS[polarization], 0]
-            angles.append(integrate_power((np.abs(jones) ** 2).sum(axis=0), zenith_angle))
-        return tuple(np.array(angles).T)
+        first, second = _solid_angles(self._table, tuple(np.asarray(frequencies, dtype=float)), FEEDS[polarization])
+        return first.copy(), second.copy()
+
+
+# Spectra of one run, which are made one after the other, have the same beam.
+@lru_cache(maxsize=4)
+def _solid_angles(
+    table: TabulatedBeam | Tile, frequencies: tuple[float, ...], feed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    angles = []
+    for frequency in frequencies:
+        jones = table.jones(np.array([frequency]))[:, feed, 0]
+        angles.append(integrate_power((np.abs(jones) ** 2).sum(axis=0), table.zenith_angles))
+    first, second = np.array(angles).T
+    return first, second
 
 
 def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> tuple[float, float]:

@@ -18,13 +18,7 @@ from calstudy.base.errors import InputError
 from calstudy.instrument.as_built import FEEDS
 from calstudy.instrument.beam_file import find_beam
 from calstudy.instrument.beam_frequencies import fit_range
-from calstudy.instrument.tabulated import (
-    PIXELS_PER_DEGREE,
-    TabulatedBeam,
-    read_mwa_embedded_element,
-    tabulate,
-    zenith_normalized,
-)
+from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_element, tabulate, zenith_normalized
 
 
 class DipoleFields:
@@ -51,10 +45,10 @@ class DipoleFields:
     """
 
     def __init__(self, path: Path | None, band: tuple[float, float], interpolation: str) -> None:
-        table = read_mwa_embedded_element(path, band)
-        self.whole = TabulatedBeam(table, band, interpolation)
-        if list(table.feed_array) != list(FEEDS):
-            raise InputError(f"instrument.beam.path: {path} has feeds {', '.join(table.feed_array)}, not x and y")
+        self.whole = mwa_embedded_element(path, band, interpolation)
+        feeds = list(self.whole.description["feed_array"])
+        if feeds != list(FEEDS):
+            raise InputError(f"instrument.beam.path: {path} has feeds {', '.join(feeds)}, not x and y")
         fields = _single_fields(find_beam() if path is None else path, *fit_range(band))
         # Shape (Ndipoles, Nreduced, 2, Nfeeds, Nza, Naz).
         self._reduced = np.stack([self.whole.interpolation.reduce(field) for field in fields])
@@ -73,7 +67,7 @@ class DipoleFields:
         reduced = np.empty(self._reduced.shape[1:], dtype=complex)
         for feed, weights in enumerate(amplitudes):
             reduced[:, :, feed] = np.tensordot(weights, self._reduced[:, :, :, feed], axes=1)
-        return zenith_normalized(np.moveaxis(self.whole.interpolation.evaluate(reduced, frequencies), 0, 2))
+        return zenith_normalized(self.whole.interpolation.evaluate(reduced, frequencies))
 
 
 class Tile:
@@ -89,7 +83,7 @@ class Tile:
 
     def __init__(self, fields: DipoleFields, amplitudes: np.ndarray) -> None:
         whole = fields.whole
-        self._fields, self._amplitudes, self._template = fields, amplitudes, whole.template
+        self._fields, self._amplitudes, self._description = fields, amplitudes, whole.description
         self.zenith_angles, self.tabulated_frequencies = whole.zenith_angles, whole.tabulated_frequencies
         self.fit_error = whole.fit_error
 
@@ -99,7 +93,7 @@ class Tile:
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
         """Return the efield beam tabulated at `frequencies` in Hz, shape (Nfreqs,)."""
-        return tabulate(self._template, self.jones(frequencies), frequencies)
+        return tabulate(self._description, self.jones(frequencies), frequencies)
 
 
 @lru_cache(maxsize=1)

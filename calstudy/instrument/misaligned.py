@@ -15,7 +15,7 @@ from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beam_grid import fixed_components, polar_components
 from calstudy.instrument.interface import AntennaBeam
 from calstudy.instrument.splines import bspline_coefficients, cells, spline_fields
-from calstudy.instrument.tabulated import tabulate
+from calstudy.instrument.tabulated import describe, tabulate
 
 # Rows by which a table is extended beyond the zenith: splines forget their ends within a few.
 MARGIN = 12
@@ -93,7 +93,7 @@ class MisalignedBeam:
         if self._misalignment.swapped and list(beam.feed_array) != ["x", "y"]:
             raise InputError(f"instrument.as_built.beams.swapped: the beam {self.name} does not have feeds x and y")
         if isinstance(beam, UVBeam):
-            return tabulate(beam, _turned_table(beam, splines, self._misalignment), frequencies)
+            return tabulate(describe(beam), _turned_table(beam, splines, self._misalignment), frequencies)
         # A formula may have settings of its own for its feeds; they are those of what it describes.
         return TurnedBeam(
             nominal=beam, misalignment=self._misalignment, feed_array=beam.feed_array, feed_angle=beam.feed_angle

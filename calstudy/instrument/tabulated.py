@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -11,6 +14,9 @@ from pyuvdata import UVBeam
 from scipy.interpolate import interp1d
 
 from calstudy.base.errors import InputError
+from calstudy.base.kept_arrays import kept_arrays
+from calstudy.base.plugins import digest_file
+from calstudy.instrument import beam_frequencies
 from calstudy.instrument.beam_file import find_beam
 from calstudy.instrument.beam_frequencies import FIT_BAND, choose_frequencies, fit_range, megahertz
 
@@ -18,9 +24,17 @@ PIXELS_PER_DEGREE = 1
 
 FIT_ORDER = 8
 
+DESCRIPTION = (
+    *("telescope_name", "feed_name", "feed_version", "model_name", "model_version", "history"),
+    *("feed_array", "feed_angle", "axis1_array", "axis2_array", "basis_vector_array"),
+)
+"""Attributes of a UVBeam that do not depend on its frequencies."""
 
-def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> UVBeam:
-    """Read the zenith-pointed full embedded element beam of an MWA tile (Sokolowski et al. 2017).
+
+def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
+    """Make the zenith-pointed full embedded element beam of an MWA tile (Sokolowski et al. 2017).
+
+    To read the file and fit its table takes seconds: the fit is kept for later processes.
 
     Parameters
     ----------
@@ -28,6 +42,8 @@ def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> U
         Beam file (HDF5), by default the one that `calstudy.instrument.beam_file.find_beam` finds.
     band
         Lowest and highest frequency of interest in Hz; the margin that a fit needs is read, too.
+    interpolation
+        In frequency; see `TabulatedBeam`.
 
     Raises
     ------
@@ -37,15 +53,64 @@ def read_mwa_embedded_element(path: Path | None, band: tuple[float, float]) -> U
     path = find_beam() if path is None else path
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
-    return _read_mwa(path, *fit_range(band))
+    return _mwa_embedded_element(path, digest_file(path), band, interpolation)
 
 
 @lru_cache(maxsize=2)
-def _read_mwa(path: Path, low: float, high: float) -> UVBeam:
+def _mwa_embedded_element(path: Path, digest: str, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
+    decisive = {
+        "file": digest,
+        "band": band,
+        "interpolation": interpolation,
+        "code": [digest_file(Path(source)) for source in (__file__, beam_frequencies.__file__)],
+        "libraries": {name: version(name) for name in ("h5py", "numpy", "pyuvdata", "scipy")},
+    }
+    fitted = kept_arrays("mwa-beam", decisive, lambda: fit_table(_read_mwa(path, band), band, interpolation))
+    return TabulatedBeam({name: values if values.ndim else values.item() for name, values in fitted.items()})
+
+
+def _read_mwa(path: Path, band: tuple[float, float]) -> UVBeam:
     try:
-        return UVBeam.from_file(path, file_type="mwa_beam", pixels_per_deg=PIXELS_PER_DEGREE, freq_range=[low, high])
+        return UVBeam.from_file(
+            path, file_type="mwa_beam", pixels_per_deg=PIXELS_PER_DEGREE, freq_range=list(fit_range(band))
+        )
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"instrument.beam.path: {path} cannot be read as an MWA beam file ({error})") from error
+
+
+def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> dict[str, Any]:
+    """Reduce a table to what a `TabulatedBeam` needs of it: arrays, strings and numbers, which a file can keep.
+
+    Parameters
+    ----------
+    table
+        On a grid of azimuth and zenith angle.
+    band
+        Lowest and highest frequency of interest in Hz.
+    interpolation
+        In frequency; see `TabulatedBeam`.
+
+    Raises
+    ------
+    InputError
+        If the table does not cover the band.
+    """
+    chosen = choose_frequencies(table.freq_array, band, interpolation)
+    tabulated = table.freq_array[chosen]
+    values = np.ascontiguousarray(np.moveaxis(table.data_array[:, :, chosen], 2, 0))
+    in_frequency = FrequencyInterpolation(tabulated, interpolation)
+    reduced = in_frequency.reduce(values)
+    first, last = np.searchsorted(tabulated, band[0], side="right") - 1, np.searchsorted(tabulated, band[1])
+    around = slice(first, last + 1)
+    fitted = zenith_normalized(in_frequency.evaluate(reduced, tabulated[around]))
+    return {
+        "interpolation": interpolation,
+        "tabulated": tabulated,
+        "reduced": reduced,
+        "tabulated_frequencies": tabulated[around],
+        "fit_error": float(np.abs(fitted - zenith_normalized(values[around])).max()),
+        **describe(table),
+    }
 
 
 class TabulatedBeam:
@@ -58,6 +123,11 @@ class TabulatedBeam:
     The result is divided by its zenith value, for each feed. For these beams the zenith value is the peak. It is a
     smooth function of frequency; the largest tabulated value (the maximum over pixels and feeds) need not be.
 
+    Parameters
+    ----------
+    fitted
+        From `fit_table`.
+
     Attributes
     ----------
     zenith_angles
@@ -66,25 +136,19 @@ class TabulatedBeam:
         Those of the band, and those next to its ends, in Hz, shape (Ntab,).
     fit_error
         Largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`.
-    template
-        The table as read.
+    description
+        From `describe`.
     interpolation
         Between the tabulated frequencies in and around the band.
     """
 
-    def __init__(self, table: UVBeam, band: tuple[float, float], interpolation: str) -> None:
-        chosen = choose_frequencies(table.freq_array, band, interpolation)
-        tabulated = table.freq_array[chosen]
-        self.zenith_angles = table.axis2_array
-        self.template = table
-        self._band = (float(tabulated[0]), float(tabulated[-1]))
-        values = np.moveaxis(table.data_array[:, :, chosen], 2, 0)
-        self.interpolation = FrequencyInterpolation(tabulated, interpolation)
-        self._reduced = self.interpolation.reduce(values)
-        first, last = np.searchsorted(tabulated, band[0], side="right") - 1, np.searchsorted(tabulated, band[1])
-        self.tabulated_frequencies = tabulated[first : last + 1]
-        reference = zenith_normalized(np.moveaxis(values[first : last + 1], 0, 2))
-        self.fit_error = float(np.abs(self.jones(self.tabulated_frequencies) - reference).max())
+    def __init__(self, fitted: Mapping[str, Any]) -> None:
+        self.description = {name: fitted[name] for name in DESCRIPTION}
+        self.zenith_angles = fitted["axis2_array"]
+        self.tabulated_frequencies, self.fit_error = fitted["tabulated_frequencies"], fitted["fit_error"]
+        self.interpolation = FrequencyInterpolation(fitted["tabulated"], fitted["interpolation"])
+        self._band = (float(fitted["tabulated"][0]), float(fitted["tabulated"][-1]))
+        self._reduced = fitted["reduced"]
 
     def require_within(self, frequencies: np.ndarray) -> np.ndarray:
         """Return frequencies (Hz) as floats; raises InputError if any is outside the band of the beam."""
@@ -100,47 +164,54 @@ class TabulatedBeam:
     def jones(self, frequencies: np.ndarray) -> np.ndarray:
         """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz."""
         frequencies = self.require_within(frequencies)
-        return zenith_normalized(np.moveaxis(self.interpolation.evaluate(self._reduced, frequencies), 0, 2))
+        return zenith_normalized(self.interpolation.evaluate(self._reduced, frequencies))
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
         """Return the efield beam tabulated at `frequencies` in Hz, shape (Nfreqs,)."""
-        return tabulate(self.template, self.jones(frequencies), frequencies)
+        return tabulate(self.description, self.jones(frequencies), frequencies)
 
 
-def tabulate(template: UVBeam, jones: np.ndarray, frequencies: np.ndarray) -> UVBeam:
+def describe(beam: UVBeam) -> dict[str, Any]:
+    """Return what `tabulate` needs of a beam: its grid, feeds and names."""
+    return {name: getattr(beam, name) for name in DESCRIPTION}
+
+
+def tabulate(description: Mapping[str, Any], jones: np.ndarray, frequencies: np.ndarray) -> UVBeam:
     """Return an efield beam on the grid of another.
 
     Parameters
     ----------
-    template
-        Has the grid, the feeds and the names.
+    description
+        Of the other, from `describe`.
     jones
         (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, one at the zenith.
     frequencies
         In Hz, (Nfreqs,).
     """
     return UVBeam.new(
-        telescope_name=template.telescope_name,
-        feed_name=template.feed_name,
-        feed_version=template.feed_version,
-        model_name=template.model_name,
-        model_version=template.model_version,
+        **description,
         data_normalization="peak",
         freq_array=np.asarray(frequencies, dtype=float),
-        feed_array=template.feed_array,
-        feed_angle=template.feed_angle,
         mount_type="fixed",
         pixel_coordinate_system="az_za",
-        axis1_array=template.axis1_array,
-        axis2_array=template.axis2_array,
-        basis_vector_array=template.basis_vector_array,
         data_array=np.ascontiguousarray(jones),
-        history=template.history,
     )
 
 
-def zenith_normalized(jones: np.ndarray) -> np.ndarray:
-    """Divide by the square root of the zenith power, per feed and frequency."""
+def zenith_normalized(values: np.ndarray) -> np.ndarray:
+    """Divide by the square root of the zenith power, per feed and frequency.
+
+    Parameters
+    ----------
+    values
+        (Nfreqs, 2 [azimuth, zenith angle], Nfeeds, Nza, Naz), complex.
+
+    Returns
+    -------
+    ndarray
+        (2, Nfeeds, Nfreqs, Nza, Naz).
+    """
+    jones = np.moveaxis(values, 0, 2)
     zenith = np.sqrt((np.abs(jones[..., 0, 0]) ** 2).sum(axis=0))
     return jones / zenith[None, :, :, None, None]
 

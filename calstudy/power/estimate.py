@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,8 @@ from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
 from calstudy.power.optimal import DiagonalPSpecData
 
 if TYPE_CHECKING:
+    from hera_pspec.conversions import Cosmo_Conversions
+
     from calstudy.power.interface import PowerBeam
     from calstudy.power.settings import PowerSettings
 
@@ -110,6 +113,14 @@ def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_conventi
     return halves[pol_convention] * 1e-26 * wavelength**2 / (2 * constants.k_B.value * omega_p)
 
 
+@lru_cache(maxsize=4)
+def _conversions(cosmology: str, z: float) -> Cosmo_Conversions:
+    """Return hera_pspec's cosmology object, which remembers its volumes: all spectra of a run ask for the same."""
+    conversions = hera_conversions(make_cosmology(cosmology), z)
+    conversions.X2Y = lru_cache(maxsize=10_000)(conversions.X2Y)
+    return conversions
+
+
 def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings) -> UVPSpec:
     """Compute the cross power of the delay spectra of two data sets that share the sky but not the noise.
 
@@ -148,7 +159,7 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
         OmegaP={pol: angles[pol][0] for pol in polarizations},
         OmegaPP={pol: angles[pol][1] for pol in polarizations},
         beam_freqs=frequencies,
-        cosmo=hera_conversions(make_cosmology(settings.cosmology), centre),
+        cosmo=_conversions(settings.cosmology, centre),
     )
     estimator = DiagonalPSpecData(
         dsets=[_to_millikelvin(uvd, angles) for uvd in (even, odd)], labels=["even", "odd"], beam=adapter

@@ -19,6 +19,7 @@ from calstudy.products.files import (
     RESIDUAL,
     SOLUTION,
     VISIBILITIES,
+    integration_times,
     read_json,
     read_visibilities,
     write_json,
@@ -28,6 +29,8 @@ from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pyuvdata import UVData
 
 
@@ -85,18 +88,18 @@ def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: 
     return Task(CALIBRATE, data.label, {}, chunks, temporary=temporary)
 
 
-def _integrations(data: UVData, index: int, count: int, together: int) -> UVData:
-    """Return run number `index` of `count` runs of consecutive integrations, as equal as can be.
+def _read_chunk(path: Path, index: int, count: int, together: int) -> UVData:
+    """Read run number `index` of `count` runs of consecutive integrations, as equal as can be.
 
     A run ends where one group of integrations that are solved `together` ends.
     """
     import numpy as np
 
-    together = min(together, data.Ntimes)
-    groups = -(-data.Ntimes // together)
+    times = integration_times(path)
+    together = min(together, times.size)
+    groups = -(-times.size // together)
     edges = np.linspace(0, groups, count + 1).round().astype(int) * together
-    first, last = edges[index] * data.Nbls, min(edges[index + 1], data.Ntimes) * data.Nbls
-    return data.select(blt_inds=np.arange(first, last), inplace=False, run_check=False)
+    return read_visibilities(path, times[edges[index] : edges[index + 1]])
 
 
 def calibrate_chunk(job: Job) -> Mapping[str, Any]:
@@ -104,11 +107,9 @@ def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     from calstudy.calibrate.execution import run_calibrator
 
     index, count, settings = (job.settings[name] for name in ("index", "count", "calibration"))
-    together = settings.integrations_per_solve
-    data = _integrations(read_visibilities(job.inputs["data"] / DATA), index, count, together)
-    sky = None
-    if "sky_model" in job.inputs:
-        sky = _integrations(read_visibilities(job.inputs["sky_model"] / VISIBILITIES), index, count, together)
+    chunk = index, count, settings.integrations_per_solve
+    data = _read_chunk(job.inputs["data"] / DATA, *chunk)
+    sky = _read_chunk(job.inputs["sky_model"] / VISIBILITIES, *chunk) if "sky_model" in job.inputs else None
     noise = read_json(job.inputs["levels"] / LEVELS)["noise_std"] if "levels" in job.inputs else None
     result = run_calibrator(settings, data, sky, noise=noise)
     result.gains.write_calh5(job.output / GAINS)
@@ -163,8 +164,8 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
 def _cost_of_chunk(task: Task) -> Cost:
     size, pieces = size_of(task), task.settings["count"]
     solves = cost_of(task.settings["calibration"], replace(size, times=-(-size.times // pieces)))
-    # Files are read whole, with flags and sample counts; results are made for the piece.
-    files = (COMPLEX64 + COMPLEX128 + 10) * size.samples + 8 * COMPLEX128 * size.samples / pieces
+    # Data and sky model, with flags and sample counts, and results.
+    files = (COMPLEX64 + COMPLEX128 + 10 + 8 * COMPLEX128) * size.samples / pieces
     return Cost(solves.seconds, solves.memory + files, 2 * size.samples * COMPLEX64 / pieces)
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from pyuvdata import UVData
+    from pyuvdata.uvdata import FastUVH5Meta
 
 VISIBILITIES, DATA, GAINS, AVERAGE = "visibilities.uvh5", "data.uvh5", "gains.calh5", "average.uvh5"
 MODEL, RESIDUAL, SOLUTION = "model.uvh5", "residual.uvh5", "solution.json"
@@ -46,12 +47,23 @@ def quiet_libraries() -> Iterator[None]:
         logging.captureWarnings(False)
 
 
-def read_visibilities(path: Path) -> UVData:
-    """Read a UVH5 product as it was written."""
+def read_visibilities(path: Path, times: np.ndarray | None = None) -> UVData:
+    """Read a UVH5 product as it was written, or some of its integrations (JD)."""
     from pyuvdata import UVData
 
     keep_compiled_pyuvdata()
-    return UVData.from_file(path, file_type="uvh5", run_check=False)
+    return UVData.from_file(path, file_type="uvh5", run_check=False, times=times)
+
+
+def _header(path: Path) -> FastUVH5Meta:
+    from pyuvdata.uvdata import FastUVH5Meta
+
+    return FastUVH5Meta(path)
+
+
+def integration_times(path: Path) -> np.ndarray:
+    """Return the times (JD) of the integrations of a UVH5 product, ascending."""
+    return np.unique(_header(path).time_array)
 
 
 def read_in_parts(paths: Sequence[Path], samples: int) -> Iterator[tuple[range, list[UVData]]]:
@@ -68,16 +80,11 @@ def read_in_parts(paths: Sequence[Path], samples: int) -> Iterator[tuple[range, 
     ------
     Places of the integrations in the run, and the data of each file.
     """
-    from pyuvdata import UVData
-
-    keep_compiled_pyuvdata()
-    header = UVData.from_file(paths[0], file_type="uvh5", run_check=False, read_data=False)
-    times = np.unique(header.time_array)
+    header, times = _header(paths[0]), integration_times(paths[0])
     step = max(1, samples // (header.Nbls * header.Nfreqs * header.Npols))
     for first in range(0, times.size, step):
         part = range(first, min(first + step, times.size))
-        options = {"file_type": "uvh5", "run_check": False, "times": times[part.start : part.stop]}
-        yield part, [UVData.from_file(path, **options) for path in paths]
+        yield part, [read_visibilities(path, times[part.start : part.stop]) for path in paths]
 
 
 def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:

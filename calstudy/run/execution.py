@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import os
 import sys
@@ -27,7 +28,6 @@ logger = logging.getLogger(__name__)
 
 BEGUN = "begun"
 """Topic under which workers report to the scheduler what they begin to make."""
-QUIET_TENSORFLOW = {"TF_CPP_MIN_LOG_LEVEL": "3", "TF_ENABLE_ONEDNN_OPTS": "0"}
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,14 @@ def _errors_written_to(path: Path) -> Iterator[None]:
         os.close(kept)
 
 
-def _import_units() -> None:
-    """Import what orders need when they arrive, in one thread of a worker, and stages need in another.
-
-    Two threads that import it at once can lock each other out (`_frozen_importlib._DeadlockError`).
-    """
+def _set_up_worker(log: Path) -> None:
+    """Prepare a process of this machine for orders."""
+    _write_errors_to(log)
+    # Orders need it when they arrive, in one thread, and stages in another: two threads that import it at once can lock
+    # each other out (`_frozen_importlib._DeadlockError`).
     import_module("astropy.units")
+    # Python would free the objects of all libraries one by one, which takes seconds; products are files.
+    atexit.register(os._exit, 0)
 
 
 @contextmanager
@@ -138,7 +140,6 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
 
     threads = str(max(1, cores() // workers))
     environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TF_NUM_INTRAOP_THREADS"), threads)
-    environment |= QUIET_TENSORFLOW
     settings = {
         "distributed.nanny.pre-spawn-environ": environment,
         "distributed.admin.tick.limit": "10 m",
@@ -160,8 +161,7 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
         Client(cluster) as client,
     ):
         if workers > 1:
-            client.run(_write_errors_to, log)
-            client.run(_import_units)
+            client.run(_set_up_worker, log)
         with _errors_written_to(log) if workers == 1 else nullcontext():
             yield client
 
@@ -303,7 +303,6 @@ def execute(
 
 def _execute_here(tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None]) -> dict[str, Product]:
     """Make products one after the other in the main thread, where MPI may be used."""
-    os.environ.update(QUIET_TENSORFLOW)
     products = {}
     for task in tasks:
         products[task.key] = perform(WorkOrder.of(task, store))

@@ -322,10 +322,7 @@ def load_runtime(
 
 
 def _gpu() -> str:
-    from calstudy.base.quiet import load_tensorflow
-
-    load_tensorflow()
-    import tensorflow as tf
+    from calstudy.base.tensorflow import tf
 
     devices = tf.config.list_physical_devices("GPU")
     if not devices:

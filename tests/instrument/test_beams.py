@@ -16,6 +16,8 @@ from scipy.special import j1
 
 from calstudy.base.errors import InputError
 from calstudy.instrument import settings as section
+from calstudy.instrument import tabulated
+from calstudy.instrument.beam_file import find_beam
 from calstudy.instrument.beam_models.airy import AiryBeam
 from calstudy.instrument.beam_models.beamfits import FileBeam
 from calstudy.instrument.beam_models.gaussian import GaussianBeam
@@ -105,6 +107,31 @@ def test_ideal_tile_is_a_dipole_times_a_sum_over_its_sixteen_dipoles_and_their_i
         az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency])
     )
     np.testing.assert_allclose(np.abs(tile), np.abs(dipole * response / zenith), atol=1e-12)
+
+
+@pytest.mark.parametrize("interpolation", ["chebyshev", "linear"])
+def test_the_kept_fit_of_the_embedded_element_is_the_fit(monkeypatch, tmp_path, interpolation):
+    """Bit by bit; what is kept is of the file's content, and is not of another file, band or interpolation."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    read, reads = tabulated._read_mwa, []
+    monkeypatch.setattr(tabulated, "_read_mwa", lambda path, band: reads.append(path) or read(path, band))
+    band = section.Channels().band
+    beams = []
+    for _ in range(2):
+        tabulated._mwa_embedded_element.cache_clear()  # As in another process.
+        beams.append(tabulated.mwa_embedded_element(None, band, interpolation))
+    assert len(reads) == 1
+    fit = tabulated.TabulatedBeam(tabulated.fit_table(read(find_beam(), band), band, interpolation))
+    for beam in beams:
+        assert beam.fit_error == fit.fit_error
+        for name, value in fit.description.items():
+            assert np.array_equal(beam.description[name], value)
+        assert np.array_equal(beam.jones(BAND), fit.jones(BAND))
+        assert np.array_equal(beam.tabulated_frequencies, fit.tabulated_frequencies)
+    other = tmp_path / "other.h5"
+    other.write_text("not a beam")
+    with pytest.raises(InputError, match="cannot be read as an MWA beam file"):
+        tabulated.mwa_embedded_element(other, band, interpolation)
 
 
 def test_x_is_the_east_west_dipole(embedded):

@@ -206,6 +206,16 @@ def write_hdf5(job):
         file["much"] = list(range(10**5))
     return {{}}
 
+class Held:
+    def __del__(self, touch=Path("freed").touch):
+        touch()
+
+held = []
+
+def hold(job):
+    held.append(Held())
+    return {{}}
+
 def limit():
     # Longer files cannot be written, whoever asks: EFBIG, as on a full disk.
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -237,6 +247,12 @@ def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, workers):
     assert result.returncode == 1
     assert "RuntimeError: stage (label): the process was told to exit" in result.stderr
     assert "in leave" in result.stderr
+
+
+def test_workers_end_at_once_and_do_not_free_what_libraries_hold(tmp_path):
+    result = program(tmp_path, "hold", workers=2)
+    assert result.returncode == 0, result.stderr
+    assert not (tmp_path / "freed").exists()
 
 
 DYING = """

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import tensorflow as tf
-
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate.pairs import inner_product
 
 Operator = Callable[[tf.Tensor], tf.Tensor]

@@ -13,8 +13,8 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-import tensorflow as tf
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.loss import FitData, JointLoss, Parameters

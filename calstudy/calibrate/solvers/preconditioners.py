@@ -27,8 +27,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy.linalg
-import tensorflow as tf
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate.batches import Piece, column_products, joined
 from calstudy.calibrate.projection import Linearization, Projection, Projector
 from calstudy.calibrate.tensors import Ends, FitTensors

@@ -36,7 +36,7 @@ class FileBeam(BeamModel):
         """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beam_grid import read_beamfits
         from calstudy.instrument.beams import GriddedBeam
-        from calstudy.instrument.tabulated import TabulatedBeam
+        from calstudy.instrument.tabulated import TabulatedBeam, fit_table
 
-        table = TabulatedBeam(read_beamfits(self.path), channels.band, self.interpolation)
+        table = TabulatedBeam(fit_table(read_beamfits(self.path), channels.band, self.interpolation))
         return GriddedBeam(table, self.path.name, STAND_IN.format(what=f"the file {self.path.name}"))

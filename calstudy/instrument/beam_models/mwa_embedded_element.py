@@ -40,10 +40,9 @@ class MwaEmbeddedBeam(BeamModel):
     def make(self, channels: Channels) -> Beam:
         """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beams import GriddedBeam
-        from calstudy.instrument.tabulated import TabulatedBeam, read_mwa_embedded_element
+        from calstudy.instrument.tabulated import mwa_embedded_element
 
-        table = read_mwa_embedded_element(self.path, channels.band)
-        return GriddedBeam(TabulatedBeam(table, channels.band, self.interpolation), self.kind, None)
+        return GriddedBeam(mwa_embedded_element(self.path, channels.band, self.interpolation), self.kind, None)
 
     def make_tiles(self, channels: Channels, amplitudes: np.ndarray) -> list[Beam]:
         """Return the beams of tiles with given amplitudes of their dipoles, (Ntiles, 2 [x, y], 16)."""

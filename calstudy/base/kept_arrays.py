@@ -1,0 +1,81 @@
+"""Arrays that take long to compute, kept on this machine for later processes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calstudy.base.downloads import default_directory
+from calstudy.base.identity import digest_json
+
+logger = logging.getLogger(__name__)
+
+MOST = 16
+"""Files of one name that are kept: those that were used last."""
+DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What numpy raises for an .npz file that was changed or cut short."""
+
+
+def kept_arrays(
+    name: str, identity: Mapping[str, Any], compute: Callable[[], Mapping[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """Read arrays that an earlier process kept or, if there are none, compute and keep them.
+
+    A folder that cannot be written costs the time alone.
+
+    Parameters
+    ----------
+    name
+        Of the arrays, as part of a file's name.
+    identity
+        All that decides their values; JSON-able.
+    compute
+        Computes them. Strings and numbers come back as arrays without axes.
+    """
+    path = default_directory() / f"{name}-{digest_json(identity)}.npz"
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = dict(file)
+    except FileNotFoundError:
+        logger.info("%s: computed, for %s is not there", name, path)
+    except DAMAGE as error:
+        logger.warning("%s: computed, for %s cannot be read (%s)", name, path, error)
+    else:
+        with suppress(OSError):
+            path.touch()
+        return arrays
+    arrays = {key: np.asarray(value) for key, value in compute().items()}
+    try:
+        _write(path, arrays)
+        _remove_oldest(path.parent, name)
+    except OSError as error:
+        logger.warning("%s: not kept in %s (%s)", name, path.parent, error)
+    return arrays
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write a file that is there whole or not at all, whoever else writes it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+        Path(partial).replace(path)
+    finally:
+        Path(partial).unlink(missing_ok=True)
+
+
+def _remove_oldest(folder: Path, name: str) -> None:
+    """Remove the files of a name beyond `MOST`; a process that reads one of them keeps what it has opened."""
+    kept = sorted(folder.glob(f"{name}-*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in kept[MOST:]:
+        path.unlink(missing_ok=True)
