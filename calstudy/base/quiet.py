@@ -1,10 +1,21 @@
-"""Keep the start-up messages of libraries off the terminal."""
+"""TensorFlow: whether it is there, and its import without start-up messages."""
 
 from __future__ import annotations
 
 import importlib
 import os
 import sys
+from importlib.util import find_spec
+
+from calstudy.base.errors import InputError
+
+
+def require_tensorflow() -> None:
+    """Raise InputError if TensorFlow is not installed; imports nothing."""
+    if find_spec("tensorflow") is None:
+        raise InputError(
+            "TensorFlow is not installed: pip install 'calstudy[cpu]', or 'calstudy[gpu]' for TensorFlow with CUDA"
+        )
 
 
 def load_tensorflow(threads: int | None = None) -> None:
@@ -14,7 +25,13 @@ def load_tensorflow(threads: int | None = None) -> None:
     ----------
     threads
         Processor cores that it, and numerical libraries loaded from now on, may use; all by default.
+
+    Raises
+    ------
+    InputError
+        If it is not installed.
     """
+    require_tensorflow()
     if threads is not None:
         for name in ("OMP_NUM_THREADS", "TF_NUM_INTRAOP_THREADS", "TF_NUM_INTEROP_THREADS"):
             os.environ[name] = str(threads)

@@ -23,6 +23,7 @@ from calstudy.corrupt.levels import rms
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import InstrumentSettings, MwaLayout
 from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.simulate.arguments import missing_package
 from calstudy.simulate.interface import Engine
 from calstudy.simulate.nodes import integration_times
 from calstudy.sky.foregrounds import make_foregrounds
@@ -113,12 +114,15 @@ def time_engines(work: Work, engines: list[str], announce: Callable[[str], None]
     Raises
     ------
     InputError
-        If a name is not an engine's, or an engine fails.
+        If a name is not an engine's, its package is not installed, or an engine fails.
     """
     known = list(dict.fromkeys(name for name, _ in CANDIDATES))
     unknown = [name for name in engines if name not in known]
     if unknown:
         raise InputError(f"--engines {unknown[0]}: not an engine that is compared (allowed: {', '.join(known)})")
+    for name in engines:
+        if (reason := missing_package(name)) is not None:
+            raise InputError(f"engine {name!r}: {reason}")
     chosen = [(name, precision) for name, precision in CANDIDATES if name in engines]
     with tempfile.TemporaryDirectory() as folder:
         found = {}

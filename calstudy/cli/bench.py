@@ -124,11 +124,14 @@ def memory(
     output: Output = None,
 ) -> None:
     """Solve one integration of growing arrays, each in a process of its own: planned and measured memory, time."""
-    from calstudy.base.resources import parse_memory
-    from calstudy.bench.solve_memory import HEADINGS, measure_solve
+    from calstudy.base.quiet import require_tensorflow
 
     if output is not None:
         require_writable(output)
+    require_tensorflow()
+    from calstudy.base.resources import parse_memory
+    from calstudy.bench.solve_memory import HEADINGS, measure_solve
+
     budget, sizes = parse_memory(max_memory), _sizes(antennas)
 
     def row(size: int) -> Sequence[str]:

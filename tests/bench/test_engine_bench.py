@@ -1,5 +1,7 @@
 """The comparison of engines: it measures what it says."""
 
+import sys
+
 import pytest
 from typer.testing import CliRunner
 
@@ -45,6 +47,14 @@ def test_engines_are_compared_in_their_precisions():
 def test_an_unknown_engine_is_refused():
     with pytest.raises(InputError, match=r"--engines oskar: .*allowed: dense, matvis, fftvis, pyuvsim"):
         time_engines(Work(), ["oskar"])
+
+
+def test_an_engine_without_its_package_is_refused_before_any_is_run(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matvis", None)
+    announced = []
+    with pytest.raises(InputError, match=r"'matvis': needs the package matvis, .* 'calstudy\[engines\]'"):
+        time_engines(SMALL, ["dense", "matvis"], announced.append)
+    assert announced == []
 
 
 @pytest.mark.parametrize(("path", "reason"), [("table.txt", "must end in .csv or .md"), ("no/table.md", "no folder")])
