@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
-import nbclient
 import nbformat
 import pytest
 
@@ -60,6 +59,7 @@ def test_a_notebook_is_stored_clean(path):
 @notebooks
 def test_a_notebook_runs(path, tmp_path, request):
     """Parameters are injected as papermill does: by a cell after the tagged one."""
+    nbclient = pytest.importorskip("nbclient", reason="needs the extra [docs]")
     notebook = nbformat.read(path, as_version=4)
     place = next(i for i, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", []))
     overrides = [

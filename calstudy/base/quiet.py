@@ -1,4 +1,4 @@
-"""Import TensorFlow without its start-up messages, and without Keras."""
+"""TensorFlow: whether it is there, and its import without start-up messages and without Keras."""
 
 from __future__ import annotations
 
@@ -7,15 +7,32 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
+
+from calstudy.base.errors import InputError
 
 KERAS = "TF_USE_LEGACY_KERAS"
+
+
+def require_tensorflow() -> None:
+    """Raise InputError if TensorFlow is not installed; imports nothing."""
+    if find_spec("tensorflow") is None:
+        raise InputError(
+            "TensorFlow is not installed: pip install 'calstudy[cpu]', or 'calstudy[gpu]' for TensorFlow with CUDA"
+        )
 
 
 def load_tensorflow() -> None:
     """Import TensorFlow without what its native code writes to standard error before any setting is heeded.
 
     Its import would import Keras, and with it scikit-learn. `tf.keras` imports it when it is used.
+
+    Raises
+    ------
+    InputError
+        If it is not installed.
     """
+    require_tensorflow()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if "tensorflow" in sys.modules:
         return

@@ -153,6 +153,7 @@ def engine(
     Both are products in the store: what a run has made is not made again, and an interrupted check is resumed.
     """
     from calstudy.products.files import VISIBILITIES, read_visibilities, write_json
+    from calstudy.simulate.arguments import missing_package
     from calstudy.simulate.settings import ENGINES
     from calstudy.studies.components import make_component
     from calstudy.studies.study import Budget
@@ -163,6 +164,8 @@ def engine(
         ENGINES.find(reference)
     except InputError as error:
         raise InputError(f"--reference {error}") from None
+    if (missing := missing_package(reference)) is not None:
+        raise InputError(f"--reference {reference}: {missing}")
     other = _load(file, scale, [*(overrides or ()), f"simulation.engine={reference}", *(reference_set or ())])
     console = Console(soft_wrap=True, highlight=False)
     products = [

@@ -9,8 +9,8 @@ function of the authors' code with the same optimizer (benchmarks/README.md).
 from __future__ import annotations
 
 import numpy as np
-import tensorflow as tf
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate.problem import CalibrationProblem
 
 LEARNING_RATE = 0.01

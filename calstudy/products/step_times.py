@@ -16,11 +16,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import tensorflow as tf
 from pydantic import TypeAdapter
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Usage, resident_memory
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.settings import BasisSettings
 from calstudy.calibrate.solvers.first_order import STEPS_PER_CALL, FirstOrder, Optimizer

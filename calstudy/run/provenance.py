@@ -35,11 +35,17 @@ def package_versions() -> dict[str, str | None]:
     """Return the versions of the packages that results depend on; None for one that is not installed."""
     versions: dict[str, str | None] = {"calstudy": __version__}
     for name in PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = None
+        versions[name] = _version(name)
+    # Without CUDA the same module comes in a package of another name.
+    versions["tensorflow"] = versions["tensorflow"] or _version("tensorflow-cpu")
     return versions
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def git_commit() -> str | None:

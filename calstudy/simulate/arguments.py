@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,19 @@ from calstudy.simulate.nodes import integration_times
 
 # Row and column of a matrix of feeds x and y that hold each polarization number.
 FEED_PAIRS = {-5: (0, 0), -6: (1, 1), -7: (0, 1), -8: (1, 0)}
+OPTIONAL = ("matvis", "fftvis")
+"""Engines whose packages are not among calstudy's dependencies; the extra `engines` has them."""
+
+
+def missing_package(engine: str) -> str | None:
+    """Return that the package of an engine of this name is not installed, or None."""
+    if engine in OPTIONAL and find_spec(engine) is None:
+        return f"needs the package {engine}, which is not installed: pip install 'calstudy[engines]'"
+    return None
 
 
 def refusal(engine: str, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
-    """Return why an engine for unpolarized skies and feeds x and y does not support a simulation, or None.
+    """Return why matvis or fftvis does not support a simulation, or None.
 
     Parameters
     ----------
@@ -33,6 +43,8 @@ def refusal(engine: str, sky: SkyModel, beam: BeamSource | AntennaBeams, templat
     sky, beam, template
         As for `calstudy.simulate.interface.Engine.simulate`.
     """
+    if (missing := missing_package(engine)) is not None:
+        return missing
     if is_polarized(sky):
         return f"the {engine} engine supports unpolarized skies only"
     unknown = [int(number) for number in template.polarization_array if int(number) not in FEED_PAIRS]

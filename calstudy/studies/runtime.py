@@ -13,6 +13,7 @@ from pydantic import Field, SerializeAsAny, ValidationError, field_validator, mo
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import Plugin
+from calstudy.base.quiet import require_tensorflow
 from calstudy.base.resources import free_memory, parse_memory
 from calstudy.base.schema import Section, fault
 from calstudy.base.units import Length
@@ -169,8 +170,9 @@ class RuntimeStudy(Study):
     def timed_on(self) -> Mapping[str, Any]:
         """What the measurements belong to: part of their keys, so that those of another machine are not taken for them.
 
-        Raises InputError if the file wants a GPU and this machine has none.
+        Raises InputError if TensorFlow is not installed, or the file wants a GPU and this machine has none.
         """
+        require_tensorflow()
         versions = package_versions()
         found = {**machine(), **{name: versions[name] for name in TIMED_WITH}}
         return {**found, "gpu": _gpu()} if "gpu" in self.file.runtime.devices else found

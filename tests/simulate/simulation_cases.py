@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from astropy import units
 from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
@@ -10,6 +11,20 @@ from pyradiosky import SkyModel
 
 from calstudy.instrument import settings as instrument
 from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.simulate.arguments import OPTIONAL, missing_package
+from calstudy.simulate.engines.dense import DenseEngine
+from calstudy.simulate.engines.fftvis import FftvisEngine
+from calstudy.simulate.engines.matvis import MatvisEngine
+from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+
+needs_engines = pytest.mark.skipif(any(map(missing_package, OPTIONAL)), reason="needs the extra [engines]")
+FAST_ENGINES = [
+    pytest.param(DenseEngine(), id="dense"),
+    pytest.param(MatvisEngine(), id="matvis", marks=needs_engines),
+    pytest.param(FftvisEngine(), id="fftvis", marks=needs_engines),
+]
+"""All but pyuvsim, the reference."""
+ALL_ENGINES = [*FAST_ENGINES, pytest.param(PyuvsimEngine(), id="pyuvsim")]
 
 
 def observe(count=5, channels=3, width="4 MHz", times=3, integration="56 s", polarizations=("xx", "yy")):

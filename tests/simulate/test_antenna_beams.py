@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulation_cases import observe, random_sky, relative_error
+from simulation_cases import ALL_ENGINES, FAST_ENGINES, needs_engines, observe, random_sky, relative_error
 
 from calstudy.base.errors import ExperimentError
 from calstudy.base.visibilities import antenna_indices, to_cube
@@ -60,12 +60,13 @@ def expected(sky, beams, template):
     return PyuvsimEngine().simulate(sky, beams, template)
 
 
-@pytest.mark.parametrize("engine", [DenseEngine(), MatvisEngine(), FftvisEngine()], ids=lambda engine: engine.label)
+@pytest.mark.parametrize("engine", FAST_ENGINES)
 def test_engines_agree_with_pyuvsim(engine, sky, beams, template, expected):
     assert engine.refusal(sky, beams, template) is None
     assert relative_error(engine.simulate(sky, beams, template), expected) < 1e-10
 
 
+@needs_engines
 def test_cross_hands_of_different_beams_go_to_an_engine_that_has_them(sky, beams):
     crossed = observe(count=6, channels=1, times=1)
     crossed.polarization_array = np.array([-7, -8])
@@ -85,9 +86,7 @@ def test_only_the_baselines_of_other_antennas_change(sky, beams, template, expec
     assert (changes[~own] > 1e-3 * np.sqrt(np.mean(np.abs(alike) ** 2))).all()
 
 
-@pytest.mark.parametrize(
-    "engine", [DenseEngine(), MatvisEngine(), FftvisEngine(), PyuvsimEngine()], ids=lambda engine: engine.label
-)
+@pytest.mark.parametrize("engine", ALL_ENGINES)
 def test_the_same_beam_given_to_each_antenna_changes_nothing(engine, sky, gaussian_beam):
     template = observe(count=4, channels=1, times=1)
     twice = AntennaBeams((gaussian_beam, gaussian_beam), np.array([0, 1, 1, 0]))
@@ -110,6 +109,7 @@ def test_auto_takes_the_fastest(sky, beams, template):
     assert SimulationSettings().engine.choose(sky, beams, template).label == "dense"
 
 
+@needs_engines
 def test_an_experiment_simulates_them(tmp_path: Path):
     groups = {"damaged": {"antennas": [2, 5], "beam": WIDE}}
     experiment = validate({**SMALL, "instrument": {**SMALL["instrument"], "antenna_beams": groups}}, tmp_path)

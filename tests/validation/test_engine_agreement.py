@@ -88,6 +88,7 @@ def test_other_observations_are_refused(template):
 
 
 def test_the_command_makes_both_once_and_keeps_them_where_a_run_finds_them(tmp_path: Path):
+    pytest.importorskip("matvis", reason="needs the extra [engines]")
     file = tmp_path / "small.yaml"
     settings = {
         "name": "small",

@@ -6,6 +6,7 @@ from typing import Self
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
+from calstudy.base.quiet import require_tensorflow
 from calstudy.base.resources import Cost
 from calstudy.calibrate.cost import LEAST_MODELS, Dimensions, solve_cost, solve_memory
 from calstudy.calibrate.interface import Assumed, Calibration, Outline, Progress
@@ -37,7 +38,7 @@ class LeastSquares(GainFit):
         return self.model_copy(update={"models_at_once": max(self.models_at_once // 2, LEAST_MODELS)})
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return why no foreground model can be made for these baselines and channels, or None."""
+        """Return that TensorFlow is missing, or why these baselines and channels cannot be fitted, or None."""
         if isinstance(self, ForegroundFit) and not has_sky_model:
             for field, value in (("foreground_prior.mean", self.foreground_prior.mean), ("prior", self.prior)):
                 if value == "sky-model":
@@ -45,6 +46,7 @@ class LeastSquares(GainFit):
         from calstudy.calibrate.problem import fitted_baselines
 
         try:
+            require_tensorflow()
             frame = frame.baselines(fitted_baselines(frame, self.autos))
             if isinstance(self, ForegroundFit) and not self.frozen:
                 _require_basis(frame, self)
