@@ -63,7 +63,7 @@ class SimulationSettings(Section):
         16,
         ge=1,
         description="Independent parts of the simulation of the EoR, for resuming and for parallel workers; the "
-        "foregrounds have a quarter as many. Changes results by rounding only.",
+        "foregrounds have a quarter as many. Changes results by less than the tolerances of the nodes.",
         json_schema_extra=UNKEYED,
     )
 
