@@ -123,12 +123,11 @@ def fit_power_law(size: np.ndarray, value: np.ndarray) -> PowerLaw:
         If there are fewer sizes, or a number is not positive.
     """
     import numpy as np
-    from scipy.stats import linregress
 
     if len(size) != len(value) or np.unique(size).size < 3 or min(*size, *value) <= 0:
         raise ValueError(f"a power law needs positive values at three sizes or more, got {len(value)} at {len(size)}")
-    line = linregress(np.log(size), np.log(value))
-    return PowerLaw(float(np.exp(line.intercept)), float(line.slope), float(line.stderr))
+    (exponent, logarithm), covariance = np.polyfit(np.log(size), np.log(value), 1, cov=True)
+    return PowerLaw(float(np.exp(logarithm)), float(exponent), float(covariance[0, 0] ** 0.5))
 
 
 def _cost_of_timing(task: Task) -> Cost:
