@@ -110,8 +110,6 @@ def test_tensorflow_of_any_package_is_recorded(monkeypatch):
     [
         ["plan", str(ROOT / "experiments" / "quickstart.yaml")],
         ["plan", str(ROOT / "experiments" / "runtime.yaml")],
-        ["bench", "calibrate"],
-        ["bench", "memory"],
     ],
     ids=" ".join,
 )

@@ -170,10 +170,13 @@ def interpolation_matrix(nodes: np.ndarray, samples: np.ndarray) -> np.ndarray:
 
 
 def time_axis(template: UVData, accuracy: Accuracy) -> Axis:
-    """Choose the times at which sources that stay above the horizon are simulated."""
+    """Choose the times at which the visibilities of all sources that stay above the horizon are interpolated.
+
+    On the longest baselines many sources come near the bound of the error, so that the tolerance is a tenth.
+    """
     times = integration_times(template)
     bandwidth = time_bandwidth(times, template.freq_array.max(), turning_length(template) + accuracy.beam_extent)
-    return make_axis(times, bandwidth, accuracy.tolerance)
+    return make_axis(times, bandwidth, 0.1 * accuracy.tolerance)
 
 
 def frequency_axis(template: UVData, accuracy: Accuracy) -> Axis:

@@ -18,7 +18,6 @@ rise or set are discontinuous in time: their patches are simulated at every inte
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numba
@@ -50,8 +49,6 @@ from calstudy.simulate.patterns import InterpolatedPattern, Pattern, power_patte
 
 SINGLE_PRECISION = 1e-6
 """Smallest tolerance to which products in single precision are exact."""
-COMMON = 0.1
-"""Tolerance of the interpolation of all patches together, over that of each: its nodes cost little."""
 LEAST, LOOSEST = 1e-30, 0.5
 """Signal of a patch over the rms below which it does not count, and the largest relative error of a patch."""
 
@@ -78,8 +75,7 @@ def visibilities(
     """
     array = PatchedArray(beam, template, accuracy)
     dtype = dtype or (np.float32 if accuracy.tolerance >= SINGLE_PRECISION else np.float64)
-    times = integration_times(template)
-    common = time_axis(template, replace(accuracy, tolerance=COMMON * accuracy.tolerance))
+    times, common = integration_times(template), time_axis(template, accuracy)
     tracks = SourceTracks.of(sky, template.telescope.location, times)
     always_up, crossing = split_by_horizon(tracks, times)
     total = np.zeros((template.Nfreqs, len(common.nodes), template.Npols, template.Nbls), dtype=np.complex128)

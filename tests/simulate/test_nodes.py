@@ -72,7 +72,7 @@ def test_julian_dates_are_interpolated_below_their_own_rounding():
 def test_counts_of_the_paper_follow_from_its_baselines():
     template = observe(count=36, channels=384, width="80 kHz", times=56, integration="2 s", polarizations=("xx",))
     times, channels = time_axis(template, DEFAULT), frequency_axis(template, DEFAULT)
-    assert (len(times.nodes), len(channels.nodes)) == (16, 94)
+    assert (len(times.nodes), len(channels.nodes)) == (17, 94)
     # 176 m and 20 m of beam: half the turns of the horizon delay over 30.64 MHz.
     assert frequency_bandwidth(template.freq_array, 196.15) == pytest.approx(np.pi * 196.15 / 299792458 * 30.64e6)
     assert turning_length(template) < 177
