@@ -12,8 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from calstudy.base import downloads
-from calstudy.base.downloads import download, sha256
+from calstudy.base.downloads import download
 from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
 from calstudy.cli.main import app
 from calstudy.instrument import beam_file
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -14,12 +13,6 @@ def default_directory() -> Path:
     import pooch
 
     return Path(pooch.os_cache("calstudy"))
-
-
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def download(url: str, path: Path, instead: str, known_hash: str | None = None, progress: bool = True) -> None:

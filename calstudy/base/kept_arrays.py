@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from calstudy.base.downloads import default_directory
+from calstudy.base.files import replacing
 from calstudy.base.identity import digest_json
 
 logger = logging.getLogger(__name__)
@@ -51,27 +51,17 @@ def kept_arrays(
         logger.warning("%s: computed, for %s cannot be read (%s)", name, path, error)
     else:
         with suppress(OSError):
-            path.touch()
+            os.utime(path)
         return arrays
     arrays = {key: np.asarray(value) for key, value in compute().items()}
     try:
-        _write(path, arrays)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as target:
+            np.savez(target, allow_pickle=False, **arrays)
         _remove_oldest(path.parent, name)
     except OSError as error:
         logger.warning("%s: not kept in %s (%s)", name, path.parent, error)
     return arrays
-
-
-def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write a file that is there whole or not at all, whoever else writes it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-        Path(partial).replace(path)
-    finally:
-        Path(partial).unlink(missing_ok=True)
 
 
 def _remove_oldest(folder: Path, name: str) -> None:

@@ -38,6 +38,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from calstudy.base.errors import InputError, nearest
+from calstudy.base.files import sha256
 from calstudy.base.schema import Section, fault
 
 FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
@@ -311,8 +312,7 @@ def digest_file(path: Path) -> str:
 @lru_cache(maxsize=256)
 def _digest_of(path: str, modified: int, size: int) -> str:
     del modified, size
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256(Path(path))
 
 
 def load_file(path: Path) -> ModuleType:

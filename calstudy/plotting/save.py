@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -14,6 +12,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.files import replacing
 from calstudy.plotting.style import journal_style
 
 if TYPE_CHECKING:
@@ -115,7 +114,7 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
     paths = [folder / f"{name}.{ending}" for ending in writers]
     with journal_style(), _laid_out(figure):
         for path, write in zip(paths, writers.values(), strict=True):
-            with _replacing(path) as stream:
+            with replacing(path) as stream:
                 write(stream)
     return paths
 
@@ -133,19 +132,3 @@ def _laid_out(figure: Figure) -> Iterator[None]:
         yield
     finally:
         figure.set_layout_engine(layout)
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Open a stream whose content becomes `path` once the block has ended without error."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    partial_file = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial_file.chmod(0o644)
-        partial_file.replace(path)
-    finally:
-        partial_file.unlink(missing_ok=True)

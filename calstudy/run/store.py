@@ -7,7 +7,6 @@ and renamed; a folder whose files no longer match its record is damaged, and is 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -23,16 +22,11 @@ from uuid import uuid4
 from filelock import FileLock
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
 
 RECORD = "product.json"
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Stages and keys: names of folders, and of nothing above or below."""
-
-
-def digest_file(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hexadecimal, read anew."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)
@@ -136,7 +130,7 @@ class Store:
             return None
         try:
             intact = all(
-                digest_file(product.path / name) == entry["sha256"] for name, entry in product.record["files"].items()
+                sha256(product.path / name) == entry["sha256"] for name, entry in product.record["files"].items()
             )
         except OSError:
             return None
@@ -193,7 +187,7 @@ class Store:
             JSON-able; must hold `stage` and `key`.
         """
         files = {
-            path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": digest_file(path)}
+            path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": sha256(path)}
             for path in sorted(folder.rglob("*"))
             if path.is_file()
         }

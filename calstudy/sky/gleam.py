@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from calstudy.base.downloads import default_directory, download, sha256
+from calstudy.base.downloads import default_directory, download
 from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
 from calstudy.sky.catalogue import read_gleam_table
 
 LOG = logging.getLogger(__name__)

@@ -12,7 +12,8 @@ from typing import Any
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-from calstudy.run.store import Product, Store, digest_file
+from calstudy.base.files import sha256
+from calstudy.run.store import Product, Store
 from calstudy.run.task import Task
 from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
@@ -56,7 +57,7 @@ class FinishedRun:
         for task in study.tables:
             for name, digest in self.tables[task.key]["files"].items():
                 path = self.folder / TABLES / name
-                if Path(name).name != name or not path.is_file() or digest_file(path) != digest:
+                if Path(name).name != name or not path.is_file() or sha256(path) != digest:
                     return f"{TABLES}/{name} is not what the run wrote: it was changed or lost"
         return None
 

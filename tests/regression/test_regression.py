@@ -14,13 +14,13 @@ from tiny import tiny
 from typer.testing import CliRunner
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
 from calstudy.cli.main import app
 from calstudy.experiment.files import load, override
 from calstudy.regression.comparison import compare_array, compare_claims, compare_figures
 from calstudy.regression.reference import accept, find_references, read_reference, read_run
 from calstudy.regression.remake import remake
 from calstudy.regression.tables import Regression, show
-from calstudy.run.store import digest_file
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, run_study
 from calstudy.verdicts.criterion import Verdict
@@ -73,7 +73,7 @@ def test_a_reference_keeps_the_tables_that_the_manifest_has_on_record(reference,
     manifest = json.loads((reference / "manifest.json").read_text())
     files = {name: digest for entry in manifest["products"] for name, digest in entry.get("files", {}).items()}
     assert "residual.outside-wedge.h5" in files
-    assert {path.name: digest_file(path) for path in (reference / "tables").iterdir()} == files
+    assert {path.name: sha256(path) for path in (reference / "tables").iterdir()} == files
     other, run = tmp_path / "reference", tmp_path / "run"
     shutil.copytree(reference, other)
     shutil.copytree(finished, run)

@@ -13,6 +13,7 @@ from rich.console import Console
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.files import sha256
 from calstudy.claims.folders import evaluate_folder
 from calstudy.cli import main as cli
 from calstudy.experiment.files import override
@@ -22,7 +23,7 @@ from calstudy.products import corruption, simulation
 from calstudy.products.spectra import power
 from calstudy.regression.reference import accept
 from calstudy.run.execution import schedule
-from calstudy.run.store import Store, digest_file
+from calstudy.run.store import Store
 from calstudy.studies.collection import Collection
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.finished import with_finished
@@ -286,7 +287,7 @@ def test_other_results_in_the_store_are_not_passed_off_as_those_of_the_run(finis
     (run / "tables" / "eor.all-modes.csv").write_text("other")
     manifest = json.loads((run / "manifest.json").read_text())
     (entry,) = (item for item in manifest["products"] if "eor.all-modes.csv" in item.get("files", {}))
-    entry["files"]["eor.all-modes.csv"] = digest_file(run / "tables" / "eor.all-modes.csv")
+    entry["files"]["eor.all-modes.csv"] = sha256(run / "tables" / "eor.all-modes.csv")
     (run / "manifest.json").write_text(json.dumps(manifest))
     there = elsewhere(folder, tmp_path)
     assert with_finished(there, [run], Console(file=io.StringIO())).finished == {"hexagon": run}
