@@ -278,9 +278,10 @@ def expect(job: Job) -> Mapping[str, Any]:
 def _cost_of_eor(task: Task) -> Cost:
     size, settings = size_of(task), task.settings
     pixels, channels = 12 * settings["eor"].nside ** 2, size.channels.count
-    slots = size.times * channels
-    engine = settings["simulation"].engine.cost(SimulationSize(pixels, slots, slots, size.antennas, 1))
-    at_once = channels / min(settings["simulation"].chunks, channels)
+    slots, simulation = size.times * channels, settings["simulation"]
+    tolerance = simulation.nodes.for_eor(smooth_beam=True).tolerance
+    engine = simulation.engine.cost(SimulationSize(pixels, slots, slots, size.antennas, 1, tolerance))
+    at_once = channels / min(simulation.chunks, channels)
     disk = size.samples * COMPLEX128
     memory = engine.memory + pixels * (300 + 55 * at_once) + 3 * disk
     return Cost(10 + engine.seconds, max(memory, LIBRARIES_MEMORY), disk)

@@ -20,6 +20,7 @@ from calstudy.simulate.nodes import (
     SECONDS_PER_DAY,
     chebyshev_count,
     frequency_bandwidth,
+    frequency_blocks,
     patch_nside,
     time_bandwidth,
 )
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.component import Component
     from calstudy.simulate.floor import DelayFloor
-    from calstudy.simulate.settings import SimulationSettings
+    from calstudy.simulate.nodes import Accuracy
     from calstudy.sky.settings import SkySettings
 
 CHUNK = "chunk.uvh5"
@@ -201,16 +202,21 @@ def _cost_of_chunk(task: Task) -> Cost:
     size, eor = Size.of(instrument), isinstance(sky, Eor)
     sources = 12 * sky.nside**2 if isinstance(sky, Eor) else _sources(task.settings)
     kept = 0.0 if eor else DRAWN_SOURCE * _drawn(task.settings["sky"])
-    nodes = _node_counts(instrument, simulation, eor, size.longest)
-    patches = _node_counts(instrument, simulation, eor, size.longest * _patch_radius(sources), TYPICAL_ERROR)
+    accuracy = simulation.nodes.for_eor(True) if eor else simulation.nodes.for_foregrounds(True, smooth_sky=True)
+    nodes = _node_counts(instrument, accuracy, size.longest)
+    patches = _node_counts(instrument, accuracy, size.longest * _patch_radius(sources), TYPICAL_ERROR)
     pieces = min(simulation.pieces(eor), size.channels.count)
     beams = beam_count(instrument, size.antennas)
     whole, in_patches = (counts[0] * counts[1] / pieces for counts in (nodes, patches))
-    engine = simulation.engine.cost(SimulationSize(sources, whole, in_patches, size.antennas, beams))
-    channels = nodes[1] / pieces if eor else nodes[1]
-    disk = size.samples / size.channels.count * channels * COMPLEX128
+    tolerance = (
+        simulation.nodes.for_eor(True).tolerance if eor else simulation.nodes.for_foregrounds(True, True).tolerance
+    )
+    engine = simulation.engine.cost(SimulationSize(sources, whole, in_patches, size.antennas, beams, tolerance))
+    total = size.samples / size.channels.count * nodes[1] * COMPLEX128
+    disk = total / (pieces if eor else frequency_blocks(total, pieces))
+    channels = nodes[1] / pieces
     memory = engine.memory + kept + 300 * sources + (55 * sources * channels if eor else 0) + 4 * disk
-    seconds = 6 + engine.seconds
+    seconds = 3 + engine.seconds
     if beams > 1:
         seconds += beams * TABLE_SECONDS * size.polarizations * channels
         memory += beams * (TABLE_MEMORY * size.polarizations * channels + 2e7)
@@ -221,17 +227,17 @@ def _cost_of_chunk(task: Task) -> Cost:
 
 
 def _node_counts(
-    instrument: InstrumentSettings, simulation: SimulationSettings, eor: bool, length: float, error: float = 1.0
+    instrument: InstrumentSettings, accuracy: Accuracy, length: float, error: float = 1.0
 ) -> tuple[int, int]:
-    """Estimate the nodes in time and frequency for a length of baselines, m."""
-    times, channels, nodes = instrument.times, instrument.channels, simulation.nodes
-    if not nodes.enabled:
+    """Estimate the nodes in time and frequency for a length of baselines (m) and an error over the tolerance."""
+    times, channels, tolerance = instrument.times, instrument.channels, error * accuracy.tolerance
+    if not tolerance:
         return times.count, channels.count
-    length, tolerance = length + nodes.beam_extent, error * (nodes.eor_tolerance if eor else nodes.tolerance)
+    length += accuracy.beam_extent
     days = np.array([0.0, times.integration * (times.count - 1) / SECONDS_PER_DAY])
     low, high = channels.band
     in_time = min(chebyshev_count(time_bandwidth(days, high, length), tolerance), times.count)
-    if eor:
+    if not accuracy.smooth_sky:
         return in_time, channels.count
     in_frequency = chebyshev_count(frequency_bandwidth(np.array([low, high]), length), tolerance)
     return in_time, min(in_frequency, channels.count)

@@ -18,7 +18,7 @@ import numpy as np
 from calstudy.instrument.telescope import subset_template
 from calstudy.simulate.directions import sky_cells
 from calstudy.simulate.interface import BeamSource, Engine, simulate_with
-from calstudy.simulate.nodes import Accuracy, Axis, frequency_axis, integration_times, time_axis
+from calstudy.simulate.nodes import Accuracy, Axis, frequency_axis, frequency_blocks, integration_times, time_axis
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-CHUNK_BYTES = 4e8
-"""Visibilities of one chunk at all integrations."""
 PART_NSIDE = 8
 """Cells of the sky that parts consist of."""
 
@@ -119,8 +117,7 @@ def plan_chunks(template: UVData, accuracy: Accuracy, count: int) -> list[Chunk]
     axis = frequency_axis(template, accuracy)
     blocks = min(count, len(axis.nodes))
     if not axis.at_samples:
-        size = 16.0 * template.Nblts * template.Npols * len(axis.nodes)
-        blocks = min(blocks, int(np.ceil(size / CHUNK_BYTES)))
+        blocks = frequency_blocks(16.0 * template.Nblts * template.Npols * len(axis.nodes), blocks)
     parts = 1 if axis.at_samples else count // blocks
     edges = np.linspace(0, len(axis.nodes), blocks + 1).round().astype(int).tolist()
     return [

@@ -47,6 +47,8 @@ class SimulationSize:
         Of the array.
     beams
         Different ones.
+    tolerance
+        Of the interpolation, 0 for none.
     """
 
     sources: float
@@ -54,6 +56,7 @@ class SimulationSize:
     patch_slots: float
     antennas: int
     beams: int
+    tolerance: float
 
 
 class Engine(Plugin, ABC):

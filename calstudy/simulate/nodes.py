@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 EARTH_ROTATION_RATE = 7.2921158553e-5  # rad / s, sidereal
 SECONDS_PER_DAY = 86400.0
+SINGLE_PRECISION = 1e-6
+"""Smallest tolerance to which products in single precision are exact."""
+CHUNK_BYTES = 4e8
+"""Visibilities of one chunk of a smooth sky, at most, unless there are too few chunks."""
 PATCH_SOURCES = 700
 """Sources of a patch of the sky, at least, on average: about those of one matrix product."""
 
@@ -222,6 +226,11 @@ def patch_nside(components: float) -> int:
     """Return the resolution of the grid whose cells are patches, for a sky of so many components; 0: one patch."""
     cells = components / PATCH_SOURCES
     return int(2 ** np.floor(np.log2(cells / 12) / 2)) if cells >= 12 else 0
+
+
+def frequency_blocks(size: float, chunks: int) -> int:
+    """Return into how many blocks of frequency nodes chunks of a smooth sky are divided, for a size of all in bytes."""
+    return min(chunks, int(np.ceil(size / CHUNK_BYTES)))
 
 
 def integration_times(template: UVData) -> np.ndarray:

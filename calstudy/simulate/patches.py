@@ -35,6 +35,7 @@ from calstudy.simulate.directions import SourceTracks, sky_cells, split_by_horiz
 from calstudy.simulate.interface import BeamSource
 from calstudy.simulate.matrix_products import PairSums, angles
 from calstudy.simulate.nodes import (
+    SINGLE_PRECISION,
     Accuracy,
     Axis,
     frequency_bandwidth,
@@ -47,8 +48,6 @@ from calstudy.simulate.nodes import (
 )
 from calstudy.simulate.patterns import InterpolatedPattern, Pattern, power_pattern
 
-SINGLE_PRECISION = 1e-6
-"""Smallest tolerance to which products in single precision are exact."""
 LEAST, LOOSEST = 1e-30, 0.5
 """Signal of a patch over the rms below which it does not count, and the largest relative error of a patch."""
 

@@ -82,7 +82,7 @@ def test_chunks_of_a_smooth_sky_partition_its_sources(template, sky):
 
 
 def test_large_chunks_of_a_smooth_sky_are_split_by_frequency_first(template, monkeypatch):
-    monkeypatch.setattr("calstudy.simulate.chunks.CHUNK_BYTES", 4e6)
+    monkeypatch.setattr("calstudy.simulate.nodes.CHUNK_BYTES", 4e6)
     chunks = plan_chunks(template, accuracy(), 8)
     nodes, times = len(chunks[0].axis.nodes), template.Ntimes
     assert max(len(chunk.frequencies) for chunk in chunks) * times * template.Nbls * 16 < 1.1 * 4e6

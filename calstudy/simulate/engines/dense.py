@@ -10,7 +10,7 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
 from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
-from calstudy.simulate.nodes import EXACT, Accuracy
+from calstudy.simulate.nodes import EXACT, SINGLE_PRECISION, Accuracy
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
@@ -63,9 +63,9 @@ class DenseEngine(Engine):
 
     def cost(self, size: SimulationSize) -> Cost:
         """Return what a simulation takes; see `Engine.cost`."""
-        up = size.sources / 2
+        single = self.precision == "single" or (self.precision == "auto" and size.tolerance >= SINGLE_PRECISION)
         # Between two processors of 46 and 32 GFLOP/s in these products.
-        products = 1.2e-9 * size.antennas + 1.05e-10 * size.antennas**2
+        products = (0.6 if single else 1.0) * (1.2e-9 * size.antennas + 1.05e-10 * size.antennas**2)
         # Fields of several beams: products over both components, with one more factor to make.
         each = 2e-8 + products if size.beams == 1 else 3.5e-8 * size.beams + 3 * products
-        return Cost(1.1 * up * size.patch_slots * each + 4.5e-6 * size.sources)
+        return Cost(1.1 * size.sources / 2 * size.patch_slots * each + 1.5e-6 * size.sources)
