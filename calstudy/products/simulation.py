@@ -11,6 +11,7 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.instrument.distinct_beams import beam_count
+from calstudy.instrument.settings import HeraLayout, HexLayout, RectangularLayout
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, once
@@ -206,7 +207,8 @@ def _cost_of_chunk(task: Task) -> Cost:
     pieces = min(simulation.pieces(eor), size.channels.count)
     beams = beam_count(instrument, size.antennas)
     whole, in_patches = (counts[0] * counts[1] / pieces for counts in (nodes, patches))
-    engine = simulation.engine.cost(SimulationSize(sources, whole, in_patches, size.antennas, beams))
+    regular = eor and _is_regular(instrument)
+    engine = simulation.engine.cost(SimulationSize(sources, whole, in_patches, size.antennas, beams, regular))
     channels = nodes[1] / pieces if eor else nodes[1]
     disk = size.samples / size.channels.count * channels * COMPLEX128
     memory = engine.memory + kept + 300 * sources + (55 * sources * channels if eor else 0) + 4 * disk
@@ -235,6 +237,12 @@ def _node_counts(
         return in_time, channels.count
     in_frequency = chebyshev_count(frequency_bandwidth(np.array([low, high]), length), tolerance)
     return in_time, min(in_frequency, channels.count)
+
+
+def _is_regular(instrument: InstrumentSettings) -> bool:
+    """Return whether antennas are on a flat lattice."""
+    regular = isinstance(instrument.layout, HeraLayout | HexLayout | RectangularLayout)
+    return regular and not instrument.as_built.positions.scatter
 
 
 def _patch_radius(sources: float) -> float:

@@ -47,6 +47,8 @@ class SimulationSize:
         Of the array.
     beams
         Different ones.
+    regular
+        Whether the antennas are on a flat lattice, and tolerances allow single precision.
     """
 
     sources: float
@@ -54,6 +56,7 @@ class SimulationSize:
     patch_slots: float
     antennas: int
     beams: int
+    regular: bool = False
 
 
 class Engine(Plugin, ABC):
