@@ -11,6 +11,7 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.instrument.distinct_beams import beam_count
+from calstudy.instrument.settings import HeraLayout, HexLayout, RectangularLayout
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, once
@@ -207,11 +208,17 @@ def _cost_of_chunk(task: Task) -> Cost:
     patches = _node_counts(instrument, accuracy, size.longest * _patch_radius(sources), TYPICAL_ERROR)
     pieces = min(simulation.pieces(eor), size.channels.count)
     beams = beam_count(instrument, size.antennas)
-    whole, in_patches = (counts[0] * counts[1] / pieces for counts in (nodes, patches))
-    tolerance = (
-        simulation.nodes.for_eor(True).tolerance if eor else simulation.nodes.for_foregrounds(True, True).tolerance
+    engine = simulation.engine.cost(
+        SimulationSize(
+            sources=sources,
+            slots=nodes[0] * nodes[1] / pieces,
+            patch_slots=patches[0] * patches[1] / pieces,
+            antennas=size.antennas,
+            beams=beams,
+            tolerance=accuracy.tolerance,
+            regular=_is_regular(instrument),
+        )
     )
-    engine = simulation.engine.cost(SimulationSize(sources, whole, in_patches, size.antennas, beams, tolerance))
     total = size.samples / size.channels.count * nodes[1] * COMPLEX128
     disk = total / (pieces if eor else frequency_blocks(total, pieces))
     channels = nodes[1] / pieces
@@ -241,6 +248,12 @@ def _node_counts(
         return in_time, channels.count
     in_frequency = chebyshev_count(frequency_bandwidth(np.array([low, high]), length), tolerance)
     return in_time, min(in_frequency, channels.count)
+
+
+def _is_regular(instrument: InstrumentSettings) -> bool:
+    """Return whether antennas are on a flat lattice."""
+    regular = isinstance(instrument.layout, HeraLayout | HexLayout | RectangularLayout)
+    return regular and not instrument.as_built.positions.scatter
 
 
 def _patch_radius(sources: float) -> float:

@@ -24,6 +24,7 @@ PACKAGES = (
     "hera_pspec",
     "tensorflow",
     "fftvis",
+    "finufft",
     "healpy",
     "dask",
     "mwa_pb",

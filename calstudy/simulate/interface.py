@@ -49,6 +49,8 @@ class SimulationSize:
         Different ones.
     tolerance
         Of the interpolation, 0 for none.
+    regular
+        Whether the antennas are on a flat lattice.
     """
 
     sources: float
@@ -57,6 +59,7 @@ class SimulationSize:
     antennas: int
     beams: int
     tolerance: float
+    regular: bool = False
 
 
 class Engine(Plugin, ABC):

@@ -12,6 +12,9 @@ the centre is exact, in double precision.
 Errors of patches are independent and add in quadrature, so that each may contribute the same variance: a patch in the
 sidelobes, with a hundredth of the signal, needs a hundredth of the relative accuracy.
 
+W is summed by matrix products. Of many antennas without heights, in single precision, it is summed by transforms, for
+which larger patches are better.
+
 Patches are added up at the time nodes of the whole sky, and interpolated from there to the integrations. Sources that
 rise or set are discontinuous in time: their patches are simulated at every integration.
 """
@@ -32,8 +35,9 @@ from calstudy.base.visibilities import antenna_indices, baseline_vectors, requir
 from calstudy.instrument.antenna_beams import AntennaBeams, split_beams
 from calstudy.simulate.brightness import stokes_i
 from calstudy.simulate.directions import SourceTracks, sky_cells, split_by_horizon
+from calstudy.simulate.flat_transforms import FlatArray, FlatSums, flat_array
 from calstudy.simulate.interface import BeamSource
-from calstudy.simulate.matrix_products import PairSums, angles
+from calstudy.simulate.matrix_products import PairSums, angles, product_seconds
 from calstudy.simulate.nodes import (
     SINGLE_PRECISION,
     Accuracy,
@@ -48,6 +52,10 @@ from calstudy.simulate.nodes import (
 )
 from calstudy.simulate.patterns import InterpolatedPattern, Pattern, power_pattern
 
+MARGIN = 2
+"""By which transforms must be faster than products: estimates are not exact."""
+PATTERN_SECONDS, TURN_SECONDS = 3e-7, 1.2e-8
+"""Of the beam at a source, and of the phase of a patch's centre for a baseline."""
 LEAST, LOOSEST = 1e-30, 0.5
 """Signal of a patch over the rms below which it does not count, and the largest relative error of a patch."""
 
@@ -81,7 +89,7 @@ def visibilities(
     # The products are many and small: threads in each cost more than they gain, and workers share the cores.
     with threadpool_limits(limits=1, user_api="blas"):
         if len(always_up):
-            steady = Patches(sky, tracks, always_up, patch_nside(sky.Ncomponents))
+            steady = Patches(sky, tracks, always_up, array.choose_nside(sky.Ncomponents, common.nodes, dtype))
             patches = PatchSum(array, sky, steady, dtype)
             for place, tolerance in enumerate(array.tolerances(steady, sky)):
                 axis = array.time_nodes(steady.radii[place], float(tolerance), common.nodes)
@@ -164,6 +172,7 @@ class PatchedArray:
         self.delays = template.telescope.get_enu_antpos()[used] / SPEED_OF_LIGHT
         first, second = pairs.reshape(-1, 2).T
         self.pairs = np.ascontiguousarray(first), np.ascontiguousarray(second)
+        self._flat = flat_array(self.delays, self.pairs) if len(self._beams) == 1 else None
         self._turning = turning_length(template)
         self._longest = np.linalg.norm(baseline_vectors(template), axis=1).max()
 
@@ -196,9 +205,54 @@ class PatchedArray:
         rms = np.sqrt(np.mean(signal**2))
         return np.minimum(self.accuracy.tolerance * rms / np.maximum(signal, LEAST * rms), LOOSEST) if rms else signal
 
-    def pair_sums(self, frequencies: np.ndarray, dtype: type) -> PairSums:
-        """Return what sums the visibilities of sources at some frequencies."""
-        return PairSums(self.delays, self.pairs, frequencies, self._patterns(frequencies), self._index, dtype)
+    def choose_nside(self, sources: int, times: np.ndarray, dtype: type) -> int:
+        """Choose the grid whose cells are patches: small ones for products, or the best if transforms are faster.
+
+        Parameters
+        ----------
+        sources
+            Components of the whole sky.
+        times : (Nt,) float
+            To which patches are interpolated, Julian dates.
+        dtype
+            Of the products.
+        """
+        small = patch_nside(sources)
+        if self._flat is None or dtype is np.float64 or not small:
+            return small
+        products = self._seconds(sources, small, times, None)
+        grids = [small >> step for step in range(small.bit_length())]
+        seconds = {nside: self._seconds(sources, nside, times, self._flat) for nside in grids}
+        best = min(grids, key=seconds.__getitem__)
+        return best if MARGIN * seconds[best] < products else small
+
+    def sums(self, frequencies: np.ndarray, dtype: type, sources: float, radius: float) -> PairSums | FlatSums:
+        """Return what sums the visibilities of sources at some frequencies in the least time.
+
+        Parameters
+        ----------
+        frequencies
+            Hz.
+        dtype
+            Of products; transforms have single precision.
+        sources, radius
+            Of a typical patch; rad.
+        """
+        patterns = self._patterns(frequencies)
+        if self._flat and dtype is not np.float64:
+            seconds = self._flat.seconds(frequencies[-1], sources, radius)
+            if MARGIN * seconds < product_seconds(len(self.delays), sources):
+                return FlatSums(self._flat, frequencies, patterns[0])
+        return PairSums(self.delays, self.pairs, frequencies, patterns, self._index, dtype)
+
+    def _seconds(self, sources: int, nside: int, times: np.ndarray, flat: FlatArray | None) -> float:
+        """Estimate the time that all patches of a grid take, by transforms of a flat array or by products."""
+        patches, radius = 6 * nside**2, 0.7 / nside
+        nodes = len(self.time_nodes(radius, self.accuracy.tolerance, times).nodes)
+        channels, each = self.frequency_nodes(radius).nodes, sources / 2 / patches
+        sums = flat.seconds(channels[-1], each, radius) if flat else product_seconds(len(self.delays), each)
+        turned = TURN_SECONDS * len(times) * self.template.Nfreqs * len(self.pairs[0])
+        return patches * (nodes * len(channels) * (PATTERN_SECONDS * each + sums) + turned)
 
     def _patterns(self, frequencies: np.ndarray) -> list[Pattern]:
         """Return the patterns of the distinct beams, interpolated from fewer frequencies where they are smooth."""
@@ -226,7 +280,8 @@ class PatchSum:
     def __init__(self, array: PatchedArray, sky: SkyModel, patches: Patches, dtype: type) -> None:
         self._array, self._patches = array, patches
         self._channels = array.frequency_nodes(patches.radii.max())
-        self._sums = array.pair_sums(self._channels.nodes, dtype)
+        sources = len(patches.components) / len(patches.members)
+        self._sums = array.sums(self._channels.nodes, dtype, sources, patches.radii.max())
         self._flux = stokes_i(sky, self._channels.nodes, patches.components)
 
     def add(self, total: np.ndarray, place: int, axis: Axis, times: np.ndarray) -> None:
