@@ -13,7 +13,6 @@ from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.resources import Cost
 from calstudy.base.visibilities import require_rectangular
-from calstudy.instrument.telescope import subset_template
 from calstudy.simulate.nodes import EXACT, Accuracy, integration_times, time_axis
 
 if TYPE_CHECKING:
@@ -134,6 +133,7 @@ class Engine(Plugin, ABC):
         (Ntimes, Nbls, Nfreqs, Npols) complex128
             Jy.
         """
+        from calstudy.instrument.telescope import subset_template
         from calstudy.simulate.directions import SourceTracks, split_by_horizon
 
         axis, integrations = time_axis(template, accuracy), integration_times(template)

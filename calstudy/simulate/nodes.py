@@ -166,11 +166,9 @@ def interpolation_matrix(nodes: np.ndarray, samples: np.ndarray) -> np.ndarray:
     weights = 1 / np.prod(differences, axis=1)
     offsets = y[:, None] - x
     hits = offsets == 0
-    terms = weights / np.where(hits, 1.0, offsets)
-    matrix = terms / terms.sum(axis=1, keepdims=True)
-    exact = hits.any(axis=1)
-    matrix[exact] = hits[exact]
-    return matrix
+    # A sample that is a node has its value.
+    terms = np.where(hits.any(axis=1, keepdims=True), hits, weights / np.where(hits, 1.0, offsets))
+    return terms / terms.sum(axis=1, keepdims=True)
 
 
 def time_axis(template: UVData, accuracy: Accuracy) -> Axis:

@@ -162,7 +162,7 @@ def test_an_eor_is_exact_to_single_precision(many, embedded_beam):
 
 def test_plans_know_that_many_regular_antennas_take_less(many):
     def seconds(antennas, regular):
-        return DenseEngine().cost(SimulationSize(8e5, 400.0, 100.0, antennas, 1, regular)).seconds
+        return DenseEngine().cost(SimulationSize(8e5, 400.0, 100.0, antennas, 1, 1e-4, regular)).seconds
 
     assert seconds(350, regular=True) < 0.3 * seconds(350, regular=False)
     assert seconds(19, regular=True) == seconds(19, regular=False)
