@@ -222,7 +222,7 @@ def _cost_of_chunk(task: Task) -> Cost:
     total = size.samples / size.channels.count * nodes[1] * COMPLEX128
     disk = total / (pieces if eor else frequency_blocks(total, pieces))
     channels = nodes[1] / pieces
-    memory = engine.memory + kept + 300 * sources + (55 * sources * channels if eor else 0) + 4 * disk
+    memory = engine.memory + kept + 300 * sources + (30 * sources * channels if eor else 0) + 4 * disk
     seconds = 3 + engine.seconds
     if beams > 1:
         seconds += beams * TABLE_SECONDS * size.polarizations * channels
