@@ -18,6 +18,7 @@ from calstudy.products.graph import Graph, once
 from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
 from calstudy.simulate.nodes import (
+    EARTH_ROTATION_RATE,
     SECONDS_PER_DAY,
     chebyshev_count,
     frequency_bandwidth,
@@ -35,12 +36,13 @@ if TYPE_CHECKING:
     from calstudy.simulate.component import Component
     from calstudy.simulate.floor import DelayFloor
     from calstudy.simulate.nodes import Accuracy
+    from calstudy.simulate.settings import SimulationSettings
     from calstudy.sky.settings import SkySettings
 
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
-TOLERATED = 100
-"""Interpolation errors up to this times the tolerance, which bounds a typical one, go without a warning."""
+TOLERATED = 1e-7
+"""Interpolation errors up to this go without a warning, however small the tolerance is: the beam's table has knots."""
 TYPICAL_ERROR = 30
 """Relative error that a typical patch may have, over the tolerance: most have a small share in the visibilities."""
 
@@ -90,8 +92,7 @@ def eor(graph: Graph) -> Task:
 def _simulation(graph: Graph, component: str, settings: Mapping[str, Any]) -> Task:
     experiment = graph.experiment
     settings = {**settings, "simulation": experiment.simulation}
-    pieces = experiment.simulation.pieces(isinstance(settings["sky"], Eor))
-    count = min(pieces, experiment.instrument.channels.count)
+    count = _pieces(experiment.simulation, settings["sky"], experiment.instrument)
     chunks = {
         f"chunk{index:03d}": Task(
             SIMULATE_CHUNK,
@@ -156,7 +157,7 @@ def assemble(job: Job) -> Mapping[str, Any]:
 def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
     """Warn of an interpolation error far above the tolerance, as a beam much wider than `beam_extent` makes."""
     check, allowed = quality["interpolation"], component.accuracy.tolerance
-    if check is None or check["max_error"] <= TOLERATED * allowed:
+    if check is None or check["max_error"] <= max(allowed, TOLERATED):
         return []
     field = "eor_tolerance" if component.is_eor else "tolerance"
     return [
@@ -206,13 +207,13 @@ def _cost_of_chunk(task: Task) -> Cost:
     accuracy = simulation.nodes.for_eor(True) if eor else simulation.nodes.for_foregrounds(True, smooth_sky=True)
     nodes = _node_counts(instrument, accuracy, size.longest)
     patches = _node_counts(instrument, accuracy, size.longest * _patch_radius(sources), TYPICAL_ERROR)
-    pieces = min(simulation.pieces(eor), size.channels.count)
+    pieces = _pieces(simulation, sky, instrument)
     beams = beam_count(instrument, size.antennas)
     engine = simulation.engine.cost(
         SimulationSize(
             sources=sources,
             slots=nodes[0] * nodes[1] / pieces,
-            patch_slots=patches[0] * patches[1] / pieces,
+            patch_slots=(patches[0] * patches[1] + _crossing(instrument) * nodes[1]) / pieces,
             antennas=size.antennas,
             beams=beams,
             tolerance=accuracy.tolerance,
@@ -222,7 +223,9 @@ def _cost_of_chunk(task: Task) -> Cost:
     total = size.samples / size.channels.count * nodes[1] * COMPLEX128
     disk = total / (pieces if eor else frequency_blocks(total, pieces))
     channels = nodes[1] / pieces
-    memory = engine.memory + kept + 300 * sources + (30 * sources * channels if eor else 0) + 4 * disk
+    # Directions of all, and of those above the horizon in another order.
+    followed = 36 * chebyshev_count(_rotation(instrument) / 2, 1e-15) + 100
+    memory = engine.memory + kept + followed * sources + (30 * sources * channels if eor else 0) + 4 * disk
     seconds = 3 + engine.seconds
     if beams > 1:
         seconds += beams * TABLE_SECONDS * size.polarizations * channels
@@ -254,6 +257,22 @@ def _is_regular(instrument: InstrumentSettings) -> bool:
     """Return whether antennas are on a flat lattice."""
     regular = isinstance(instrument.layout, HeraLayout | HexLayout | RectangularLayout)
     return regular and not instrument.as_built.positions.scatter
+
+
+def _pieces(simulation: SimulationSettings, sky: Foregrounds | Eor, instrument: InstrumentSettings) -> int:
+    """Return how many chunks a component has at most."""
+    eor = isinstance(sky, Eor)
+    return min(simulation.pieces(eor), instrument.channels.count) if eor else simulation.pieces(eor)
+
+
+def _rotation(instrument: InstrumentSettings) -> float:
+    """Return by what angle the Earth turns from the first to the last integration, rad."""
+    return EARTH_ROTATION_RATE * instrument.times.integration * (instrument.times.count - 1)
+
+
+def _crossing(instrument: InstrumentSettings) -> float:
+    """Estimate the integrations of sources that rise or set, for each source above the horizon."""
+    return instrument.times.count * min(1.0, _rotation(instrument) / np.pi)
 
 
 def _patch_radius(sources: float) -> float:

@@ -1,8 +1,8 @@
 """Simulation in pieces, their assembly, and the check of the interpolation.
 
 A chunk is a block of consecutive frequency nodes at all integrations, of the whole sky or of one part of it. Chunks are
-simulated independently, can be stored, and are added up to the visibilities. The result does not depend on the number
-of chunks.
+simulated independently, can be stored, and are added up to the visibilities. Their number changes the result by less
+than the tolerance of the interpolation.
 """
 
 from __future__ import annotations

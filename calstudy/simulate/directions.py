@@ -65,7 +65,7 @@ class SourceTracks:
         count = chebyshev_count(bandwidth, DIRECTION_TOLERANCE)
         distinct = np.unique(times_jd)
         nodes = distinct if count >= len(distinct) else chebyshev_nodes(distinct[0], distinct[-1], count)
-        if sky.component_type == "healpix" and sky.Ncomponents == 12 * sky.nside**2 and sky.hpx_frame.name in FRAMES:
+        if _is_whole_map(sky):
             place = tuple(axis.to_value("m") for axis in location.geocentric)
             return cls(nodes, _map_vectors(sky.nside, sky.hpx_order, sky.hpx_frame.name, place, tuple(nodes)))
         return cls(nodes, _vectors(sky_coordinates(sky), location, nodes))
@@ -79,6 +79,15 @@ class SourceTracks:
     def select(self, components: np.ndarray) -> SourceTracks:
         """Return the tracks of some components, in that order."""
         return SourceTracks(self.nodes, np.ascontiguousarray(self.vectors[:, :, components]))
+
+
+def _is_whole_map(sky: SkyModel) -> bool:
+    """Return whether a sky is a HEALPix map whose directions follow from its resolution, order and frame alone."""
+    return (
+        sky.component_type == "healpix"
+        and sky.hpx_frame.name in FRAMES
+        and np.array_equal(sky.hpx_inds, np.arange(12 * sky.nside**2))
+    )
 
 
 def sky_coordinates(sky: SkyModel) -> SkyCoord:

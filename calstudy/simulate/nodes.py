@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 EARTH_ROTATION_RATE = 7.2921158553e-5  # rad / s, sidereal
 SECONDS_PER_DAY = 86400.0
-SINGLE_PRECISION = 1e-6
+SINGLE_PRECISION = 1e-5
 """Smallest tolerance to which products in single precision are exact."""
 CHUNK_BYTES = 4e8
 """Visibilities of one chunk of a smooth sky, at most, unless there are too few chunks."""
@@ -38,7 +38,8 @@ class Accuracy:
     Attributes
     ----------
     tolerance
-        Largest interpolation error of the fringe of any source, relative to its amplitude; 0: nothing is interpolated.
+        Interpolation error of visibilities, relative to their rms, if all fringes were as fast as the fastest one; 0:
+        nothing is interpolated.
     beam_extent
         Length in m by which a baseline is extended for the structure of the beam in fringe rate and delay.
     smooth_beam, smooth_sky

@@ -56,6 +56,8 @@ MARGIN = 2
 """By which transforms must be faster than products: estimates are not exact."""
 PATTERN_SECONDS, TURN_SECONDS = 3e-7, 1.2e-8
 """Of the beam at a source, and of the phase of a patch's centre for a baseline."""
+SINGLE_TURNS = 8.0
+"""Turns of a fringe across the band up to which single precision keeps phases to 3e-6 rad."""
 LEAST, LOOSEST = 1e-30, 0.5
 """Signal of a patch over the rms below which it does not count, and the largest relative error of a patch."""
 
@@ -183,6 +185,10 @@ class PatchedArray:
         smooth = accuracy.smooth_beam and accuracy.smooth_sky
         return make_axis(channels, bandwidth, accuracy.tolerance if smooth else 0.0)
 
+    def turns(self, radius: float) -> float:
+        """Return by how many turns fringes within a patch of a radius (rad) differ between the ends of the band."""
+        return radius * self._longest * float(np.ptp(self.template.freq_array)) / SPEED_OF_LIGHT
+
     def time_nodes(self, radius: float, tolerance: float, times: np.ndarray) -> Axis:
         """Choose the times at which a patch is simulated, from which it is interpolated to `times` (Julian dates)."""
         length = self._turning * radius + self.accuracy.beam_extent
@@ -280,6 +286,8 @@ class PatchSum:
     def __init__(self, array: PatchedArray, sky: SkyModel, patches: Patches, dtype: type) -> None:
         self._array, self._patches = array, patches
         self._channels = array.frequency_nodes(patches.radii.max())
+        if array.turns(patches.radii.max()) > SINGLE_TURNS:
+            dtype = np.float64
         sources = len(patches.components) / len(patches.members)
         self._sums = array.sums(self._channels.nodes, dtype, sources, patches.radii.max())
         self._flux = stokes_i(sky, self._channels.nodes, patches.components)

@@ -23,8 +23,8 @@ class Nodes(Section):
         1e-9,
         gt=0,
         lt=1e-2,
-        description="Largest interpolation error of the fringe of any source of the foregrounds, relative to its "
-        "amplitude.",
+        description="Interpolation error of the visibilities of the foregrounds, relative to their rms: a bound for "
+        "phasors as fast as the fastest fringe. Sources that contribute little have larger relative errors.",
     )
     eor_tolerance: float = Field(
         1e-4,
@@ -35,8 +35,8 @@ class Nodes(Section):
     )
     beam_extent: Length = Field(
         20.0,
-        ge=0,
-        description="Length added to the longest baseline, for the structure of the beam in fringe rate and delay.",
+        ge=10,
+        description="Length added to baselines for the structure of the beam in fringe rate and delay.",
     )
 
     def for_eor(self, smooth_beam: bool) -> Accuracy:

@@ -31,8 +31,8 @@ Targets = Callable[[Experiment], Sequence[Task]]
 def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Experiment, int]:
     """Choose the number of workers, and cut simulations finely enough for them, within the memory.
 
-    How many chunks a simulation is cut into changes its visibilities by rounding only, and not the key under which
-    they are stored.
+    How many chunks a simulation is cut into changes its visibilities by less than the tolerance of their
+    interpolation, and not the key under which they are stored.
 
     Parameters
     ----------

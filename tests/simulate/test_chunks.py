@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from simulation_cases import healpix_sky, observe, random_sky, relative_error
 
+from calstudy.experiment.files import validate
 from calstudy.instrument.telescope import subset_template
+from calstudy.products import simulation
+from calstudy.products.graph import Graph
 from calstudy.simulate.chunks import assemble, check_interpolation, plan_chunks, simulate_chunk, simulate_visibilities
+from calstudy.simulate.component import Component
 from calstudy.simulate.directions import SourceTracks, split_by_horizon
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
@@ -90,6 +94,22 @@ def test_large_chunks_of_a_smooth_sky_are_split_by_frequency_first(template, mon
     parts = chunks[0].part[1]
     assert sorted(covered) == [((part, parts), node) for part in range(parts) for node in range(nodes)]
     assert len(chunks) <= 8
+
+
+@pytest.mark.parametrize("chunks", [1, 4, 64])
+def test_plans_have_a_task_for_every_chunk(chunks, tmp_path):
+    data = {
+        "name": "many",
+        "instrument": {"layout": {"kind": "hex", "side": 2}, "beam": "gaussian", "channels": {"count": 8}},
+        "sky": {"foregrounds": {"kind": "g4jy-and-counts", "count": 50}, "eor": {"nside": 16}},
+        "simulation": {"chunks": chunks},
+    }
+    experiment = validate(data, tmp_path)
+    graph = Graph(experiment)
+    for task, sky in ((simulation.foregrounds(graph), "foregrounds"), (simulation.eor(graph), "eor")):
+        settings = getattr(experiment.sky, sky)
+        component = Component(experiment.instrument, experiment.simulation, settings, "Planck15")
+        assert len(task.pieces) >= len(component.chunks)
 
 
 def test_a_sky_given_channel_by_channel_needs_only_the_chunks_channels(dipole_beam):

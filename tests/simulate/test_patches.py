@@ -139,3 +139,25 @@ def test_a_patch_below_the_noise_of_the_others_may_be_zero(template, dipole_beam
     assert relative_error(ENGINE.interpolate(sky, dipole_beam, template, CHANNELS), direct) < CHANNELS.tolerance
     sky.stokes[:] = 0
     assert not ENGINE.interpolate(sky, dipole_beam, template, CHANNELS).any()
+
+
+@pytest.mark.parametrize("stretch", [1, 20])
+def test_single_precision_serves_long_arrays_and_wide_bands(stretch, dipole_beam):
+    """Over 30 MHz fringes of kilometres turn hundreds of times, where a sky of few sources is one patch."""
+    template = observe(count=12, channels=16, width="2 MHz", times=6, integration="20 s", polarizations=("xx",))
+    template.telescope.antenna_positions *= stretch
+    rng, count = np.random.default_rng(3), 500
+    coordinates = local_coordinates(template, np.arcsin(rng.uniform(-1, 1, count)), rng.uniform(0, 2 * np.pi, count))
+    sky = point_sky(coordinates, rng.exponential(1, count))
+    loose = Accuracy(1e-5, beam_extent=20.0)
+    direct = ENGINE.simulate(sky, dipole_beam, template)
+    assert relative_error(ENGINE.interpolate(sky, dipole_beam, template, loose), direct) < loose.tolerance
+
+
+def test_a_map_may_have_its_pixels_in_any_order(template, dipole_beam):
+    sky = healpix_sky(template.freq_array, nside=8)
+    order = np.random.default_rng(8).permutation(sky.Ncomponents)
+    shuffled = sky.copy()
+    shuffled.hpx_inds, shuffled.stokes = sky.hpx_inds[order], sky.stokes[:, :, order]
+    direct = ENGINE.simulate(sky, dipole_beam, template)
+    assert relative_error(ENGINE.simulate(shuffled, dipole_beam, template), direct) < 1e-12

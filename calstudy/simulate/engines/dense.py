@@ -28,8 +28,8 @@ class DenseEngine(Engine):
 
     precision: Literal["auto", "single", "double"] = Field(
         "auto",
-        description="Of the products. double agrees with pyuvsim to rounding, single to 1e-6 of the rms; auto: single "
-        "where the tolerance of the interpolation is 1e-6 or more.",
+        description="Of the products. double agrees with pyuvsim to rounding, single to 3e-6 of the rms; auto: single "
+        "where the tolerance of the interpolation is 1e-5 or more.",
     )
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
