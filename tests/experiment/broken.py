@@ -358,9 +358,3 @@ def bad_texts(folder: Path) -> Iterator[Broken]:
     }
     for name, text in texts.items():
         yield Broken(name, text, ())
-
-
-def all_broken(folder: Path) -> list[Broken]:
-    """Return all of them."""
-    makers = (wrong_values, unknown_keys, missing_files, bad_layouts, bad_texts, implausible, bad_beams)
-    return [item for make in makers for item in make(folder)]

@@ -27,7 +27,7 @@ from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 FREQUENCY = 167.075e6 + 80e3 * np.arange(64)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_wedge_spectrum() -> Callable[..., CylindricalSpectrum]:
     """Return a maker of wedge spectra: power (Nb, Nd), bin edges (Nb, 2) in m."""
 
@@ -47,7 +47,7 @@ def make_wedge_spectrum() -> Callable[..., CylindricalSpectrum]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def wedge_panels(make_wedge_spectrum) -> WedgePanels:
     rng = np.random.default_rng(11)
     lower = 4.0 * np.concatenate([[2, 3], np.arange(6, 40, 3)])
@@ -61,7 +61,7 @@ def wedge_panels(make_wedge_spectrum) -> WedgePanels:
     return WedgePanels(*(make_wedge_spectrum(power, edges, delay) for power in powers))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_spherical_spectrum() -> Callable[..., SphericalSpectrum]:
     """Return a maker of spherical spectra in bins of 0.04 h/Mpc: power (Nk,), errors (Nk,) or numbers."""
 
@@ -84,7 +84,7 @@ def make_spherical_spectrum() -> Callable[..., SphericalSpectrum]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_column(make_spherical_spectrum) -> Callable[..., SphericalColumn]:
     """Return a maker of whole columns; the first bins, where everything is excised, are empty."""
 
@@ -109,7 +109,7 @@ def make_column(make_spherical_spectrum) -> Callable[..., SphericalColumn]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def visibility_comparison() -> VisibilityComparison:
     rng = np.random.default_rng(12)
     foregrounds = 30 * np.exp(-2j * np.pi * FREQUENCY * 100e-9)
@@ -118,7 +118,7 @@ def visibility_comparison() -> VisibilityComparison:
     return compare_visibilities((0, 1), 54.9, FREQUENCY, visibilities)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def baseline_spectra() -> list[BaselineSpectra]:
     delay = delays(64, 80e3)
     noise = np.full(64, 2e4)
@@ -130,7 +130,7 @@ def baseline_spectra() -> list[BaselineSpectra]:
     return made
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra) -> Callable[..., dict[str, Figure]]:
     """Return a function that draws every kind of figure, or those named, with the given stand-ins."""
     rng = np.random.default_rng(13)

@@ -29,19 +29,37 @@ def pixels(figure: Figure) -> np.ndarray:
         return np.asarray(figure.canvas.buffer_rgba()).copy()
 
 
-def test_every_axis_label_has_its_unit(draw_all):
-    for name, figure in draw_all().items():
+STAND_INS = ("synthetic faint sources, " * 5 + "all of them.", "small scale")
+"""More than one line of them."""
+
+
+@pytest.fixture(scope="module")
+def plain(draw_all) -> dict[str, Figure]:
+    return draw_all()
+
+
+@pytest.fixture(scope="module")
+def noted(draw_all) -> dict[str, Figure]:
+    """All figures with stand-ins, laid out."""
+    figures = draw_all(STAND_INS)
+    for figure in figures.values():
+        with style.journal_style():
+            figure.draw_without_rendering()
+    return figures
+
+
+def test_every_axis_label_has_its_unit(plain):
+    for name, figure in plain.items():
         labels = {text for axes in all_axes(figure) for text in (axes.get_xlabel(), axes.get_ylabel())} - {""}
         assert len(labels) >= 2, name
         without = {label for label in labels if not re.search(r"\([^)]*(m|Hz|ns|Jy|s|Mpc.*)\)$", label)}
         assert without <= DIMENSIONLESS, name
 
 
-def test_text_is_inside_the_page_and_large_enough_to_read(draw_all):
-    for name, figure in draw_all(("synthetic faint sources; " * 5,)).items():
+def test_text_is_inside_the_page_and_large_enough_to_read(noted):
+    for name, figure in noted.items():
         assert figure.get_figwidth() in (style.ONE_COLUMN, style.TWO_COLUMNS)
         with style.journal_style():
-            figure.draw_without_rendering()
             used = figure.get_tightbbox()
         assert used.x0 >= 0, name
         assert used.y0 >= 0, name
@@ -51,13 +69,10 @@ def test_text_is_inside_the_page_and_large_enough_to_read(draw_all):
         assert min(text.get_fontsize() for text in texts) >= 5, name
 
 
-def test_stand_ins_are_printed_below_everything_and_only_when_there_are_any(draw_all):
-    stand_ins = ("synthetic faint sources.", "small scale")
-    plain = draw_all()
-    for name, figure in draw_all(stand_ins).items():
-        figure.draw_without_rendering()
+def test_stand_ins_are_printed_below_everything_and_only_when_there_are_any(plain, noted):
+    for name, figure in noted.items():
         (note,) = [text for text in figure.findobj(Text) if "stand-in" in text.get_text()]
-        assert note.get_text().replace("\n", " ") == "stand-in: synthetic faint sources; small scale"
+        assert note.get_text().replace("\n", " ") == f"stand-in: {STAND_INS[0].rstrip('.')}; {STAND_INS[1]}"
         box = note.get_window_extent()
         assert all(box.y1 <= axes.get_tightbbox().y0 + 0.5 for axes in figure.axes if axes.get_visible()), name
         assert not [text for text in plain[name].findobj(Text) if "stand-in" in text.get_text()]

@@ -17,6 +17,8 @@ from calstudy.base.identity import identity
 from calstudy.instrument import as_built as section
 from calstudy.instrument.antenna_beams import AntennaBeams, make_beams
 from calstudy.instrument.as_built import Misalignment, dipole_amplitudes, misalignments, position_offsets
+from calstudy.instrument.beam_file import find_beam
+from calstudy.instrument.beam_frequencies import MWA_GROUP
 from calstudy.instrument.beams import ExactBeam, MwaTile, make_beam
 from calstudy.instrument.dipoles import dipole_fields
 from calstudy.instrument.distinct_beams import assigned_beams
@@ -95,12 +97,23 @@ def test_antennas_are_where_they_are_built():
 
 
 @pytest.fixture(scope="module")
-def tiles():
+def beam_file(tmp_path_factory):
+    """What the beam file has at three frequencies: to combine dipoles at one of them needs no other."""
+    path = tmp_path_factory.mktemp("beam") / "three-frequencies.h5"
+    with h5py.File(find_beam()) as whole, h5py.File(path, "w") as file:
+        for name in whole:
+            if not (match := MWA_GROUP.fullmatch(name)) or abs(float(match[1]) - FREQUENCY[0]) < 1.5e6:
+                whole.copy(name, file)
+    return path
+
+
+@pytest.fixture(scope="module")
+def tiles(beam_file):
     """An array with dead dipoles in one tile, and in the other feed of another, and all amplitudes scattered."""
     dead = {"broken": {"antennas": [4], "x": [0, 5]}, "other": {"antennas": [5], "y": [10]}}
     settings = instrument(
         as_built={"dipoles": {"dead": dead, "amplitude_scatter": "10 %"}},
-        beam={"kind": "mwa-embedded-element", "interpolation": "nearest"},
+        beam={"kind": "mwa-embedded-element", "interpolation": "nearest", "path": str(beam_file)},
     )
     return dipole_amplitudes(settings.as_built.dipoles, 7), make_beams(settings, 7)
 
@@ -132,12 +145,12 @@ def test_tiles_with_dead_dipoles_are_those_of_mwa_pb(tiles, monkeypatch):
     assert np.abs(whole[:, 0, 0, degrees[:, 1], degrees[:, 0]] - found[:, 0]).max() > 0.01
 
 
-def test_a_dipole_is_where_its_number_says():
+def test_a_dipole_is_where_its_number_says(beam_file):
     """The phase of a dipole's own field, across the zenith along the dipole, is that of its place in the tile.
 
     Neighbours along a dipole's axis hardly move the centre of its field; those beside it move it a lot.
     """
-    fields = dipole_fields(None, instrument().channels.band, "nearest")
+    fields = dipole_fields(beam_file, instrument().channels.band, "nearest")
     degrees, wavenumber = 5, 2 * np.pi * FREQUENCY[0] / speed_of_light
     for dipole in range(16):
         jones = fields.combined(np.tile(np.arange(16) == dipole, (2, 1)), FREQUENCY)[1, :, 0, degrees]

@@ -109,19 +109,29 @@ def test_ideal_tile_is_a_dipole_times_a_sum_over_its_sixteen_dipoles_and_their_i
     np.testing.assert_allclose(np.abs(tile), np.abs(dipole * response / zenith), atol=1e-12)
 
 
+@pytest.fixture(scope="module")
+def mwa_table():
+    """What is read of the beam file for the default band."""
+    return tabulated._read_mwa(find_beam(), section.Channels().band)
+
+
 @pytest.mark.parametrize("interpolation", ["chebyshev", "linear"])
-def test_the_kept_fit_of_the_embedded_element_is_the_fit(monkeypatch, tmp_path, interpolation):
+def test_the_kept_fit_of_the_embedded_element_is_the_fit(monkeypatch, tmp_path, mwa_table, interpolation):
     """Bit by bit; what is kept is of the file's content, and is not of another file, band or interpolation."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    read, reads = tabulated._read_mwa, []
-    monkeypatch.setattr(tabulated, "_read_mwa", lambda path, band: reads.append(path) or read(path, band))
-    band = section.Channels().band
+    read, reads, band = tabulated._read_mwa, [], section.Channels().band
+
+    def counted(path, wanted):
+        reads.append((path, wanted))
+        return mwa_table.copy() if (path, wanted) == (find_beam(), band) else read(path, wanted)
+
+    monkeypatch.setattr(tabulated, "_read_mwa", counted)
     beams = []
     for _ in range(2):
         tabulated._mwa_embedded_element.cache_clear()  # As in another process.
         beams.append(tabulated.mwa_embedded_element(None, band, interpolation))
     assert len(reads) == 1
-    fit = tabulated.TabulatedBeam(tabulated.fit_table(read(find_beam(), band), band, interpolation))
+    fit = tabulated.TabulatedBeam(tabulated.fit_table(mwa_table, band, interpolation))
     for beam in beams:
         assert beam.fit_error == fit.fit_error
         for name, value in fit.description.items():
