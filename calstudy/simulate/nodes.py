@@ -182,11 +182,21 @@ def time_axis(template: UVData, accuracy: Accuracy) -> Axis:
     return make_axis(times, bandwidth, 0.1 * accuracy.tolerance)
 
 
-def frequency_axis(template: UVData, accuracy: Accuracy) -> Axis:
-    """Choose the frequencies at which a sky is simulated: every channel, unless sky and beam are smooth."""
+def frequency_axis(template: UVData, accuracy: Accuracy, radius: float = 1.0) -> Axis:
+    """Choose the frequencies at which a sky is simulated: every channel, unless sky and beam are smooth.
+
+    Parameters
+    ----------
+    template
+        The observation.
+    accuracy
+        Errors that are allowed.
+    radius
+        Largest distance of a source from the direction that fringes are relative to, rad; 1 from the zenith.
+    """
     channels = template.freq_array
     smooth = accuracy.smooth_beam and accuracy.smooth_sky
-    length = np.linalg.norm(baseline_vectors(template), axis=1).max() + accuracy.beam_extent
+    length = radius * np.linalg.norm(baseline_vectors(template), axis=1).max() + accuracy.beam_extent
     return make_axis(channels, frequency_bandwidth(channels, length), accuracy.tolerance if smooth else 0.0)
 
 

@@ -42,6 +42,7 @@ from calstudy.simulate.nodes import (
     SINGLE_PRECISION,
     Accuracy,
     Axis,
+    frequency_axis,
     frequency_bandwidth,
     integration_times,
     make_axis,
@@ -178,13 +179,6 @@ class PatchedArray:
         self._turning = turning_length(template)
         self._longest = np.linalg.norm(baseline_vectors(template), axis=1).max()
 
-    def frequency_nodes(self, radius: float) -> Axis:
-        """Choose the frequencies at which patches of a radius (rad) are simulated."""
-        channels, accuracy = self.template.freq_array, self.accuracy
-        bandwidth = frequency_bandwidth(channels, radius * self._longest + accuracy.beam_extent)
-        smooth = accuracy.smooth_beam and accuracy.smooth_sky
-        return make_axis(channels, bandwidth, accuracy.tolerance if smooth else 0.0)
-
     def turns(self, radius: float) -> float:
         """Return by how many turns fringes within a patch of a radius (rad) differ between the ends of the band."""
         return radius * self._longest * float(np.ptp(self.template.freq_array)) / SPEED_OF_LIGHT
@@ -255,7 +249,7 @@ class PatchedArray:
         """Estimate the time that all patches of a grid take, by transforms of a flat array or by products."""
         patches, radius = 6 * nside**2, 0.7 / nside
         nodes = len(self.time_nodes(radius, self.accuracy.tolerance, times).nodes)
-        channels, each = self.frequency_nodes(radius).nodes, sources / 2 / patches
+        channels, each = frequency_axis(self.template, self.accuracy, radius).nodes, sources / 2 / patches
         sums = flat.seconds(channels[-1], each, radius) if flat else product_seconds(len(self.delays), each)
         turned = TURN_SECONDS * len(times) * self.template.Nfreqs * len(self.pairs[0])
         return patches * (nodes * len(channels) * (PATTERN_SECONDS * each + sums) + turned)
@@ -265,7 +259,9 @@ class PatchedArray:
         bandwidth = frequency_bandwidth(frequencies, self.accuracy.beam_extent)
         axis = make_axis(frequencies, bandwidth, self.accuracy.tolerance if self.accuracy.smooth_beam else 0.0)
         found = [power_pattern(beam.at(axis.nodes), axis.nodes, self._feeds) for beam in self._beams]
-        return found if axis.at_samples else [*(InterpolatedPattern(pattern, axis.matrix) for pattern in found)]
+        if axis.at_samples:
+            return found
+        return [InterpolatedPattern(pattern, axis.matrix) for pattern in found]
 
 
 class PatchSum:
@@ -285,7 +281,7 @@ class PatchSum:
 
     def __init__(self, array: PatchedArray, sky: SkyModel, patches: Patches, dtype: type) -> None:
         self._array, self._patches = array, patches
-        self._channels = array.frequency_nodes(patches.radii.max())
+        self._channels = frequency_axis(array.template, array.accuracy, patches.radii.max())
         if array.turns(patches.radii.max()) > SINGLE_TURNS:
             dtype = np.float64
         sources = len(patches.components) / len(patches.members)
