@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,8 @@ from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import sky_model_slope
 from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure
-from calstudy.calibrate.settings import GainFit, GaussNewtonSettings, LbfgsSettings
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, weight_change
+from calstudy.calibrate.settings import GainFit, GainWeights, GaussNewtonSettings, LbfgsSettings
 from calstudy.calibrate.solution import Solution
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
@@ -39,7 +40,8 @@ class Solve(NamedTuple):
     Attributes
     ----------
     diagnostics
-        The slope of the calibrated data on the sky model, and the rms of its band shape; empty without a sky model.
+        The slope of the calibrated data on the sky model, and the rms of its band shape, if there is one; passes and
+        the last change of the weights, if they come from the gains.
     """
 
     times: slice
@@ -79,7 +81,7 @@ def fit(
         As for `calstudy.calibrate.preparation.prepare`.
     """
     prepared = prepare(observation, settings, assumed)
-    shape, used = prepared.data.shape, prepared.weights > 0
+    shape, used = prepared.data.shape, prepared.used
     gains, gain_flags = np.ones(prepared.start.shape, complex), np.ones(prepared.start.shape, bool)
     model = np.zeros(shape, complex)
     outcomes = []
@@ -90,12 +92,13 @@ def fit(
             continue
         model[times, :, :, p] = solution.model.reshape(-1, *shape[1:3])
         for t in range(times.start, times.stop):
-            gain_flags[:, :, t, p] = ~_has_data(prepared.structure, used[t, :, :, p])
+            gain_flags[:, :, t, p] = ~_has_data(prepared.structure, prepared.weights[t, :, :, p] > 0)
             gains[:, :, t, p] = np.where(gain_flags[:, :, t, p], 1, solution.gains)
     return Calibration(
         gains=gains,
         gain_flags=gain_flags,
-        model=model,
+        # Solves know nothing of baselines that they have no weight for.
+        model=model if settings.baselines is None else None,
         flags=~used,
         baselines=prepared.fitted,
         outcomes=outcomes,
@@ -118,8 +121,11 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
                     solution = _skipped(repeat_structure(prepared.structure, times.stop - times.start), problem)
                 else:
                     start = warm if settings.solver.warm_start else None
-                    solution, warm, anew = _solve(problem, solver, start, anew)
-                    diagnostics = _diagnostics(solution, problem)
+                    if isinstance(settings.weights, GainWeights):
+                        solution, warm, diagnostics = _solve_in_passes(problem, solver, start, settings.weights)
+                    else:
+                        solution, warm, anew = _solve(problem, solver, start, anew)
+                    diagnostics |= _diagnostics(solution, problem)
             yield Solve(times, p, solution, usage.peak_memory, diagnostics)
             if progress is not None:
                 progress(p * len(groups) + index + 1, len(groups) * n_polarizations)
@@ -145,6 +151,54 @@ def _solve(
     if not again.usable or (solution.usable and again.loss_history[-1] > solution.loss_history[-1]):
         return solution, next_warm, anew
     return again, again_warm, anew
+
+
+def _solve_in_passes(
+    problem: CalibrationProblem, solver: Solver, warm: WarmStart | None, settings: GainWeights
+) -> tuple[Solution, WarmStart | None, dict[str, float]]:
+    """Solve with the weights of the gains of the pass before, until they settle; each pass starts from the one before.
+
+    Parameters
+    ----------
+    problem
+        With the weights of unity gains.
+    warm
+        Whose gains make the first weights; None for those that the problem starts from.
+
+    Returns
+    -------
+    The last solution, with the times of all passes, what the next solve may start from, and the number of passes and
+    the last relative change of the weights by name.
+    """
+    weighted = problem.weighted_by(problem.initial_gains if warm is None else warm.gains)
+    solutions: list[Solution] = []
+    change, anew = 0.0, True
+    while len(solutions) < settings.passes:
+        solution, warm, anew = _solve(weighted, solver, warm, anew)
+        solutions.append(solution)
+        if warm is None:
+            break
+        before, weighted = weighted.weights, problem.weighted_by(solution.gains)
+        change = weight_change(weighted.weights, before)
+        if change < settings.tolerance:
+            break
+    solution = _together(solutions)
+    if settings.passes > 1 and change >= settings.tolerance and solution.status == "converged":
+        message = f"weights from the gains still changed by {change:.1e} in pass {len(solutions)}"
+        solution = replace(solution, status="max-steps", message=message)
+    return solution, warm, {"passes": len(solutions), "weight_change": change}
+
+
+def _together(solutions: Sequence[Solution]) -> Solution:
+    """Return the last of consecutive solutions, with the steps and times of all."""
+    first, *others = [solution.loss_history for solution in solutions]
+    return replace(
+        solutions[-1],
+        loss_history=np.concatenate([first, *(history[1:] for history in others)]),
+        n_steps=sum(solution.n_steps for solution in solutions),
+        seconds=sum(solution.seconds for solution in solutions),
+        cpu_seconds=sum(solution.cpu_seconds for solution in solutions),
+    )
 
 
 def _skipped(structure: FitStructure, message: str) -> Solution:

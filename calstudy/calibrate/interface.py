@@ -269,6 +269,11 @@ class Calibrator(Plugin):
         """Whether `Assumed.noise` changes anything."""
         return False
 
+    @property
+    def needs_autos(self) -> bool:
+        """Whether the data must have autocorrelations."""
+        return False
+
     def cost(self, size: Size) -> Cost:
         """Return what calibrating data of this size takes; by default little beyond the data themselves."""
         return Cost(5.0 + 1e-6 * size.samples, LIBRARIES_MEMORY + 6 * COMPLEX128 * size.samples)

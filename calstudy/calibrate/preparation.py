@@ -13,7 +13,7 @@ from calstudy.base.observation import Observation
 from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, fitted_baselines
-from calstudy.calibrate.settings import ForegroundFit, GainFit
+from calstudy.calibrate.settings import ForegroundFit, GainFit, GainWeights
 from calstudy.calibrate.standard_formats import require_parallel_hands
 from calstudy.calibrate.starts import redundant_start, starting_gains
 from calstudy.calibrate.structure import make_structure, repeat_structure
@@ -36,7 +36,10 @@ class PreparedFit:
     structure
         Of the fit of one integration.
     weights
-        Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior.
+        Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior. Those of unity
+        gains, if they come from the gains.
+    used
+        Which samples are calibrated, bool, likewise: all that have weight, on whatever baseline.
     start
         Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
     sky
@@ -47,6 +50,7 @@ class PreparedFit:
     fitted: np.ndarray
     structure: FitStructure
     weights: np.ndarray
+    used: np.ndarray
     start: np.ndarray
     sky: np.ndarray | None
 
@@ -72,7 +76,9 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     weights = make_weights(observation, fitted, settings.weights)
     if isinstance(settings, ForegroundFit) and settings.foreground_prior.finite:
         weights = inverse_variances(observation, fitted, weights, settings, assumed.noise)
-    data = observation.baselines(fitted)
+    data, used = observation.baselines(fitted), weights > 0
+    if settings.baselines is not None:
+        weights = weights * settings.baselines.factors(data.lengths)[:, None, None]
     sky = None if assumed.sky_model is None else assumed.sky_model.baselines(fitted).visibilities
     _require_finite(data)
     structure = make_structure(data, settings)
@@ -85,11 +91,31 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
         start = delay_start(data, weights, settings.initial_gains, sky)
     else:
         start = starting_gains(data, gains)
-    return PreparedFit(data, fitted, structure, weights, start, sky)
+    return PreparedFit(data, fitted, structure, weights, used, start, sky)
+
+
+def problem_at(
+    prepared: PreparedFit, settings: GainFit, times: slice, polarization: int, gains: np.ndarray
+) -> CalibrationProblem | str:
+    """Return the problem whose solution are some gains, with the weights that they make; or why there is none.
+
+    Parameters
+    ----------
+    prepared, settings, times, polarization
+        As for `make_problem`.
+    gains
+        The solution, complex, (Nants, Nfreqs).
+    """
+    problem = make_problem(prepared, settings, times, polarization)
+    if isinstance(problem, str) or not isinstance(settings.weights, GainWeights):
+        return problem
+    return problem.weighted_by(gains)
 
 
 def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polarization: int) -> CalibrationProblem | str:
     """Return the problem of some consecutive integrations together, or the reason why there is none.
+
+    Weights that come from the gains are those of unity gains.
 
     Parameters
     ----------
@@ -108,8 +134,8 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         return cube[times, :, :, polarization].reshape(structure.n_baselines, structure.n_frequencies)
 
     weights, visibilities = rows(prepared.weights), rows(prepared.data.visibilities)
-    flagged = float(np.mean(weights == 0))
-    if flagged == 1:
+    flagged = 1 - float(np.mean(rows(prepared.used)))
+    if not weights.any():
         return "every sample is flagged or has no weight"
     if flagged >= settings.skip_flagged:
         return f"{100 * flagged:.0f} % of the samples are flagged, which skip_flagged excludes"

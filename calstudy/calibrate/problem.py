@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -209,6 +209,16 @@ class CalibrationProblem:
         """The mean of the foregrounds' finite prior, (Nbls, Nfreqs); None if there is no such prior."""
         return None if self.structure.prior == "none" else self.sky_model
 
+    def weighted_by(self, gains: np.ndarray) -> CalibrationProblem:
+        """Return the problem with its weights over |g_a g_b|^2, and the same sum of weights.
+
+        Parameters
+        ----------
+        gains
+            Complex, (Nants, Nfreqs).
+        """
+        return replace(self, weights=gain_weights(self.weights, gain_products(gains, self.structure.antennas)))
+
     @property
     def antenna_weights(self) -> np.ndarray:
         """Summed weights of the baselines of each antenna, shape (Nants, Nfreqs)."""
@@ -244,6 +254,40 @@ def fitted_baselines(frame: Frame, autos: bool) -> np.ndarray:
 def flag_weights(flags: np.ndarray) -> np.ndarray:
     """Return the paper's weights 1 / (Nbls Nfreqs), zero where flagged; shape of `flags`, (Nbls, Nfreqs), float64."""
     return np.where(flags, 0.0, 1.0 / flags.size)
+
+
+def gain_weights(weights: np.ndarray, products: np.ndarray) -> np.ndarray:
+    """Return weights over |g_a g_b|^2, with the same mean over baselines and channels.
+
+    Parameters
+    ----------
+    weights
+        As of unity gains, (..., Nbls, Nfreqs).
+    products
+        g_a g_b*, of the same shape; not zero where the weight is not.
+    """
+    used = weights > 0
+    found = np.where(used, weights, 0) / np.where(used, np.abs(products) ** 2, 1)
+    before, after = (np.sum(values, axis=(-2, -1), keepdims=True) for values in (weights, found))
+    return found * (before / np.where(after > 0, after, 1))
+
+
+def weight_change(weights: np.ndarray, before: np.ndarray) -> float:
+    """Return how much weights changed in neighbouring channels against each other, relative, rms.
+
+    Changes that are smooth in frequency carry no error of the foregrounds to other delays, and go on for as long as a
+    fit moves along gains that foregrounds can nearly follow.
+
+    Parameters
+    ----------
+    weights, before
+        (..., Nfreqs); samples without weight do not count.
+    """
+    used = (before > 0) & (weights > 0)
+    ratio = np.divide(weights, before, out=np.ones_like(weights), where=used)
+    both = used[..., 1:] & used[..., :-1]
+    steps = np.diff(ratio, axis=-1)[both]
+    return float(np.sqrt(np.mean(steps**2) / 2)) if steps.size else 0.0
 
 
 def gain_products(gains: np.ndarray, antennas: np.ndarray) -> np.ndarray:

@@ -6,8 +6,11 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from calstudy.base.errors import InputError
+from calstudy.base.observation import Frame
 from calstudy.base.schema import UNKEYED, Section, choice, fault
 from calstudy.base.units import Delay, FluxDensity, Length
 from calstudy.calibrate.interface import Calibrator
@@ -101,6 +104,28 @@ Solver = Annotated[
 ]
 
 
+class GainWeights(Section):
+    """Inverse variance of noise that is received with the sky: 1 / |g_a g_b|^2 of the gains that the fit finds itself.
+
+    The first pass has the weights of the gains that it starts from; each other pass those of the gains of the pass
+    before.
+    """
+
+    kind: Literal["gains"] = "gains"
+    passes: int = Field(
+        10,
+        ge=1,
+        description="Passes at most, each with the steps that `solver` allows; 1: the weights of the first gains.",
+    )
+    tolerance: float = Field(
+        1e-4,
+        gt=0,
+        lt=1,
+        description="The last pass is the one whose gains change weights by less: relative, rms of neighbouring "
+        "channels against each other.",
+    )
+
+
 class FlagWeights(Section):
     """Every unflagged sample counts alike, 1 / (Nbls Nfreqs): the paper's weights."""
 
@@ -127,8 +152,32 @@ class FileWeights(Section):
 
 
 Weights = Annotated[
-    FlagWeights | SampleWeights | AutoWeights | FileWeights, Field(discriminator="kind"), choice("kind", "flags")
+    GainWeights | FlagWeights | SampleWeights | AutoWeights | FileWeights,
+    Field(discriminator="kind"),
+    choice("kind", "gains"),
 ]
+
+
+class BaselineRange(Section):
+    """Baselines that gains are fitted to. Gains calibrate all baselines of their antennas."""
+
+    shortest: Length = Field(0.0, ge=0, description="Shorter baselines have no weight.")
+    longest: Length | None = Field(None, gt=0, description="Longer baselines have no weight; null: all have.")
+    taper: Length | None = Field(
+        None, gt=0, description="Weights are multiplied by a Gaussian of the length with this standard deviation."
+    )
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Self:
+        if self.longest is not None and self.longest <= self.shortest:
+            raise fault("longest", f"{self.longest:g} m is not above shortest, {self.shortest:g} m")
+        return self
+
+    def factors(self, lengths: np.ndarray) -> np.ndarray:
+        """Return what the weights of baselines of some lengths, m, are multiplied by."""
+        chosen = (lengths >= self.shortest) & (lengths <= (math.inf if self.longest is None else self.longest))
+        taper = 1.0 if self.taper is None else np.exp(-((lengths / self.taper) ** 2) / 2)
+        return chosen * taper
 
 
 class UnityStart(Section):
@@ -227,14 +276,45 @@ class ForegroundPrior(Section):
         return any(value not in (0, "infinite") for value in (self.deviation, self.shared_deviation))
 
 
-class GainFit(Calibrator):
+class WeightedFit(Calibrator):
+    """What all calibrators have in common that fit gains to weighted visibilities."""
+
+    weights: Weights = GainWeights()
+    baselines: BaselineRange | None = Field(
+        None, description="Baselines that gains are fitted to, where the foregrounds are the sky model; null: all."
+    )
+
+    @property
+    def needs_autos(self) -> bool:
+        """Whether weights come from autocorrelations."""
+        return self.weights.kind == "autos"
+
+    def fitted(self, frame: Frame) -> Frame:
+        """Return the baselines of a frame that gains are fitted to.
+
+        Raises
+        ------
+        InputError
+            If there are none; the message starts with the path of the setting.
+        """
+        if self.baselines is None:
+            return frame
+        chosen = self.baselines.factors(frame.lengths) > 0
+        if not chosen.any():
+            raise InputError(
+                f"baselines: none lies within the range; the data have {frame.lengths.min():.0f} to "
+                f"{frame.lengths.max():.0f} m"
+            )
+        return frame.baselines(chosen)
+
+
+class GainFit(WeightedFit):
     """Settings of calibrators that fit gains by weighted least squares, w |V - g_a g_b* F|^2.
 
     Fields of `solver` that a file leaves out are those of the calibrator's own solver, if it has the same name.
     """
 
     solver: Solver = GaussNewtonSettings()
-    weights: Weights = FlagWeights()
     initial_gains: InitialGains = UnityStart()
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
     gain_delay: Delay | None = Field(
@@ -312,6 +392,8 @@ class ForegroundFit(GainFit):
             raise fault("joint_basis", "has no finite prior; leave it out, or make `deviation` infinite")
         if prior.finite and isinstance(self.solver, FirstOrderSettings):
             raise fault("solver", f"{self.solver.name} cannot fit a finite prior; use gauss-newton or lbfgs")
+        if self.baselines is not None and not self.frozen:
+            raise fault("baselines", "must be null where foregrounds are fitted, which takes data of every baseline")
         return self
 
     @property

@@ -1,4 +1,10 @@
-"""Weights of the likelihood, from the flags, the sample counts or the autocorrelations of the data, or from a file."""
+"""Weights of the likelihood: inverse variances from gains or autocorrelations, sample counts, flags, or a file.
+
+Noise that is received with the sky is multiplied by the gains as the sky is, so that the variance of a visibility is
+proportional to |g_a g_b|^2. With weights that do not follow it, errors of the foregrounds that are smooth in frequency
+become errors of the gains that have the structure of |g_a g_b|^2 in frequency: with gains that are white in frequency
+they are white, and at all delays.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +33,7 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     fitted
         Which baselines are calibrated, bool, shape (Nbls,).
     settings
-        Where weights come from.
+        Where weights come from. Those from gains are those of unity gains; the solves change them.
 
     Returns
     -------
@@ -40,14 +46,14 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
         complex, negative or not finite.
     """
     used = ~data.flags[:, fitted]
-    if settings.kind == "flags":
-        weights = used.astype(float)
-    elif settings.kind == "nsamples":
+    if settings.kind == "nsamples":
         weights = data.nsamples[:, fitted] * used
     elif settings.kind == "autos":
         weights = _from_autos(data, fitted) * used
-    else:
+    elif settings.kind == "file":
         weights = _from_file(data, settings)[:, fitted] * used
+    else:
+        weights = used.astype(float)
     size = weights.shape[1] * weights.shape[2]
     count, total = (np.sum(values, axis=(1, 2), keepdims=True) for values in (weights > 0, weights))
     return weights * (count / size / np.where(total > 0, total, 1))

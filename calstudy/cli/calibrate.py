@@ -38,7 +38,7 @@ SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
 Redundant = Annotated[bool, typer.Option("--redundant", help="One foreground model per redundant group.")]
 GainsOnly = Annotated[bool, typer.Option("--gains-only", help="Freeze the sky model and solve for gains alone.")]
-Weighting = Annotated[str | None, typer.Option(help="flags (default), nsamples, autos, or a UVFlag file.")]
+Weighting = Annotated[str | None, typer.Option(help="gains (default), flags, nsamples, autos, or a UVFlag file.")]
 Select = Annotated[
     list[str] | None,
     typer.Option(
@@ -141,10 +141,10 @@ def _calibrator(redundant: bool, gains_only: bool) -> str | None:
 
 
 def _weights(text: str | None) -> Any:
-    if text is None or text in ("flags", "nsamples", "autos"):
+    if text is None or text in ("gains", "flags", "nsamples", "autos"):
         return text
     if not Path(text).is_file():
-        raise InputError(f"--weights {text}: neither flags, nsamples or autos, nor a file")
+        raise InputError(f"--weights {text}: neither gains, flags, nsamples or autos, nor a file")
     return {"kind": "file", "path": text}
 
 
@@ -157,7 +157,7 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
         raise InputError(NOISE_UNKNOWN)
 
     selection = parse_selection(request.selections)
-    if isinstance(calibrator, GainFit) and calibrator.weights.kind == "autos":
+    if calibrator.needs_autos:
         selection = replace(selection, autos=True)
     require_free(request.output, request.extras, request.overwrite)
     if EXPECTED in request.extras and not isinstance(calibrator, GainFit):

@@ -231,6 +231,16 @@ class Experiment(Section):
         return self
 
     @model_validator(mode="after")
+    def _autocorrelations_are_noise(self) -> Experiment:
+        if self.corruption.noise.kind == "none" and self.calibration.needs_autos:
+            raise fault(
+                "calibration.weights",
+                "is 'autos', and without corruption.noise there are no autocorrelations: choose other weights, or let "
+                "there be noise",
+            )
+        return self
+
+    @model_validator(mode="after")
     def _antennas_and_effects_are_independent(self) -> Experiment:
         # Both are drawn by NumPy's default generator from the seed alone: equal seeds draw the same numbers.
         effects = enumerate(self.corruption.effects)

@@ -14,7 +14,8 @@ from calstudy.experiment.yaml_files import read_mapping
 MODELINE = "# yaml-language-server: $schema="
 """Start of the line from which editors know the schema of a file."""
 TEXT = """\
-# A small experiment: about a minute. Every field that is left out has the value of Ewall-Wice et al. (2022).
+# A small experiment: about a minute. Fields that are left out have the values of
+# Ewall-Wice et al. (2022), but for calibration.weights.
 # `calstudy plan {name}.yaml` checks it and says what a run takes; `calstudy run {name}.yaml` runs it.
 # All fields: docs/experiments.md, or `calstudy fields`.
 name: {name}
@@ -41,6 +42,7 @@ corruption:
 calibration:
   calibrator: calamity                                    # calamity-redundant, sky-based, ..., or a file.py
   # assumed: {{sky.foregrounds.flux_limit: 1 Jy}}         # what the calibrator takes for true
+  # weights: autos                                        # or flags, the paper's; inverse variances without them
   chunks: 1
 
 simulation:
@@ -77,6 +79,7 @@ observed:
 
 calibration:
   calibrator: calamity                                    # calamity-redundant, ..., or a file.py
+  # weights: autos                                        # the radiometer equation, if there are autocorrelations
 
 injection:
   eor: {{nside: 64}}                                        # pixels of 0.9 deg; finer for long baselines

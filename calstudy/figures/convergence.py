@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.calibrate.bias import ratio_over_antennas
+from calstudy.calibrate.settings import GainFit, GainWeights
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95
@@ -24,6 +25,8 @@ from calstudy.verdicts.tolerances import Drawn, half
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from calstudy.experiment.model import Experiment
 
 SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
 BIAS = r"$|P^{R}|\,/\,P^{S}$, no EoR in the data"
@@ -148,6 +151,13 @@ class Convergence(StudyFigure):
     needs_least_squares = True
     needs_calibration = True
     tolerances = ((r".*\.predicted", Drawn(half, "an estimate to within a factor of two; half of it")),)
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Return that the weights are not the same in all steps, or what else is missing."""
+        reason, calibration = super().refusal(experiment), experiment.calibration
+        if reason is None and isinstance(calibration, GainFit) and isinstance(calibration.weights, GainWeights):
+            return "needs weights that stay as they are: with calibration.weights 'gains' solvers run several times"
+        return reason
 
     def _integrations(self, graph: Graph) -> list[int]:
         last = graph.experiment.instrument.times.count - 1

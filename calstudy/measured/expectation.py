@@ -16,7 +16,7 @@ from calstudy.calibrate.expected_loss import (
     jacobian_size,
 )
 from calstudy.calibrate.interface import USABLE, Assumed
-from calstudy.calibrate.preparation import make_problem, prepare
+from calstudy.calibrate.preparation import prepare, problem_at
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import GainFit
 
@@ -60,13 +60,13 @@ def expect(
     record = usable[len(usable) // 2]
     times = slice(record.integration, record.integration + record.n_integrations)
     prepared = prepare(Observation(data), settings, assumed or Assumed())
-    problem = make_problem(prepared, settings, times, polarization)
-    if isinstance(problem, str):
-        return None
     solved = result.gains
     rows = np.searchsorted(solved.ant_array, prepared.data.numbers, sorter=np.argsort(solved.ant_array))
     antennas = np.argsort(solved.ant_array)[rows]
     gains = solved.gain_array[antennas, :, times.start, polarization]
+    problem = problem_at(prepared, settings, times, polarization, gains)
+    if isinstance(problem, str):
+        return None
     model = to_cube(result.model)[times, :, :, polarization].reshape(problem.visibilities.shape)
     probes = None if jacobian_size(problem) <= DENSE else PROBES
     modes = DelayModes(prepared.data.frequencies, taper)

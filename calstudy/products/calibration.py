@@ -31,6 +31,7 @@ from calstudy.run.task import Job, Stage, Task
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy as np
     from pyuvdata import UVData
 
 
@@ -48,14 +49,22 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
         "even" or "odd".
     """
     # What is assumed decides the sky model, which is an input, and nothing else.
-    inputs = {"data": corruption.data(graph, variant, parity)}
+    inputs = calibration_inputs(graph, variant, parity)
+    model = inputs.get("sky_model")
+    calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model.key if model else None)
+    return calibration_of(calibrator.reset("assumed"), inputs, temporary=not graph.keep_visibilities)
+
+
+def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str, Task]:
+    """Return what the calibration of one noise realization of a variant needs."""
+    inputs, calibrator = {"data": corruption.data(graph, variant, parity)}, graph.experiment.calibration
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
-    calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model.key if model else None)
-    settings = calibrator.reset("assumed")
-    if settings.needs_noise:
+    if calibrator.needs_noise:
         inputs["levels"] = corruption.levels(graph)
-    return calibration_of(settings, inputs, temporary=not graph.keep_visibilities)
+    if calibrator.needs_autos:
+        inputs["autocorrelations"] = corruption.autocorrelations(graph, variant, parity)
+    return inputs
 
 
 def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: bool = False) -> Task:
@@ -66,7 +75,8 @@ def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: 
     settings
         The calibrator.
     inputs
-        ``data``; ``sky_model``, if there is one; ``levels``, if the calibrator needs to know the noise.
+        ``data``; ``sky_model``, if there is one; ``levels``, if the calibrator needs to know the noise;
+        ``autocorrelations``, if it needs them and the data have none.
     temporary
         Of the task.
     """
@@ -88,8 +98,8 @@ def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: 
     return Task(CALIBRATE, data.label, {}, chunks, temporary=temporary)
 
 
-def _read_chunk(path: Path, index: int, count: int, together: int) -> UVData:
-    """Read run number `index` of `count` runs of consecutive integrations, as equal as can be.
+def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.ndarray:
+    """Return the times of run number `index` of `count` runs of consecutive integrations, as equal as can be.
 
     A run ends where one group of integrations that are solved `together` ends.
     """
@@ -99,7 +109,41 @@ def _read_chunk(path: Path, index: int, count: int, together: int) -> UVData:
     together = min(together, times.size)
     groups = -(-times.size // together)
     edges = np.linspace(0, groups, count + 1).round().astype(int) * together
-    return read_visibilities(path, times[edges[index] : edges[index + 1]])
+    return times[edges[index] : edges[index + 1]]
+
+
+def read_calibrated(
+    inputs: Mapping[str, Path], times: np.ndarray | None = None
+) -> tuple[UVData, UVData | None, float | None]:
+    """Read what a calibration is given: data, sky model and the level of the noise, as far as there are any.
+
+    Parameters
+    ----------
+    inputs
+        Folders of the products of `calibration_inputs`.
+    times
+        JD of the integrations that are read; None for all.
+    """
+    from calstudy.calibrate.sky_model import common_baselines
+
+    data = read_visibilities(inputs["data"] / DATA, times)
+    sky = read_visibilities(inputs["sky_model"] / VISIBILITIES, times) if "sky_model" in inputs else None
+    if "autocorrelations" in inputs:
+        data = with_autocorrelations(data, read_visibilities(inputs["autocorrelations"] / DATA, times))
+        if sky is not None:
+            sky, data, _ = common_baselines(sky, data, autos=False)
+    noise = read_json(inputs["levels"] / LEVELS)["noise_std"] if "levels" in inputs else None
+    return data, sky, noise
+
+
+def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
+    """Return data whose integrations have autocorrelations after all other baselines."""
+    import numpy as np
+
+    joined = data.fast_concat([autos], "blt", inplace=False)
+    rows = [np.arange(uvd.Nblts).reshape(uvd.Ntimes, uvd.Nbls) for uvd in (data, autos)]
+    joined.reorder_blts(order=np.hstack([rows[0], data.Nblts + rows[1]]).ravel(), run_check=False)
+    return joined
 
 
 def calibrate_chunk(job: Job) -> Mapping[str, Any]:
@@ -107,10 +151,8 @@ def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     from calstudy.calibrate.execution import run_calibrator
 
     index, count, settings = (job.settings[name] for name in ("index", "count", "calibration"))
-    chunk = index, count, settings.integrations_per_solve
-    data = _read_chunk(job.inputs["data"] / DATA, *chunk)
-    sky = _read_chunk(job.inputs["sky_model"] / VISIBILITIES, *chunk) if "sky_model" in job.inputs else None
-    noise = read_json(job.inputs["levels"] / LEVELS)["noise_std"] if "levels" in job.inputs else None
+    times = _times_of_chunk(job.inputs["data"] / DATA, index, count, settings.integrations_per_solve)
+    data, sky, noise = read_calibrated(job.inputs, times)
     result = run_calibrator(settings, data, sky, noise=noise)
     result.gains.write_calh5(job.output / GAINS)
     for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 PARITIES = ("even", "odd")
 """Names of the two noise realizations."""
 LEVELS, TRUTH = "levels.json", "truth.h5"
+AUTOS_SEED = 1
+"""Besides the seed of the noise, of the noise of autocorrelations."""
 
 
 def truths(graph: Graph) -> list[Task]:
@@ -122,6 +124,35 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         settings["flagged_by"] = acting
         inputs |= _numbered([_truth(graph, place) for place in flagging])
     return Task(CORRUPT, label, settings, inputs, temporary=not graph.keep_visibilities)
+
+
+@once
+def autocorrelations(graph: Graph, variant: Variant, parity: str) -> Task:
+    """Return the task of the autocorrelations of one noise realization of a variant.
+
+    They are the same with the EoR and without it, which is far below their noise.
+
+    Parameters
+    ----------
+    graph
+        Of the experiment.
+    variant
+        Whether effects happen to it.
+    parity
+        "even" or "odd".
+    """
+    noise = graph.experiment.corruption.noise
+    if isinstance(noise, NoNoise):
+        raise LookupError("autocorrelations: corruption.noise is 'none'")
+    settings: dict[str, Any] = {
+        "instrument": graph.experiment.instrument.without_beams(),
+        "noise_seed": noise.seeds[PARITIES.index(parity)],
+        "nights": noise.nights if isinstance(noise, RadiometerNoise) else 1,
+    }
+    inputs = {"levels": levels(graph)}
+    if variant.effects:
+        inputs["gains"] = gains(graph)
+    return Task(AUTOCORRELATE, f"autocorrelations {parity}", settings, inputs, temporary=not graph.keep_visibilities)
 
 
 def draw_effect(job: Job) -> Mapping[str, Any]:
@@ -249,6 +280,45 @@ def corrupt(job: Job) -> Mapping[str, Any]:
     return notes
 
 
+def autocorrelate(job: Job) -> Mapping[str, Any]:
+    """Write what the antennas measure of themselves to data.uvh5: noise, with noise, after the gains.
+
+    By the radiometer equation noise of sigma on all baselines means autocorrelations of sigma sqrt(width x integration
+    x nights) before the gains, sky and receiver together, whose own noise has the same sigma. Effects that are no gains
+    leave them as they are.
+    """
+    import numpy as np
+
+    from calstudy.base.gains import read_gains
+    from calstudy.base.observation import Observation
+    from calstudy.base.visibilities import from_cube
+    from calstudy.corrupt.levels import Levels
+    from calstudy.instrument.telescope import make_template
+
+    settings = job.settings["instrument"]
+    template = make_template(settings, autos=True)
+    template.select(blt_inds=np.flatnonzero(template.ant_1_array == template.ant_2_array), run_check=False)
+    observation = Observation(template)
+    sigma = Levels(**read_json(job.inputs["levels"] / LEVELS)).noise
+    samples = settings.channels.width * settings.times.integration * job.settings["nights"]
+    # A list of seeds gives another stream than that of the noise of the baselines.
+    random = np.random.default_rng([job.settings["noise_seed"], AUTOS_SEED])
+    cube = sigma * (np.sqrt(samples) + random.standard_normal(observation.shape))
+    if "gains" in job.inputs:
+        true = read_gains(job.inputs["gains"] / GAINS, "true gains")
+        order = np.argsort(true.ant_array)
+        rows = order[np.searchsorted(true.ant_array, template.ant_1_array[: template.Nbls], sorter=order)]
+        cube = cube * np.moveaxis(np.abs(true.gain_array[rows]) ** 2, 2, 0)
+    write_visibilities(from_cube(template, cube.astype(complex)), job.output / DATA, single=True)
+    return {}
+
+
+def _cost_of_autocorrelations(task: Task) -> Cost:
+    size = size_of(task)
+    disk = size.antennas * size.channels.count * size.times * size.polarizations * COMPLEX64
+    return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, disk)
+
+
 def _cost_of_corruption(task: Task) -> Cost:
     size = size_of(task)
     effects = [effect.cost(size) for effect in task.settings.get("effects", ())]
@@ -278,3 +348,4 @@ DRAW_EFFECT = Stage(name="effect", version=1, make=draw_effect, cost=_cost_of_ga
 MULTIPLY_GAINS = Stage(name="gains", version=2, make=multiply_gains, cost=_cost_of_gains)
 MEASURE_LEVELS = Stage(name="levels", version=2, make=measure_levels, cost=_cost_of_levels)
 CORRUPT = Stage(name="corrupt", version=2, make=corrupt, cost=_cost_of_corruption)
+AUTOCORRELATE = Stage(name="autocorrelations", version=1, make=autocorrelate, cost=_cost_of_autocorrelations)

@@ -9,9 +9,8 @@ from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
-from calstudy.products import calibration, corruption, sky_model
-from calstudy.products.corruption import LEVELS
-from calstudy.products.files import DATA, MODEL, VISIBILITIES, read_json, read_visibilities
+from calstudy.products import calibration
+from calstudy.products.files import DATA, MODEL, integration_times, read_visibilities
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
 
@@ -32,14 +31,8 @@ PROBES = 16
 def expected_loss(graph: Graph) -> Task:
     """Return the task that predicts T for the middle integration of the variant `residual`."""
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
-    inputs = {
-        "data": corruption.data(graph, residual, "even"),
-        "calibration": calibration.calibration(graph, residual, "even"),
-    }
-    if (model := sky_model.sky_model(graph)) is not None:
-        inputs["sky_model"] = model
-    if graph.experiment.calibration.needs_noise:
-        inputs["levels"] = corruption.levels(graph)
+    inputs = calibration.calibration_inputs(graph, residual, "even")
+    inputs["calibration"] = calibration.calibration(graph, residual, "even")
     settings = {
         "calibration": graph.experiment.calibration.reset("assumed"),
         "power": graph.experiment.power.reset("pairs", "redundancy_tolerance", "coherent_time"),
@@ -57,24 +50,19 @@ def expect(job: Job) -> Mapping[str, Any]:
     from calstudy.base.visibilities import to_cube
     from calstudy.calibrate.expected_loss import DelayModes, expected_transfer
     from calstudy.calibrate.interface import Assumed
-    from calstudy.calibrate.preparation import make_problem, prepare
+    from calstudy.calibrate.preparation import prepare, problem_at
     from calstudy.power.tables import save_spectrum
     from calstudy.products.selection import read_gains
 
     settings, power = job.settings["calibration"], job.settings["power"]
     index = job.settings["integration"]
-    data = read_visibilities(job.inputs["data"] / DATA)
-    chosen = np.arange(index * data.Nbls, (index + 1) * data.Nbls)
-    sky = None
-    if "sky_model" in job.inputs:
-        sky = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
-        sky = sky.select(blt_inds=chosen, inplace=False, run_check=False)
-    noise = read_json(job.inputs["levels"] / LEVELS)["noise_std"] if "levels" in job.inputs else None
+    times = integration_times(job.inputs["data"] / DATA)[[index]]
+    data, sky, noise = calibration.read_calibrated(job.inputs, times)
     assumed = Assumed(None if sky is None else Observation(sky), noise=noise)
-    chosen_data = Observation(data.select(blt_inds=chosen, inplace=False, run_check=False))
-    prepared = prepare(chosen_data, settings, assumed)
-    problem = make_problem(prepared, settings, slice(0, 1), 0)
+    prepared = prepare(Observation(data), settings, assumed)
     fitted = read_gains(job.inputs["calibration"])
+    gains = fitted.at(index, prepared.data.numbers)
+    problem = problem_at(prepared, settings, slice(0, 1), 0, gains)
     if isinstance(problem, str) or fitted.flags[index].any():
         raise InputError(
             f"expected-loss: integration {index} was not calibrated in all antennas and channels, and flagged data are "
@@ -83,7 +71,6 @@ def expect(job: Job) -> Mapping[str, Any]:
     model = to_cube(read_visibilities(job.inputs["calibration"] / MODEL))[index, ..., 0]
     frequency = np.asarray(data.freq_array, float)
     modes = DelayModes(frequency, power.taper)
-    gains = fitted.at(index, prepared.data.numbers)
     expected = expected_transfer(problem, gains, model, modes, job.settings["probes"])
     save_spectrum(job.output / EXPECTED, binned(expected, prepared.data.lengths, float(frequency.mean()), power))
     return {"integration": index, "probes": job.settings["probes"]}

@@ -47,7 +47,7 @@ class LeastSquares(GainFit):
 
         try:
             require_tensorflow()
-            frame = frame.baselines(fitted_baselines(frame, self.autos))
+            frame = self.fitted(frame.baselines(fitted_baselines(frame, self.autos)))
             if isinstance(self, ForegroundFit) and not self.frozen:
                 _require_basis(frame, self)
         except InputError as error:

@@ -12,8 +12,9 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import fix_phase
-from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Outcome, Progress
-from calstudy.calibrate.settings import FlagWeights, Weights
+from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
+from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
+from calstudy.calibrate.settings import GainWeights, WeightedFit
 
 # hera_cal wants a name for the polarization; each is calibrated by itself.
 POL, FEED = "nn", "Jnn"
@@ -38,26 +39,47 @@ class Measured:
     sky: np.ndarray
     weights: np.ndarray
 
+    def weighted_by(self, gains: np.ndarray, groups: list[slice]) -> Measured:
+        """Return the data with their weights over |g_a g_b|^2, and the same mean weight in every group.
+
+        Parameters
+        ----------
+        gains
+            Complex, (Nants, Nfreqs, Ngroups); where they are not known, they count as unity.
+        groups
+            Integrations that share their gains.
+        """
+        known = np.where(np.isfinite(gains) & (gains != 0), gains, 1)
+        weights = self.weights.copy()
+        for number, times in enumerate(groups):
+            products = gain_products(known[..., number], self.frame.antennas)
+            weights[times] = gain_weights(weights[times], np.broadcast_to(products, weights[times].shape))
+        return replace(self, weights=weights)
+
     def keys(self, rows: np.ndarray) -> list[tuple[int, int, str]]:
         """Return what hera_cal calls some baselines."""
         return [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
 
 
-class OtherPackage(Calibrator):
+class OtherPackage(WeightedFit):
     """A calibrator that finds gains alone; the residual is that of the sky model."""
-
-    weights: Weights = FlagWeights()
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return that there is no sky model, or nothing to calibrate."""
         if not has_sky_model:
             return "needs a sky model, and there is none"
-        return (
-            "the data hold no cross-correlations, so that there is nothing to calibrate" if frame.autos.all() else None
-        )
+        if frame.autos.all():
+            return "the data hold no cross-correlations, so that there is nothing to calibrate"
+        try:
+            self.fitted(frame.baselines(~frame.autos))
+        except InputError as error:
+            return str(error)
+        return None
 
     @abstractmethod
-    def solve(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def solve(
+        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, list[Outcome]]:
         """Return gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how each solve ended.
 
         Parameters
@@ -66,6 +88,9 @@ class OtherPackage(Calibrator):
             Data of one polarization; there are some with weight in each group.
         groups
             Integrations that share their gains.
+        start
+            Gains of the pass before, as they are returned, if weights come from these: those of `measured` are over
+            |g_a g_b|^2 of them (`Measured.weighted_by`). None in the first pass.
         """
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
@@ -81,6 +106,7 @@ class OtherPackage(Calibrator):
         data, sky = observation.baselines(crosses), assumed.sky_model.baselines(crosses)
         if not (np.isfinite(data.visibilities) | data.flags).all():
             raise InputError(f"{self.label}: unflagged visibilities are not finite; flag them")
+        factors = 1.0 if self.baselines is None else self.baselines.factors(data.lengths)[:, None]
         groups = self.solves(data.n_times)
         gains = np.full((data.n_antennas, data.n_channels, len(groups), data.n_polarizations), np.nan, complex)
         outcomes: list[Outcome] = []
@@ -88,7 +114,7 @@ class OtherPackage(Calibrator):
             used = (weights[..., p] > 0) & (sky.visibilities[..., p] != 0) & (data.visibilities[..., p] != 0)
             visibilities = np.where(used, data.visibilities[..., p], 0).astype(complex)
             model = np.nan_to_num(sky.visibilities[..., p].astype(complex))
-            measured = Measured(data, visibilities, model, np.where(used, weights[..., p], 0.0))
+            measured = Measured(data, visibilities, model, np.where(used, weights[..., p] * factors, 0.0))
             gains[..., p], ended = self._solve_timed(measured, groups)
             outcomes += ended
             if progress is not None:
@@ -114,7 +140,7 @@ class OtherPackage(Calibrator):
             with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
                 # They divide by what may be zero, and tell of numbers that they replace themselves.
                 warnings.simplefilter("ignore")
-                gains[:, :, full], found = self.solve(measured, [groups[number] for number in full])
+                gains[:, :, full], found = self._solve_in_passes(measured, [groups[number] for number in full])
             for number, outcome in zip(full, found, strict=True):
                 ended[number] = replace(
                     outcome,
@@ -123,6 +149,32 @@ class OtherPackage(Calibrator):
                     peak_memory=usage.peak_memory,
                 )
         return gains, ended
+
+    def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+        """Solve groups; if weights come from the gains, again with those of the pass before, until they settle."""
+        settings, weights = self.weights, measured.weights
+        gains, outcomes = self.solve(measured, groups)
+        if not isinstance(settings, GainWeights):
+            return gains, outcomes
+        passes = 1
+        while True:
+            before, weights = weights, measured.weighted_by(gains, groups).weights
+            changes = [weight_change(weights[times], before[times]) for times in groups]
+            if passes == settings.passes or max(changes) < settings.tolerance:
+                break
+            gains, outcomes = self.solve(measured, groups, gains)
+            passes += 1
+        settled = [settings.passes == 1 or found < settings.tolerance for found in changes]
+        return gains, [_in_passes(*ended, passes) for ended in zip(outcomes, changes, settled, strict=True)]
+
+
+def _in_passes(outcome: Outcome, change: float, settled: bool, passes: int) -> Outcome:
+    """Return an outcome with the number of passes and the last change of the weights."""
+    diagnostics = {**outcome.diagnostics, "passes": passes, "weight_change": change}
+    if settled or outcome.status != "converged":
+        return replace(outcome, diagnostics=diagnostics)
+    message = f"weights from the gains still changed by {change:.1e} in pass {passes}"
+    return replace(outcome, status="max-steps", message=message, diagnostics=diagnostics)
 
 
 def _turned(gains: np.ndarray) -> np.ndarray:

@@ -68,8 +68,12 @@ class Ddecal(OtherPackage):
         seconds = 5 + 8 * size.polarizations + 4e-5 * size.samples
         return Cost(seconds, LIBRARIES_MEMORY + 12 * CORRELATIONS * COMPLEX64 * samples)
 
-    def solve(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def solve(
+        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, list[Outcome]]:
         """Solve every group of integrations."""
+        if start is not None:
+            measured = measured.weighted_by(start, groups)
         with TemporaryDirectory(prefix="ddecal-") as name:
             folder = Path(name)
             _write_measurement_set(folder, measured, groups)

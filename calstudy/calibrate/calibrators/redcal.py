@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -14,7 +15,8 @@ from calstudy.base.units import Length
 from calstudy.calibrate.calibrators._other_packages import FEED, POL, Measured, OtherPackage, patterns
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Outcome
-from calstudy.calibrate.settings import FlagWeights
+from calstudy.calibrate.problem import gain_products
+from calstudy.calibrate.settings import FlagWeights, GainWeights
 from calstudy.instrument.layouts import RedundantGroups, redundant_groups
 from calstudy.instrument.size import Size
 
@@ -48,6 +50,8 @@ class Redcal(OtherPackage):
     gradient, comes from the sky model (Liu et al. 2010; Kern et al. 2020; Byrne et al. 2019).
     """
 
+    # Amplitude and phase gradient have the weights of calibrated data since 2.
+    version: ClassVar[int] = 2
     calibrator: str = "redcal"
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
     steps: Annotated[tuple[Step, ...], Field(strict=False, min_length=1)] = Field(
@@ -71,20 +75,23 @@ class Redcal(OtherPackage):
         """Return why redundancy does not tie the gains of all antennas to each other, or None."""
         if (reason := super().refusal(frame, has_sky_model)) is not None:
             return reason
-        crosses = frame.baselines(~frame.autos)
-        groups = redundant_groups(crosses.vectors, self.redundancy_tolerance)
-        return _undetermined(crosses.antennas, groups)
+        fitted = self.fitted(frame.baselines(~frame.autos))
+        return _undetermined(fitted.antennas, redundant_groups(fitted.vectors, self.redundancy_tolerance))
 
     def cost(self, size: Size) -> Cost:
         """Return what the solves take, for some hundred steps of omnical; flags that differ in all cells cost more."""
         cells = size.channels.count * size.times * size.polarizations
-        alike = isinstance(self.weights, FlagWeights) or "logcal" not in self.steps
+        alike = isinstance(self.weights, FlagWeights | GainWeights) or "logcal" not in self.steps
         seconds = 5 + (4e-6 if alike else 1.5e-5) * size.samples + (1e-3 * cells if "abscal" in self.steps else 0)
         at_once = max(SAMPLES_AT_ONCE, size.baselines * size.channels.count)
         return Cost(seconds, LIBRARIES_MEMORY + COMPLEX128 * (6 * size.samples + 25 * min(size.samples, at_once)))
 
-    def solve(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def solve(
+        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, list[Outcome]]:
         """Solve every integration by itself; gains of those that share them are averaged, phases aligned."""
+        if start is not None:
+            return self._solve_again(measured, groups, start)
         found = redundant_groups(measured.frame.vectors, self.redundancy_tolerance)
         n_times, n_baselines, n_channels = measured.visibilities.shape
         step = max(int(SAMPLES_AT_ONCE // (n_baselines * n_channels)), 1)
@@ -95,6 +102,20 @@ class Redcal(OtherPackage):
         gains, status, steps = (np.concatenate(parts, axis=-2) for parts in zip(*blocks, strict=True))
         shared = np.stack([_average(gains[:, times]) for times in groups], axis=2)
         return shared, [self._outcome(status[times], steps[times]) for times in groups]
+
+    def _solve_again(
+        self, measured: Measured, groups: list[slice], start: np.ndarray
+    ) -> tuple[np.ndarray, list[Outcome]]:
+        """Solve data that are divided by the gains of the pass before, whose weights are those of unity gains.
+
+        They are equal if nothing is flagged, which logcal needs for its speed.
+        """
+        known = np.where(np.isfinite(start) & (start != 0), start, 1)
+        visibilities = measured.visibilities.copy()
+        for number, times in enumerate(groups):
+            visibilities[times] /= gain_products(known[..., number], measured.frame.antennas)
+        gains, outcomes = self.solve(replace(measured, visibilities=visibilities), groups)
+        return gains * known, outcomes
 
     def _outcome(self, status: np.ndarray, steps: np.ndarray) -> Outcome:
         """Return how a solve ended, from the marks of its channels in `_Redundant.solve`."""
@@ -294,20 +315,24 @@ class _Redundant:
         from hera_cal.datacontainer import DataContainer
 
         calibrated = _calibrated(self.data, gains)
+        # Of the calibrated data: those of the measured ones times |g_a g_b|^2.
+        weights = {key: weight * _power(gains, key) for key, weight in self.weights.items()}
         # All that the phase gradient depends on: the sum over each group. It is of group members on one grid point.
         heads = [group[0] for group in self.reds]
         overlap = {
-            group[0]: sum(self.weights[key] * calibrated[key] * self.sky[key].conj() for key in group)
-            for group in self.reds
+            group[0]: sum(weights[key] * calibrated[key] * self.sky[key].conj() for key in group) for group in self.reds
         }
         ones = {key: np.ones(self.solvable.shape, complex) for key in heads}
         _, turns = complex_phase_abscal(DataContainer(overlap), DataContainer(ones), self.reds, heads, heads)
         gains = {key: gain * turns[key] for key, gain in gains.items()}
-        data, sky, weights = (
-            DataContainer(values) for values in (_calibrated(self.data, gains), self.sky, self.weights)
-        )
-        scales = abs_amp_lincal(sky, data, wgts=weights, verbose=False, return_gains=True, gain_ants=list(gains))
+        data, sky, wgts = (DataContainer(values) for values in (_calibrated(self.data, gains), self.sky, weights))
+        scales = abs_amp_lincal(sky, data, wgts=wgts, verbose=False, return_gains=True, gain_ants=list(gains))
         return {key: gain * scales[key] for key, gain in gains.items()}
+
+
+def _power(gains: Gains, key: tuple[int, int, str]) -> np.ndarray:
+    """Return |g_a g_b|^2."""
+    return np.abs(gains[key[0], FEED] * gains[key[1], FEED]) ** 2
 
 
 def _calibrated(data: Visibilities, gains: Gains) -> Visibilities:

@@ -29,8 +29,12 @@ class Skycal(OtherPackage):
         solve = size.samples * self.integrations_per_solve / (size.times * size.polarizations)
         return Cost(seconds, LIBRARIES_MEMORY + COMPLEX128 * (6 * size.samples + 12 * solve))
 
-    def solve(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def solve(
+        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, list[Outcome]]:
         """Solve every group of integrations."""
+        if start is not None:
+            measured = measured.weighted_by(start, groups)
         found = [self._solve_group(measured, times) for times in groups]
         return np.stack([gains for gains, _ in found], axis=2), [outcome for _, outcome in found]
 

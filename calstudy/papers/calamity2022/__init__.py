@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import BaseModel
 
-from calstudy.calibrate.settings import FirstOrderSettings, GainFit, Solver
+from calstudy.calibrate.settings import FirstOrderSettings, FlagWeights, GainFit, Solver
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.settings import NoNoise, RadiometerNoise
 from calstudy.instrument.as_built import AsBuilt
@@ -28,8 +28,8 @@ SAME_NOISE = 0.1
 PAPER_RATE, PAPER_STEPS = 0.01, 10_000
 LEAST_STEPS = 1000
 """First-order steps below which foregrounds are hardly fitted: the paper's solver takes thousands."""
-NOT_THE_METHOD = ("calibrator", "solver", "chunks", "models_at_once")
-"""Fields of a calibrator that do not decide what is fitted: they may be other than the paper's."""
+NOT_THE_METHOD = ("calibrator", "solver", "weights", "chunks", "models_at_once")
+"""Fields of a calibrator whose defaults are not the paper's, or need not be."""
 
 
 class Calamity2022(Paper):
@@ -75,8 +75,8 @@ class Calamity2022(Paper):
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return which setting of an experiment is not that of the role, or None if all are.
 
-        Defaults of experiments are the paper's values. Antennas, channels, integrations and sources may be fewer, and
-        what stands in for the sky and the beam is told with the results.
+        Defaults of experiments are the paper's values, but for the weights. Antennas, channels, integrations and
+        sources may be fewer, and what replaces the sky and the beam is written with the results.
         """
         if role == "run_time":
             return "an experiment measures no run times"
@@ -126,6 +126,8 @@ def _other_calibrator(role: str, experiment: Experiment) -> str | None:
     wanted = "calamity-redundant" if role == "redundant_modelling" else "calamity"
     if experiment.calibration.calibrator != wanted:
         return f"calibration.calibrator is {experiment.calibration.calibrator!r}, not {wanted!r}"
+    if isinstance(experiment.calibration, GainFit) and experiment.calibration.weights != FlagWeights():
+        return f"calibration.weights is {experiment.calibration.weights.kind!r}, not the paper's 'flags'"
     return _changed(experiment.calibration, "calibration", NOT_THE_METHOD)
 
 
