@@ -174,4 +174,4 @@ def _cost(task: Task) -> Cost:
     return Cost(20 + 2 * steps * step * work, LIBRARIES_MEMORY + 1.5e9 * work + data, 1e6)
 
 
-CONVERGENCE = Stage(name="convergence", version=3, make=follow, cost=_cost)
+CONVERGENCE = Stage(name="convergence", version=4, make=follow, cost=_cost)
