@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from calstudy.corrupt.settings import RadiometerNoise
     from calstudy.instrument.settings import InstrumentSettings
 
+AUTOCORRELATIONS = 1
+"""A list of seeds gives another stream than any single number does."""
+
 
 def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np.ndarray:
     """Return the standard deviation of the complex noise, V_aa / sqrt(width integration nights), Jy, (Nfreqs, Npols).
@@ -56,3 +59,24 @@ def thermal_noise(shape: tuple[int, ...], std: float | np.ndarray, seed: int) ->
     noise.imag = rng.standard_normal(shape)
     noise *= std / np.sqrt(2)
     return noise
+
+
+def autocorrelations(shape: tuple[int, ...], std: float | np.ndarray, samples: float, seed: int) -> np.ndarray:
+    """Draw autocorrelations of antennas whose cross-correlations have noise, before any gains, float64, Jy.
+
+    By the radiometer equation noise of E|n|^2 = std^2 comes from autocorrelations of std sqrt(samples), sky and
+    receiver together, whose own noise has the standard deviation std.
+
+    Parameters
+    ----------
+    shape
+        Of the returned array.
+    std
+        Standard deviation of the complex noise of cross-correlations, a number or an array that broadcasts.
+    samples
+        Channel width times the time that is averaged.
+    seed
+        Same seed and shape, same autocorrelations; independent of `thermal_noise` of this seed.
+    """
+    rng = np.random.default_rng([seed, AUTOCORRELATIONS])
+    return np.asarray(std * (np.sqrt(samples) + rng.standard_normal(shape)))

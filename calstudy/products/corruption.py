@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 PARITIES = ("even", "odd")
 """Names of the two noise realizations."""
 LEVELS, TRUTH = "levels.json", "truth.h5"
-AUTOS_SEED = 1
-"""Besides the seed of the noise, of the noise of autocorrelations."""
 
 
 def truths(graph: Graph) -> list[Task]:
@@ -281,29 +279,22 @@ def corrupt(job: Job) -> Mapping[str, Any]:
 
 
 def autocorrelate(job: Job) -> Mapping[str, Any]:
-    """Write what the antennas measure of themselves to data.uvh5: noise, with noise, after the gains.
-
-    By the radiometer equation noise of sigma on all baselines means autocorrelations of sigma sqrt(width x integration
-    x nights) before the gains, sky and receiver together, whose own noise has the same sigma. Effects that are no gains
-    leave them as they are.
-    """
+    """Write the autocorrelations after the gains to data.uvh5. Other effects leave them as they are."""
     import numpy as np
 
     from calstudy.base.gains import read_gains
     from calstudy.base.observation import Observation
     from calstudy.base.visibilities import from_cube
     from calstudy.corrupt.levels import Levels
+    from calstudy.corrupt.noise import autocorrelations as draw
     from calstudy.instrument.telescope import make_template
 
     settings = job.settings["instrument"]
     template = make_template(settings, autos=True)
     template.select(blt_inds=np.flatnonzero(template.ant_1_array == template.ant_2_array), run_check=False)
-    observation = Observation(template)
     sigma = Levels(**read_json(job.inputs["levels"] / LEVELS)).noise
     samples = settings.channels.width * settings.times.integration * job.settings["nights"]
-    # A list of seeds gives another stream than that of the noise of the baselines.
-    random = np.random.default_rng([job.settings["noise_seed"], AUTOS_SEED])
-    cube = sigma * (np.sqrt(samples) + random.standard_normal(observation.shape))
+    cube = draw(Observation(template).shape, sigma, samples, job.settings["noise_seed"])
     if "gains" in job.inputs:
         true = read_gains(job.inputs["gains"] / GAINS, "true gains")
         order = np.argsort(true.ant_array)

@@ -9,7 +9,12 @@ from plugin_files import make
 from scipy.constants import Boltzmann, speed_of_light
 from tiny import tiny
 
-from calstudy.base.visibilities import to_cube
+from calstudy.base.errors import ExperimentError
+from calstudy.base.gains import read_gains
+from calstudy.base.observation import Observation
+from calstudy.base.visibilities import antenna_pairs, to_cube
+from calstudy.calibrate.settings import AutoWeights
+from calstudy.calibrate.weights import make_weights
 from calstudy.corrupt.levels import Levels
 from calstudy.corrupt.noise import radiometer_std, thermal_noise
 from calstudy.corrupt.settings import CorruptionSettings
@@ -17,9 +22,11 @@ from calstudy.corrupt.temperature import SystemTemperature, effective_area
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import Variant
 from calstudy.instrument.beams import make_beam
+from calstudy.measured.noise import radiometer_variance
 from calstudy.power.settings import PowerSettings
 from calstudy.products import corruption
-from calstudy.products.files import read_visibilities
+from calstudy.products.calibration import calibration, with_autocorrelations
+from calstudy.products.files import read_json, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.validation.measurements.noise import noise_power
 
@@ -108,3 +115,46 @@ def test_the_theory_of_the_noise_power_takes_a_spectrum_of_noise():
     # The Blackman-Harris taper is 6e-5 at the ends of the band.
     rising = Levels(**levels, noise_std=2.0, noise_spectrum=edges)
     assert noise_power(instrument, power, rising) == pytest.approx(noise_power(instrument, power, flat), rel=1e-3)
+
+
+def test_autocorrelations_of_a_run_say_what_the_noise_of_its_baselines_is(tmp_path):
+    """The radiometer equation, from autocorrelations after the gains, gives the variance |g_a g_b|^2 sigma^2."""
+    noisy = Variant(components=("noise",), effects=True)
+    graph = Graph(validate(override(tiny(tmp_path), "calibration.weights", "autos"), tmp_path))
+    tasks = corruption.data(graph, noisy, "even"), corruption.autocorrelations(graph, noisy, "even")
+    levels, true = corruption.levels(graph), corruption.gains(graph)
+    products = make([*tasks, levels, true], tmp_path)
+    data, autos = (read_visibilities(products[task.key].path / "data.uvh5") for task in tasks)
+    joined = with_autocorrelations(data, autos)
+    pairs = antenna_pairs(data)
+    sigma = Levels(**read_json(products[levels.key].path / "levels.json")).noise_std
+    gains = read_gains(products[true.key].path / "gains.calh5", "test").gain_array[:, :, 0, 0]
+    expected = (sigma * np.abs(gains[pairs[:, 0]] * gains[pairs[:, 1]])) ** 2
+    found = radiometer_variance(joined, pairs, 0)
+    # Noise of 1 / sqrt(400 kHz x 10 s) = 0.05 % in each autocorrelation.
+    assert np.std(found / expected) == pytest.approx(np.sqrt(2 / 4e6), rel=0.1)
+    assert np.mean(found / expected) == pytest.approx(1, abs=1e-4)
+    # 1344 samples: their mean square is known to 1 / sqrt(1344) = 2.7 %.
+    ratio = np.abs(to_cube(joined)[:, : len(pairs), :, 0]) ** 2 / found
+    assert np.mean(ratio) == pytest.approx(1, abs=0.1)
+    weights = make_weights(Observation(joined), ~Observation(joined).autos, AutoWeights(kind="autos"))[..., 0]
+    product = weights * expected
+    assert np.std(product / product.mean()) < 1e-3
+
+
+def test_a_run_calibrates_with_weights_from_autocorrelations(tmp_path):
+    graph = Graph(validate(override(tiny(tmp_path), "calibration.weights", "autos"), tmp_path))
+    variant = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
+    task = calibration(graph, variant, "even")
+    product = make([task], tmp_path)[task.key]
+    assert read_json(product.path / "solution.json")["by_status"] == {"converged": 2}
+    residual = read_visibilities(product.path / "residual.uvh5")
+    assert residual.Nbls == graph.size.baselines
+    assert not residual.flag_array.any()
+
+
+def test_weights_from_autocorrelations_need_noise(tmp_path):
+    data = override(tiny(tmp_path), "calibration.weights", "autos")
+    data = override(data, "variants", {"eor": {"components": ["eor"]}})
+    with pytest.raises(ExperimentError, match=r"calibration\.weights: is 'autos', and without"):
+        validate(override(data, "corruption.noise", "none"), tmp_path)
