@@ -6,18 +6,40 @@ u is the change of ln|g|, that is, the relative change of the amplitude while it
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Annotated, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag
 
 from calstudy.base.schema import Section, choice
 from calstudy.base.units import Phase, Time
+from calstudy.corrupt.shapes import KINDS, Shape
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
 
 SECONDS_PER_DAY = 86400
+
+
+def _word_or_shape(value: Any) -> str | None:
+    if value in ("common", "independent"):
+        return "word"
+    return "shape" if isinstance(value, Mapping | Section) or value in KINDS else None
+
+
+Channels = Annotated[
+    Annotated[Literal["common", "independent"], Tag("word")] | Annotated[Shape, Tag("shape")],
+    Discriminator(
+        _word_or_shape,
+        custom_error_type="fault",
+        custom_error_message="{sentence}",
+        custom_error_context={
+            "path": "",
+            "sentence": f"must be common, independent, or a shape ({', '.join(KINDS)})",
+        },
+    ),
+]
 
 
 class _Drift(Section, ABC):
@@ -32,8 +54,11 @@ class _Drift(Section, ABC):
     phase: Phase = Field(
         0.01, ge=0, description="Of the change of their phase, see the kind; the default is a choice of this project."
     )
-    channels: Literal["common", "independent"] = Field(
-        "common", description="Whether all channels of an antenna change alike, or each by itself."
+    channels: Channels = Field(
+        "common",
+        description="Whether all channels of an antenna change alike, or each by itself; or the shape in frequency of "
+        "the change, of which every component is a process of its own: `amplitude` and `phase` are then in the mean "
+        "over the band.",
     )
     seed: int = Field(50, ge=0, description="Together with the seed of the effect.")
 
@@ -50,9 +75,16 @@ class _Drift(Section, ABC):
         # A list of seeds gives another stream than any single number does.
         random = np.random.default_rng([self.seed, effect_seed])
         seconds = (observation.times - observation.times[0]) * SECONDS_PER_DAY
-        n_channels = observation.n_channels if self.channels == "independent" else 1
-        shape = (2, observation.n_antennas, n_channels, observation.n_polarizations)
-        amplitude, phase = np.moveaxis(self.unit_process(shape, seconds, random), -1, -2)
+        if isinstance(self.channels, str):
+            n_processes = observation.n_channels if self.channels == "independent" else 1
+        else:
+            components = self.channels.components(observation.frequencies)
+            n_processes = components.shape[1]
+        shape = (2, observation.n_antennas, n_processes, observation.n_polarizations)
+        processes = self.unit_process(shape, seconds, random)
+        if not isinstance(self.channels, str):
+            processes = np.einsum("fc,xacpt->xafpt", components, processes, optimize=True)
+        amplitude, phase = np.moveaxis(processes, -1, -2)
         return np.exp(self.amplitude * amplitude + 1j * self.phase * phase)
 
     @abstractmethod
@@ -62,7 +94,7 @@ class _Drift(Section, ABC):
         Parameters
         ----------
         shape
-            Of the processes.
+            Of the processes: (2, Nants, Nfreqs or Ncomponents or 1, Npols).
         seconds
             Of each integration after the first, (Ntimes,).
         random
@@ -115,7 +147,10 @@ class Jumps(_Drift):
     def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return sums of the jumps so far: zero up to the first."""
         waits = np.diff(seconds, prepend=seconds[0]) / self.interval
-        counts = random.poisson(waits, (*shape[1:], len(seconds)))
+        _, n_antennas, n_processes, n_polarizations = shape
+        # The components of a shape jump together.
+        n_counts = n_processes if self.channels == "independent" else 1
+        counts = random.poisson(waits, (n_antennas, n_counts, n_polarizations, len(seconds)))
         # The sum of n normal jumps is normal with variance n.
         return np.cumsum(np.sqrt(counts) * random.standard_normal((*shape, len(seconds))), axis=-1)
 

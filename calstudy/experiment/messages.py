@@ -71,7 +71,8 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
     for step in location:
         models = [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
         if len(models) > 1:
-            members = [model for model in models if step in _tags(model)]
+            # A tag may also be that of a choice between choices.
+            members = [model for model in models if step in _tags(model)] or members
             continue
         holder = models[0] if models else None
         path.append(str(step))

@@ -58,13 +58,13 @@ def _kind(info: FieldInfo) -> str:
         elif get_origin(item) is tuple:
             choices = " \\| ".join(f"`{value}`" for value in get_args(get_args(item)[0]) if isinstance(value, str))
             words.append(f"list of {choices}" if choices else "list")
-        elif get_origin(item) is dict:
+        elif get_origin(item) is dict or _blocks(item):
             words.append("block")
         else:
             words.append(
                 {int: "whole number", float: "number", bool: "true or false", str: "text", Path: "path"}.get(item, "")
             )
-    return ", or ".join(word for word in words if word)
+    return ", or ".join(dict.fromkeys(word for word in words if word))
 
 
 def _default(info: FieldInfo) -> str:
@@ -84,7 +84,8 @@ def _default(info: FieldInfo) -> str:
 def _rows(model: type[BaseModel]) -> Iterator[str]:
     tag = model.registry.tag if issubclass(model, Plugin) else None
     for name, info in model.model_fields.items():
-        if name != tag and not _blocks(info.annotation):
+        words = any(get_origin(item) is Literal for item in _alternatives(info.annotation))
+        if name != tag and (words or not _blocks(info.annotation)):
             yield f"| `{name}` | {_kind(info)} | {_default(info)} | {info.description or ''} |"
 
 
@@ -112,7 +113,9 @@ def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[s
     elif len(blocks) == 1:
         yield from (f"## `{path}`", "")
         yield from _section(blocks[0], path, listed)
-    elif blocks:
+    # Several blocks of a choice may have the field.
+    elif blocks and path not in listed:
+        listed[path] = path
         yield from (f"## `{path}`: one of", "")
         for block in blocks:
             tag = next(key for key in ("kind", "name") if key in block.model_fields)

@@ -9,9 +9,12 @@ from plugin_files import make
 from pydantic import ValidationError
 from tiny import tiny
 
+from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal
+from calstudy.base.identity import identity
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices
+from calstudy.corrupt.drift import RandomWalk
 from calstudy.corrupt.effects.file_gains import FileGains
 from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
 from calstudy.corrupt.interface import Effect, apply_effect, draw_truth
@@ -67,6 +70,102 @@ def test_channels_drift_alike_unless_they_are_independent(observed):
     last = drifted(observed, kind="random-walk", channels="independent")[:, :, -1].real
     correlation = np.mean(last[:, 1:] * last[:, :-1]) / np.var(last)
     assert abs(correlation) < 5 / np.sqrt(last.size)
+
+
+@pytest.fixture(scope="module")
+def wideband() -> Observation:
+    """Thirty antennas, 64 channels of 480 kHz and ten integrations of 5 s, without data."""
+    instrument = small_instrument(
+        layout={"kind": "linear", "count": 30},
+        channels={"count": 64, "width": "480 kHz"},
+        times={"count": 10, "integration": f"{SECONDS} s"},
+        polarizations=["xx", "yy"],
+    )
+    return Observation(make_template(instrument))
+
+
+@pytest.mark.parametrize("channels", [{"kind": "polynomial", "order": 3}, {"kind": "delays", "max_delay": "200 ns"}])
+def test_a_drift_with_a_shape_has_its_rms_in_the_mean_over_the_band(wideband, channels):
+    change = drifted(wideband, kind="random-walk", amplitude=0.02, phase="0.04 rad", time="50 s", channels=channels)
+    assert change.shape == (30, 64, 10, 2)
+    assert change[:, :, 0] == pytest.approx(0, abs=1e-14)
+    for part, scale in ((change.real, 0.02), (change.imag, 0.04)):
+        growth = np.mean(part[:, :, 1:] ** 2, axis=(0, 1, 3)) / (scale**2 * np.arange(1, 10) * SECONDS / 50)
+        # 60 walks, each of four components at least: the variance is known to sqrt(2 / 240) = 9 %.
+        assert abs(growth - 1).max() < 0.4
+        assert np.mean(growth) == pytest.approx(1, abs=0.25)
+        steps = np.diff(part, axis=2)
+        for products in (steps[1:] * steps[:-1], steps[..., 0] * steps[..., 1]):
+            # Averages over 29 pairs, nine steps, and four components.
+            assert abs(np.mean(products)) < 5 * np.var(steps) / np.sqrt(29 * 9 * 4)
+    # The covariance of Legendre polynomials up to order 3 at both ends over their variance there is -1 / 4; that of
+    # delays is sinc(2 x 200 ns x 30.24 MHz) = 0.01.
+    expected = -0.25 if channels["kind"] == "polynomial" else 0.01
+    ends = np.moveaxis(np.diff(change, axis=2), 1, 0)[[0, -1]].reshape(2, -1)
+    assert np.corrcoef(ends.real)[0, 1] == pytest.approx(expected, abs=5 / np.sqrt(ends.shape[1]))
+
+
+def test_a_drift_with_a_shape_is_smooth_in_frequency(wideband):
+    shape = {"kind": "polynomial", "order": 2}
+    change = drifted(wideband, kind="random-walk", amplitude=0.02, channels=shape)[:, :, -1]
+    place = np.linspace(-1, 1, 64)
+    rows = np.moveaxis(change.real, 1, 0).reshape(64, -1)
+    fitted = np.polynomial.polynomial.polyfit(place, rows, 2)
+    assert np.polynomial.polynomial.polyval(place, fitted) == pytest.approx(rows.T, abs=1e-12)
+    change = drifted(wideband, kind="random-walk", amplitude=0.02, channels={"kind": "delays", "max_delay": "200 ns"})
+    # The window has side lobes of -150 dB and a main lobe of 6.5 / 30.72 MHz = 210 ns to either side.
+    spectrum = np.fft.fft(change[:, :, -1] * np.kaiser(64, 20)[:, None], axis=1)
+    power, delay = np.mean(abs(spectrum) ** 2, axis=(0, 2)), abs(np.fft.fftfreq(64, 480e3))
+    assert power[delay > 450e-9].max() < 1e-12 * power[delay < 150e-9].min()
+
+
+def test_a_drift_with_a_shape_of_one_component_is_that_of_all_channels(wideband):
+    for kind in ("random-walk", "sinusoid", "jumps"):
+        common = drifted(wideband, kind=kind)
+        assert drifted(wideband, kind=kind, channels={"kind": "polynomial", "order": 0}) == pytest.approx(
+            common, abs=1e-13
+        )
+
+
+def test_jumps_of_a_shape_come_at_the_same_times_in_all_channels(observed):
+    change = drifted(observed, kind="jumps", amplitude=0.05, phase="0.1 rad", interval="100 s", channels="delays")
+    steps = np.diff(change, axis=2)
+    moved = abs(steps) > 1e-12
+    assert (moved == moved[:, :1]).all()
+    expected = -np.expm1(-SECONDS / 100)
+    assert moved[:, 0].mean() == pytest.approx(expected, abs=5 * np.sqrt(expected / moved[:, 0].size))
+    crowd = SECONDS / 100 / expected
+    assert np.var(steps.real[moved]) == pytest.approx(0.05**2 * crowd, rel=0.4)
+
+
+def test_a_sinusoid_of_a_shape_is_one_in_every_channel(wideband):
+    change = drifted(wideband, kind="sinusoid", amplitude=0.03, period="40 s", channels={"kind": "delays"}).real
+    angle = 2 * np.pi * np.arange(10) * SECONDS / 40
+    waves = np.stack([np.sin(angle), np.cos(angle)])
+    rows = np.moveaxis(change, 2, -1).reshape(-1, 10)
+    fitted, misfit, *_ = np.linalg.lstsq(waves.T, rows.T, rcond=None)
+    # Times are Julian dates, which are good to 4e-5 s.
+    assert np.sqrt(misfit.max()) < 1e-3 * 0.03
+    assert np.mean(np.sum(fitted**2, axis=0)) == pytest.approx(0.03**2, rel=0.25)
+
+
+def test_words_for_channels_keep_their_keys_and_anything_else_is_refused_in_one_sentence(tmp_path):
+    def keyed(channels: object) -> object:
+        return identity(RandomWalk.model_validate({"kind": "random-walk", "channels": channels}))
+
+    assert keyed("common") == {"kind": "random-walk"}
+    assert keyed("independent") == {"kind": "random-walk", "channels": "independent"}
+    assert keyed("delays") == {"kind": "random-walk", "channels": {"kind": "delays"}}
+    effect = {"kind": "per-channel-gains", "drift": {"kind": "jumps", "channels": {"kind": "delays"}}}
+    data = override(tiny(tmp_path), "corruption.effects", [effect])
+    for channels, told in (
+        ("comon", "drift.channels: must be common, independent, or a shape (polynomial, delays)"),
+        ({"kind": "delays", "max_delay": "-1 ns"}, "drift.channels.max_delay = '-1 ns': must be greater than 0 s"),
+    ):
+        effect["drift"]["channels"] = channels
+        with pytest.raises(InputError) as caught:
+            validate(data, tmp_path)
+        assert str(caught.value) == f"corruption.effects.0.{told}"
 
 
 def test_a_sinusoid_has_its_amplitude_and_its_period(observed):
