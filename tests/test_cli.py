@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 from command_line import run_command
-from tiny import tiny
+from tiny import of_the_paper, tiny
 
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import FIGURES
@@ -78,10 +78,10 @@ def test_a_plan_with_every_figure_imports_no_library_that_only_stages_need(tmp_p
     drawn = [
         name
         for name in FIGURES.built_in()
-        if FIGURES.find(name).refusal(FIGURES.make(name), validate(tiny(tmp_path), tmp_path)) is None
+        if FIGURES.find(name).refusal(FIGURES.make(name), validate(of_the_paper(tmp_path), tmp_path)) is None
     ]
     assert len(drawn) >= 10
-    data = override(tiny(tmp_path), "outputs.figures", drawn)
+    data = override(of_the_paper(tmp_path), "outputs.figures", drawn)
     # With fewer channels than sequences are asked for, the foreground basis is made to see that it leaves any free.
     data = override(data, "instrument.channels.count", 64)
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(data))
@@ -197,7 +197,7 @@ def test_a_plan_of_a_sweep_counts_what_its_points_share_once(tmp_path):
 
 
 def test_a_plan_of_a_collection_counts_what_its_members_share_once(tmp_path):
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "papers": ["calamity2022"]}))
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(of_the_paper(tmp_path)))
     members = ["tiny.yaml", {"file": "tiny.yaml", "name": "louder", "overrides": {"corruption.noise.factor": 5}}]
     (tmp_path / "both.yaml").write_text(yaml.safe_dump({"name": "both", "experiments": members}))
     result = calstudy("plan", "both.yaml", cwd=tmp_path)

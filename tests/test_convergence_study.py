@@ -29,7 +29,8 @@ STUDY = {
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("convergence")
-    data = {**tiny(folder), "variants": VARIANTS}
+    # Weights that stay as they are, so that losses of all steps compare.
+    data = override({**tiny(folder), "variants": VARIANTS}, "calibration.weights", "flags")
     data = override(data, "outputs.figures", ["convergence", "expected-loss"])
     data = override(data, "outputs.convergence", STUDY)
     return run_study(ExperimentStudy(validate(data, folder)), Budget(workers=1)).folder / "figures"

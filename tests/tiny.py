@@ -24,3 +24,9 @@ TINY: dict[str, Any] = {
 def tiny(folder: Path) -> dict[str, Any]:
     """Return the tiny experiment with its store and runs in `folder`."""
     return {**TINY, "outputs": {"store": str(folder / "store"), "runs": str(folder / "runs")}}
+
+
+def of_the_paper(folder: Path) -> dict[str, Any]:
+    """Return the tiny experiment with the weights of Ewall-Wice et al. (2022), compared with what they say."""
+    calibration = {**TINY["calibration"], "weights": "flags"}
+    return {**tiny(folder), "calibration": calibration, "papers": ["calamity2022"]}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.constants import speed_of_light
-from test_calamity import SETTINGS, make_uvdata
+from test_calamity import ONE_SOLVE, make_uvdata
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
 from calstudy.base.errors import InputError
@@ -28,7 +28,7 @@ ANTENNAS = 10
 CABLES = 500e-9
 TURNS = 2j * np.pi * (FREQUENCIES - FREQUENCIES.mean())
 START, PER_CHANNEL = DelayStart(kind="delays"), DelayStart(kind="delays", per_channel=True)
-WITH_DELAYS = SETTINGS.model_copy(update={"initial_gains": START})
+WITH_DELAYS = ONE_SOLVE.model_copy(update={"initial_gains": START})
 
 
 @pytest.fixture(scope="module")
@@ -252,8 +252,8 @@ def test_long_cables_are_as_easy_as_none_from_there_and_out_of_reach_from_unity(
     data = make_uvdata(toy, 1)
     sky = from_cube(data, toy.foregrounds[None, :, :, None]) if with_sky else None
     truth = make_uvcal(data, toy.gains[:, :, None, None])
-    floor = run_calibrator(SETTINGS, data, sky, truth).solutions[0]
-    found, unity = (run_calibrator(settings, data, sky).solutions[0] for settings in (WITH_DELAYS, SETTINGS))
+    floor = run_calibrator(ONE_SOLVE, data, sky, truth).solutions[0]
+    found, unity = (run_calibrator(settings, data, sky).solutions[0] for settings in (WITH_DELAYS, ONE_SOLVE))
     assert found.status == "converged"
     assert found.loss_history[-1] < 1.01 * floor.loss_history[-1]
     assert unity.loss_history[-1] > 1.2 * floor.loss_history[-1]
@@ -284,7 +284,7 @@ def test_gain_errors_of_order_one_are_within_reach_with_gains_per_channel():
     data = make_uvdata(toy, 1)
     wrong = toy.foregrounds + 0.25 * make_toy(toy.positions, seed=33).foregrounds
     sky = from_cube(data, wrong[None, :, :, None])
-    closer = SETTINGS.model_copy(update={"solver": GaussNewtonSettings(tolerance=1e-4)})
+    closer = ONE_SOLVE.model_copy(update={"solver": GaussNewtonSettings(tolerance=1e-4)})
     floor = run_calibrator(closer, data, sky, make_uvcal(data, toy.gains[:, :, None, None])).solutions[0]
     found = run_calibrator(closer.model_copy(update={"initial_gains": PER_CHANNEL}), data, sky).solutions[0]
     assert found.status == "converged"
@@ -296,7 +296,7 @@ def test_gain_errors_of_order_one_are_within_reach_with_gains_per_channel():
 def test_gains_that_are_noise_in_frequency_are_fitted_as_from_unity(toy, with_sky):
     data = make_uvdata(toy, 1)
     sky = from_cube(data, toy.foregrounds[None, :, :, None]) if with_sky else None
-    found, unity = (run_calibrator(settings, data, sky).solutions[0] for settings in (WITH_DELAYS, SETTINGS))
+    found, unity = (run_calibrator(settings, data, sky).solutions[0] for settings in (WITH_DELAYS, ONE_SOLVE))
     assert found.status == unity.status == "converged"
     assert found.loss_history[-1] < 1.01 * unity.loss_history[-1]
 
@@ -324,7 +324,7 @@ def test_what_cannot_work_is_refused_in_a_sentence(cables):
 
 
 def test_an_experiment_says_so_by_name(cables):
-    settings = type(SETTINGS).model_validate({"initial_gains": "delays"})
+    settings = type(ONE_SOLVE).model_validate({"initial_gains": "delays"})
     toy, delays = cables
     prepared = prepare(Observation(make_uvdata(toy, 2)), settings, Assumed())
     assert prepared.start.shape == (ANTENNAS, FREQUENCIES.size, 2, 1)

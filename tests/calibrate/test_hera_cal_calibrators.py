@@ -19,6 +19,7 @@ from calstudy.calibrate.calibrators.sky_based import SkyBased
 from calstudy.calibrate.calibrators.skycal import Skycal
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.settings import FlagWeights
 
 LARGE_HEX = 14.0 * np.array(
     [[x + y / 2, y * np.sqrt(0.75), 0] for y in range(-2, 3) for x in range(-2, 3) if abs(x + y) < 3]
@@ -135,7 +136,11 @@ def test_skycal_is_sky_based_calibration_of_several_integrations(toy):
 
 
 def test_logcal_pulls_weak_antennas_up_and_omnical_does_not():
-    """E ln |V + n| > ln |V|, more so where V is small: the amplitudes of weak antennas come out too large."""
+    """E ln |V + n| > ln |V|, more so where V is small: the amplitudes of weak antennas come out too large.
+
+    So it is for noise that is the same on all baselines, whose inverse variances are equal weights. Of noise that is
+    received with the sky weak antennas have no more than others.
+    """
     toy = make_toy(LARGE_HEX, noise=0.0)
     weak = np.arange(len(LARGE_HEX)) % 2 == 1
     toy = replace(toy, gains=np.where(weak, 0.5, 1.0)[:, None] * np.exp(1j * np.angle(toy.gains)))
@@ -145,7 +150,7 @@ def test_logcal_pulls_weak_antennas_up_and_omnical_does_not():
     uvd = from_cube(uvd, cube)
     ratios, scatter = {}, {}
     for steps in (("logcal", "abscal"), ("logcal", "omnical", "abscal")):
-        result = run_calibrator(Redcal(steps=steps), uvd, sky_of(uvd, toy.foregrounds))
+        result = run_calibrator(Redcal(steps=steps, weights=FlagWeights()), uvd, sky_of(uvd, toy.foregrounds))
         rows = np.isin(result.gains.ant_array, 10 + 2 * np.arange(len(weak)))
         amplitude = np.abs(result.gains.gain_array[rows, :, :, 0])
         ratio = amplitude[weak].mean(axis=0) / amplitude[~weak].mean(axis=0)
@@ -167,7 +172,8 @@ def test_cells_with_the_same_weights_are_solved_together(monkeypatch):
     monkeypatch.setattr(RedundantCalibrator, "logcal", lambda *args, **more: (calls.append(1), true(*args, **more))[1])
     for cells in (redcal.CELLS_OF_A_SET, 10**9):
         monkeypatch.setattr(redcal, "CELLS_OF_A_SET", cells)
-        result = run_calibrator(Redcal(steps=("firstcal", "logcal")), uvd, sky_of(uvd, toy.foregrounds))
+        calibrator = Redcal(steps=("firstcal", "logcal"), weights=FlagWeights())
+        result = run_calibrator(calibrator, uvd, sky_of(uvd, toy.foregrounds))
         found[cells] = result.gains.gain_array
     assert len(calls) == 4 + 1
     together, apart = found.values()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_calamity import SETTINGS, make_uvdata
+from test_calamity import ONE_SOLVE, make_uvdata
 from toy import FREQUENCIES, HEX, make_toy, scattered
 
 from calstudy.base.errors import InputError
@@ -32,7 +32,7 @@ def start_of(toy, delays, change=None):
     data = make_uvdata(toy, 1)
     if change is not None:
         change(data)
-    settings = SETTINGS.model_copy(update={"initial_gains": RedundantStart(kind="redundant", delays=delays)})
+    settings = ONE_SOLVE.model_copy(update={"initial_gains": RedundantStart(kind="redundant", delays=delays)})
     return data, settings, prepare(Observation(data), settings).start[..., 0, 0]
 
 
@@ -49,7 +49,7 @@ def test_gains_are_right_up_to_what_redundancy_cannot_know(hexagon):
 
 def test_long_cables_are_within_reach_of_the_fit_from_there_but_not_from_unity(hexagon):
     data, settings, _ = start_of(hexagon, delays=True)
-    near, far = run_calibrator(settings, data).solutions[0], run_calibrator(SETTINGS, data).solutions[0]
+    near, far = run_calibrator(settings, data).solutions[0], run_calibrator(ONE_SOLVE, data).solutions[0]
     # Without noise the minimum is zero, which single precision does not reach.
     assert near.status in ("converged", "stalled")
     assert near.loss_history[0] < 0.1 * far.loss_history[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pyuvdata import UVFlag
-from test_calamity import SETTINGS, make_uvdata
+from test_calamity import ONE_SOLVE, SETTINGS, make_uvdata
 from toy import make_toy, scattered
 
 from calstudy.base.errors import InputError
@@ -32,7 +32,7 @@ def result(toy):
 def test_flag_weights_are_the_papers(toy):
     data = make_uvdata(toy, 2)
     data.flag_array[3, :9] = True
-    weights = make_weights(Observation(data), everything(data), SETTINGS.weights)
+    weights = make_weights(Observation(data), everything(data), FlagWeights())
     assert np.allclose(weights[weights > 0], 1 / (28 * 64), rtol=1e-12)
     assert (weights == 0).sum() == 9
 
@@ -167,10 +167,12 @@ def test_mostly_flagged_integrations_are_skipped_where_asked(toy):
     assert first.message == "71 % of the samples are flagged, which skip_flagged excludes"
 
 
-def test_starting_at_the_solution_takes_fewer_steps(toy, result, tmp_path):
+def test_starting_at_the_solution_takes_fewer_steps(toy, tmp_path):
+    data = make_uvdata(toy, 2)
+    result = run_calibrator(ONE_SOLVE, data)
     result.gains.write_calh5(str(tmp_path / "g.calh5"))
-    settings = SETTINGS.model_copy(update={"initial_gains": FileStart(kind="file", path=tmp_path / "g.calh5")})
-    again = run_calibrator(settings, make_uvdata(toy, 2))
+    settings = ONE_SOLVE.model_copy(update={"initial_gains": FileStart(kind="file", path=tmp_path / "g.calh5")})
+    again = run_calibrator(settings, data)
     assert again.solutions[0].n_steps < result.solutions[0].n_steps
     assert again.solutions[0].loss_history[0] < 1.01 * result.solutions[0].loss_history[-1]
 

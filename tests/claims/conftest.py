@@ -194,7 +194,9 @@ def make_study(tmp_path) -> Callable[..., RunResults]:
         }
         agreement = {"measurements": measurements, "redundant_fraction": world.redundant_fraction}
         Path(folder / "agreement.json").write_text(json.dumps(agreement))
-        experiment = validate({"name": name, "papers": ["calamity2022"], **world.facts}, tmp_path)
+        calibration = {"weights": "flags", **world.facts.get("calibration", {})}
+        data = {"name": name, "papers": ["calamity2022"], **world.facts, "calibration": calibration}
+        experiment = validate(data, tmp_path)
         return RunResults(experiment, (folder,))
 
     return make

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import tiny
+from tiny import of_the_paper
 
 from calstudy.base.errors import InputError
 from calstudy.claims.bins import RecoveredPower, bias_extent, difference_of_ratios, fraction_within, recovered
@@ -313,6 +313,7 @@ def changed(experiment: dict, changes: dict) -> dict:
         ({"calibration.gain_delay": "400 ns"}, "calibration.gain_delay is 4e-07 s"),
         ({"calibration.basis": {"buffer": "200 ns"}}, "calibration.basis.buffer is 2e-07 s"),
         ({"calibration.prior": "none"}, "calibration.prior is none"),
+        ({"calibration.weights": "gains"}, "calibration.weights is 'gains', not the paper's 'flags'"),
         ({"calibration.integrations_per_solve": 2}, "calibration.integrations_per_solve is 2"),
         ({"calibration.solver": {"name": "adamax", "max_steps": 1}}, "calibration.solver.max_steps is 1"),
         (
@@ -345,7 +346,7 @@ def changed(experiment: dict, changes: dict) -> dict:
 )
 @pytest.mark.parametrize("role", ["minimally_redundant", "redundant", "paper_solver", "redundant_paper_solver"])
 def test_what_is_not_the_papers_study_plays_no_role_of_it(tmp_path, changes, reason, role):
-    data = changed({"name": "changed", "outputs": {"figures": []}}, changes)
+    data = changed({"name": "changed", "outputs": {"figures": []}, "calibration": {"weights": "flags"}}, changes)
     assert PAPER.refusal(role, validate(data, tmp_path)).startswith(reason)
 
 
@@ -385,7 +386,8 @@ def test_what_is_not_the_papers_study_plays_no_role_of_it(tmp_path, changes, rea
 )
 def test_a_role_needs_the_settings_that_its_sentences_are_about(tmp_path, role, changes, reason):
     facts = LOW_SNR_FACTS if role == "low_snr" else {}
-    data = changed({"name": "changed", "outputs": {"figures": []}, **facts}, changes)
+    base = {"name": "changed", "outputs": {"figures": []}, "calibration": {"weights": "flags"}}
+    data = changed({**base, **facts}, changes)
     assert PAPER.refusal(role, validate(data, tmp_path)).startswith(reason)
 
 
@@ -415,7 +417,7 @@ def test_a_published_experiment_plays_its_role_at_every_scale(name, scale):
 
 
 def test_the_experiment_of_other_tests_differs_from_the_paper_in_scale_alone(tmp_path):
-    assert PAPER.refusal("redundant", validate(tiny(tmp_path), tmp_path)) is None
+    assert PAPER.refusal("redundant", validate(of_the_paper(tmp_path), tmp_path)) is None
 
 
 def test_a_run_without_a_role_has_no_claims_and_says_why_in_a_sentence(make_study):

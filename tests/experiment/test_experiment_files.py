@@ -136,7 +136,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ),
         (
             "{name: a, calibration: {calibrator: sky-based, basis: {buffer: 10 ns}}}",
-            "calibration.basis: unknown key (allowed: assumed, autos, calibrator,",
+            "calibration.basis: unknown key, did you mean 'baselines'? (allowed: assumed, autos, baselines,",
         ),
     ],
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
-from tiny import tiny
+from tiny import of_the_paper
 from typer.testing import CliRunner
 
 from calstudy.base.errors import InputError
@@ -44,8 +44,7 @@ def places(folder) -> list[str]:
 def finished(folder) -> Path:
     """The folder of a finished run of the tiny experiment."""
     path = folder / "tiny.yaml"
-    data = {**tiny(folder), "papers": ["calamity2022"]}
-    path.write_text(yaml.safe_dump(override(data, "outputs.figures", FIGURES)))
+    path.write_text(yaml.safe_dump(override(of_the_paper(folder), "outputs.figures", FIGURES)))
     return run_study(load_study(path), Budget(workers=1)).folder
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
-from tiny import tiny
+from tiny import of_the_paper
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.files import sha256
@@ -47,7 +47,7 @@ PAIR = {
 
 def write(folder: Path, **changes) -> Path:
     """Write a collection of two hexagons with different gains, and, for other collections, one with reflections."""
-    hexagon = {**override(tiny(folder), "outputs.figures", ["gains"]), "name": "hexagon", "papers": ["calamity2022"]}
+    hexagon = {**override(of_the_paper(folder), "outputs.figures", ["gains"]), "name": "hexagon"}
     reflecting = override({**hexagon, "name": "lowsnr"}, "corruption.effects", ["reflection-gains"])
     for name, data in (("hex", hexagon), ("reflections", reflecting)):
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(data))
@@ -130,7 +130,7 @@ def test_a_second_run_makes_nothing_and_a_member_alone_has_everything(finished, 
     again = run_study(collection, Budget(1), Console(file=io.StringIO()))
     assert again.made.tasks == ()
     assert all(run.made.tasks == () for run in again.parts.values())
-    store = Path(tiny(folder)["outputs"]["store"])
+    store = Path(of_the_paper(folder)["outputs"]["store"])
     alone = ExperimentStudy(collection.members["redundant"])
     assert all((store / task.stage.name / task.key).exists() for task in alone.targets)
     assert alone.folder == finished.parts["redundant"].folder

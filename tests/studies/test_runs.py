@@ -15,7 +15,7 @@ import yaml
 from fault_runs import differences
 from pyuvdata import UVCal, UVData
 from rich.console import Console
-from tiny import tiny as without_papers
+from tiny import of_the_paper
 
 from calstudy.base.errors import InputError
 from calstudy.experiment.files import load, override, validate
@@ -25,11 +25,6 @@ from calstudy.power.tables import load_spectrum
 from calstudy.run.store import Store
 from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.study import Budget, Run, run_study
-
-
-def tiny(folder: Path) -> dict:
-    """Return the tiny study, compared with the paper."""
-    return {**without_papers(folder), "papers": ["calamity2022"]}
 
 
 def run_here(data: dict, folder: Path) -> tuple[Run, str]:
@@ -47,7 +42,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(folder) -> Run:
-    return run_here(tiny(folder), folder)[0]
+    return run_here(of_the_paper(folder), folder)[0]
 
 
 def arrays(result: Run, figure: str) -> dict[str, np.ndarray]:
@@ -56,7 +51,7 @@ def arrays(result: Run, figure: str) -> dict[str, np.ndarray]:
 
 
 def load_tiny(result: Run) -> Experiment:
-    return validate(tiny(result.folder.parents[1]), result.folder)
+    return validate(of_the_paper(result.folder.parents[1]), result.folder)
 
 
 def product_of(result: Run, stage: str, label: str) -> Path:
@@ -119,7 +114,7 @@ def test_spectra_have_errors_of_noise_and_sample_variance(finished):
 
 
 def test_a_second_run_makes_nothing(finished, folder):
-    result, _ = run_here(tiny(folder), folder)
+    result, _ = run_here(of_the_paper(folder), folder)
     assert result.made.tasks == ()
     assert result.folder == finished.folder
     manifest = json.loads((finished.folder / "manifest.json").read_text())
@@ -132,9 +127,9 @@ def test_a_complete_store_is_only_read(finished, folder, monkeypatch):
 
     for name in ("prepare", "lock", "building", "seal"):
         monkeypatch.setattr(Store, name, written)
-    store = Path(tiny(folder)["outputs"]["store"])
+    store = Path(of_the_paper(folder)["outputs"]["store"])
     before = sorted(store.rglob("*"))
-    result, _ = run_here(tiny(folder), folder)
+    result, _ = run_here(of_the_paper(folder), folder)
     assert sorted(store.rglob("*")) == before
     assert result.made.tasks == ()
     temporary = {task.key for task in finished.tasks if task.temporary}
@@ -142,7 +137,7 @@ def test_a_complete_store_is_only_read(finished, folder, monkeypatch):
 
 
 def test_a_changed_field_makes_only_what_reads_it_in_another_run_folder(finished, folder):
-    result, _ = run_here(override(tiny(folder), "power.bins.width", "0.2 h/Mpc"), folder)
+    result, _ = run_here(override(of_the_paper(folder), "power.bins.width", "0.2 h/Mpc"), folder)
     assert stages_made(result) == {"spectra", "figure", "claims", "transfer", "score"}
     figures = {task.label for task in result.made.tasks if task.stage.name == "figure"}
     assert figures == {"wedge", "spherical", "signal-loss"}
@@ -160,7 +155,7 @@ def test_a_damaged_product_is_told_and_rebuilt_to_the_same_figures(finished, fol
         content = bytearray(path.read_bytes())
         content[len(content) // 2] ^= 1
         path.write_bytes(content)
-    result, text = run_here(tiny(folder), folder)
+    result, text = run_here(of_the_paper(folder), folder)
     assert "damaged" in text
     assert stages_made(result) == {"power", "spectra", "figure"}
     # From the same calibration, so that nothing but the rounding of sums may differ.
@@ -171,7 +166,7 @@ def test_a_run_folder_with_a_strangers_file_is_refused(finished, folder):
     stranger = finished.folder / "thesis.tex"
     stranger.write_text("mine")
     with pytest.raises(InputError, match=r"thesis\.tex"):
-        run_here(tiny(folder), folder)
+        run_here(of_the_paper(folder), folder)
     assert stranger.read_text() == "mine"
     stranger.unlink()
 
@@ -182,7 +177,7 @@ def command(path: Path, *options: str) -> list[str]:
 
 def test_a_killed_run_resumes_and_ends_as_if_it_had_not_been(finished, tmp_path):
     path = tmp_path / "tiny.yaml"
-    path.write_text(yaml.safe_dump(tiny(tmp_path)))
+    path.write_text(yaml.safe_dump(of_the_paper(tmp_path)))
     process = subprocess.Popen(
         command(path, "--workers", "1"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
@@ -193,7 +188,7 @@ def test_a_killed_run_resumes_and_ends_as_if_it_had_not_been(finished, tmp_path)
     process.wait()
     survivors = {product.name for product in (tmp_path / "store" / "simulate-chunk").glob("[0-9a-f]*")}
     assert survivors
-    result, _ = run_here(tiny(tmp_path), tmp_path)
+    result, _ = run_here(of_the_paper(tmp_path), tmp_path)
     assert not survivors & {task.key for task in result.made.tasks}
     expected, found = arrays(finished, "spherical"), arrays(result, "spherical")
     for key in expected:
@@ -203,7 +198,7 @@ def test_a_killed_run_resumes_and_ends_as_if_it_had_not_been(finished, tmp_path)
 
 
 def test_temporary_products_are_dropped_once_used(finished, folder):
-    store = Path(tiny(folder)["outputs"]["store"])
+    store = Path(of_the_paper(folder)["outputs"]["store"])
     temporary = [task for task in finished.tasks if task.temporary]
     assert temporary
     assert not any((store / task.stage.name / task.key).exists() for task in temporary)
