@@ -180,10 +180,11 @@ def _solve_in_passes(
             break
         before, weighted = weighted.weights, problem.weighted_by(solution.gains)
         change = weight_change(weighted.weights, before)
-        if change < settings.tolerance:
+        # Weights of gains that are far from the solution lead away from it.
+        if change < settings.tolerance or solution.status == "max-steps":
             break
     solution = _together(solutions)
-    if settings.passes > 1 and change >= settings.tolerance and solution.status == "converged":
+    if settings.unsettled(change) and solution.status == "converged":
         message = f"weights from the gains still changed by {change:.1e} in pass {len(solutions)}"
         solution = replace(solution, status="max-steps", message=message)
     return solution, warm, {"passes": len(solutions), "weight_change": change}

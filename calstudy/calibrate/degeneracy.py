@@ -70,7 +70,7 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
         if not slope > 0:
             raise ValueError("prior sky-model: the calibrated data are not correlated with the sky model")
         return 1 / slope
-    total, target = complex(np.sum(problem.weights * model)), problem.prior_target
+    total, target = complex(np.sum(problem.summing * model)), problem.prior_target
     if problem.prior == "sum":
         scale = (total.conjugate() * target).real / abs(total) ** 2 if total else 0.0
     else:
@@ -105,8 +105,8 @@ def sky_model_slope(gains: np.ndarray, problem: CalibrationProblem) -> tuple[flo
     """
     sky_model: Any = problem.sky_model
     calibrated = problem.visibilities / gain_products(gains, problem.structure.antennas)
-    overlap = np.sum(problem.weights * (sky_model.conj() * calibrated).real, axis=0)
-    power = np.sum(problem.weights * np.abs(sky_model) ** 2, axis=0)
+    overlap = np.sum(problem.summing * (sky_model.conj() * calibrated).real, axis=0)
+    power = np.sum(problem.summing * np.abs(sky_model) ** 2, axis=0)
     slope = float(overlap.sum() / power.sum()) if power.any() else 0.0
     return slope, np.divide(overlap, slope * power, out=np.full(power.shape, np.nan), where=slope * power != 0)
 

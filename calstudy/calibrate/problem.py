@@ -143,6 +143,8 @@ class CalibrationProblem:
         Standard deviation per channel, in the unit of the data, of what the foregrounds' prior allows beside the sky
         model: on each baseline by itself, and in common to those that share a model. Both count only where the
         structure says so. The weights must be inverse variances then.
+    scale_weights
+        Weights of the sums that fix the overall scale, like `weights`; None for those. They do not follow the gains.
 
     Raises
     ------
@@ -159,6 +161,7 @@ class CalibrationProblem:
     prior: Prior = "sum"
     frozen: bool = False
     deviations: tuple[float, float] = (math.inf, math.inf)
+    scale_weights: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self._check_shapes()
@@ -217,7 +220,13 @@ class CalibrationProblem:
         gains
             Complex, (Nants, Nfreqs).
         """
-        return replace(self, weights=gain_weights(self.weights, gain_products(gains, self.structure.antennas)))
+        weights = gain_weights(self.weights, gain_products(gains, self.structure.antennas))
+        return replace(self, weights=weights, scale_weights=self.summing)
+
+    @property
+    def summing(self) -> np.ndarray:
+        """The weights of the sums that fix the overall scale, (Nbls, Nfreqs)."""
+        return self.weights if self.scale_weights is None else self.scale_weights
 
     @property
     def antenna_weights(self) -> np.ndarray:
@@ -233,7 +242,7 @@ class CalibrationProblem:
         sky_model = self.sky_model
         if sky_model is None:
             sky_model = self.visibilities / gain_products(self.initial_gains, self.structure.antennas)
-        return complex(np.sum(self.weights * sky_model))
+        return complex(np.sum(self.summing * sky_model))
 
 
 def fitted_baselines(frame: Frame, autos: bool) -> np.ndarray:

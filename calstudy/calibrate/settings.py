@@ -104,11 +104,15 @@ Solver = Annotated[
 ]
 
 
+UNSETTLED = 10.0
+"""Weights from gains that still change by more than this times the tolerance after the last pass make no result."""
+
+
 class GainWeights(Section):
     """Inverse variance of noise that is received with the sky: 1 / |g_a g_b|^2 of the gains that the fit finds itself.
 
     The first pass has the weights of the gains that it starts from; each other pass those of the gains of the pass
-    before.
+    before. After a pass that ends at the largest number of steps there is no other.
     """
 
     kind: Literal["gains"] = "gains"
@@ -122,8 +126,13 @@ class GainWeights(Section):
         gt=0,
         lt=1,
         description="The last pass is the one whose gains change weights by less: relative, rms of neighbouring "
-        "channels against each other.",
+        "channels against each other. A fit whose weights change by ten times as much in its last pass has not "
+        "converged.",
     )
+
+    def unsettled(self, change: float) -> bool:
+        """Whether weights that changed by so much in the last pass are not those of the result."""
+        return self.passes > 1 and change > UNSETTLED * self.tolerance
 
 
 class FlagWeights(Section):

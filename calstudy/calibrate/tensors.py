@@ -130,6 +130,10 @@ class FitTensors:
         scale = float(np.sqrt(np.sum(weights * np.abs(visibilities) ** 2) / np.sum(weights)))
         return SortedData(pairs.to_pair(visibilities / scale, dtype), tf.constant(weights, dtype), scale)
 
+    def ordered(self, weights: np.ndarray) -> tf.Tensor:
+        """Return weights of the problem's baselines, (Nbls, Nfreqs), in the solvers' order, in double precision."""
+        return tf.constant(weights[self._order], tf.float64)
+
     def load_model(self, model: np.ndarray, scale: float, dtype: tf.DType) -> tf.Tensor:
         """Return a model as a tensor in the solvers' order and orientation, (2, Nbls, Nfreqs); the inverse of `unload`.
 

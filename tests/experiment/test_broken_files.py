@@ -162,7 +162,7 @@ COMMANDS = [
     (["calibrate", "nowhere.uvh5"], "nowhere.uvh5: no such file or folder"),
     (["calibrate", "list.yaml"], "list.yaml: cannot be read as visibilities"),
     (["calibrate", "x", "--redundant", "--gains-only"], "--redundant and --gains-only: choose one"),
-    (["calibrate", "x", "--weights", "banana"], "--weights banana: neither gains, flags, nsamples or autos"),
+    (["calibrate", "x", "--weights", "banana"], "--weights banana: neither gains, flags, nsamples or autos, nor"),
     (["calibrate", "x", "--select", "banana=3"], "--select banana=3: write one of"),
     (["calibrate", "x", "--select", "times=3"], "write a range such as times=0..9"),
     (["calibrate", "x", "--select", "times=a..b"], "not a whole number"),

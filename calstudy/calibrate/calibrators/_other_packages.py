@@ -164,14 +164,14 @@ class OtherPackage(WeightedFit):
                 break
             gains, outcomes = self.solve(measured, groups, gains)
             passes += 1
-        settled = [settings.passes == 1 or found < settings.tolerance for found in changes]
-        return gains, [_in_passes(*ended, passes) for ended in zip(outcomes, changes, settled, strict=True)]
+        unsettled = [settings.unsettled(found) for found in changes]
+        return gains, [_in_passes(*ended, passes) for ended in zip(outcomes, changes, unsettled, strict=True)]
 
 
-def _in_passes(outcome: Outcome, change: float, settled: bool, passes: int) -> Outcome:
+def _in_passes(outcome: Outcome, change: float, unsettled: bool, passes: int) -> Outcome:
     """Return an outcome with the number of passes and the last change of the weights."""
     diagnostics = {**outcome.diagnostics, "passes": passes, "weight_change": change}
-    if settled or outcome.status != "converged":
+    if not unsettled or outcome.status != "converged":
         return replace(outcome, diagnostics=diagnostics)
     message = f"weights from the gains still changed by {change:.1e} in pass {passes}"
     return replace(outcome, status="max-steps", message=message, diagnostics=diagnostics)

@@ -148,7 +148,7 @@ class JointKernels:
             coefficients = self.loss.coefficients(self.tensors.of_models(tf.concat(best, axis=1)))
         target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
         visibilities, weights = (tf.cast(part, self.dtype) for part in (exact.visibilities, exact.weights))
-        summed = () if problem.frozen else self.loss.summed(exact.weights)
+        summed = () if problem.frozen else self.loss.summed(self.tensors.ordered(problem.summing))
         data = FitData(visibilities, weights, pairs.to_pair(target, self.dtype), summed, model)
         return Parameters(self.space.reduce(tf.cast(start, self.dtype)), coefficients), data, exact.scale
 
