@@ -48,7 +48,7 @@ def draw_variants(
     """Draw a panel for each kind of world and band of k: calibrators from top to bottom, the bias from left to right.
 
     Colours are variants of calibrators, symbols those of worlds. Open symbols are 95 % upper limits of a bias that is
-    within two standard deviations of zero.
+    within two standard deviations of zero; crosses are cases of which most solves stalled or failed.
 
     Parameters
     ----------
@@ -84,9 +84,10 @@ def draw_variants(
     handles += [
         Line2D([], [], color=style.GREY, marker=marker, linestyle="", label=name) for name, marker in markers.items()
     ]
-    handles.append(
-        Line2D([], [], color=style.GREY, marker="o", markerfacecolor="white", linestyle="", label="95 % upper limit")
-    )
+    handles += [
+        Line2D([], [], color=style.GREY, marker="o", markerfacecolor="white", linestyle="", label="95 % upper limit"),
+        Line2D([], [], color=style.GREY, marker="x", linestyle="", label="stalled"),
+    ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     style.note_stand_ins(figure, stand_ins)
     return figure
@@ -94,6 +95,12 @@ def draw_variants(
 
 def _drawn(labels: Mapping[str, str], worlds: Sequence[Mapping[str, Case]]) -> bool:
     return any(label in world for label in labels.values() for world in worlds)
+
+
+def _stalled(case: Case) -> bool:
+    """Whether most solves of a case stalled or failed."""
+    counts = case.summary["by_status"]
+    return 2 * (counts.get("stalled", 0) + counts.get("failed", 0)) > sum(counts.values())
 
 
 def _draw_panel(
@@ -115,7 +122,8 @@ def _draw_panel(
                 axes.plot(
                     upper_limit(bias, error) if limited else abs(bias),
                     row + SPREAD * ((place * len(kinds) + number + 0.5) / count - 0.5),
-                    marker=marker,
+                    marker="x" if _stalled(cases[label]) else marker,
+                    linestyle="",
                     color=colours[variant],
                     markerfacecolor="white" if limited else colours[variant],
                 )
@@ -133,7 +141,8 @@ class ComparisonVariants(CasesFigure):
 
     caption = (
         "Bias of every calibrator, by its variants (colours) and those of the worlds (symbols), next to the wedge and "
-        "beyond. The dashed line is the EoR; open symbols are 95 % upper limits."
+        "beyond. The dashed line is the EoR; open symbols are 95 % upper limits, crosses "
+        "cases of which most solves stalled."
     )
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
