@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -139,6 +139,7 @@ def _draw_panel(
 class ComparisonVariants(CasesFigure):
     """Bias of calibrators in variants and in variants of worlds: of labels such as ``sky-based, autos``."""
 
+    version: ClassVar[int] = 2
     caption = (
         "Bias of every calibrator, by its variants (colours) and those of the worlds (symbols), next to the wedge and "
         "beyond. The dashed line is the EoR; open symbols are 95 % upper limits, crosses "
