@@ -1,14 +1,21 @@
-"""What papers ask of the runs that play their roles: the calibrator, what it is told, and what is true."""
+"""What papers ask of the runs that play their roles: calibrator, weights, sky model, array, and what is true."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from scipy.spatial.distance import pdist
+
+from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.calibrate.settings import WeightedFit
+from calstudy.corrupt.effects.bandpass import Bandpass, Delays
 from calstudy.corrupt.interface import GainEffect
 from calstudy.experiment.assumed import assumed_changes
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.as_built import AsBuilt
+from calstudy.instrument.layouts import make_array
+from calstudy.power.cosmology import k_parallel, make_cosmology
 from calstudy.verdicts.statement import Unevaluated
 
 if TYPE_CHECKING:
@@ -16,12 +23,37 @@ if TYPE_CHECKING:
 
 INCOMPLETE = ("sky.foregrounds.flux_limit", "sky.foregrounds.count")
 """Fields of the assumed sky that leave sources out."""
+INVERSE_VARIANCES = ("gains", "autos")
+"""Kinds of weights."""
+SMOOTH = 100e-9
+"""s, the largest delay of gains that are smooth in frequency."""
 
 
 def other_calibrator(experiment: Experiment, allowed: Sequence[str]) -> str | None:
     """Return in words that an experiment has none of the allowed calibrators, or None if it has one."""
     found = experiment.calibration.label
     return None if found in allowed else f"calibration.calibrator is {found!r}, not {' or '.join(map(repr, allowed))}"
+
+
+def structured_gains(experiment: Experiment) -> str | None:
+    """Return in words which gains are not smooth in frequency, or None if all are."""
+    for effect in experiment.corruption.effects:
+        rough = isinstance(effect, Bandpass) and isinstance(effect.shape, Delays) and effect.shape.max_delay > SMOOTH
+        if isinstance(effect, GainEffect) and (rough or not isinstance(effect, Bandpass)):
+            return f"corruption.effects has {effect.label}, whose gains are not smooth in frequency"
+    return None
+
+
+def other_weights(experiment: Experiment) -> str | None:
+    """Return in words that weights are no inverse variances and gains not smooth, or None.
+
+    A smooth error of the model then becomes errors of the gains that are white, which no paper is about.
+    """
+    calibration = experiment.calibration
+    rough = structured_gains(experiment)
+    if rough is None or not isinstance(calibration, WeightedFit) or calibration.weights.kind in INVERSE_VARIANCES:
+        return None
+    return f"calibration.weights is {calibration.weights.kind!r}, which is no inverse variance, and {rough}"
 
 
 def other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
@@ -68,6 +100,30 @@ def _fields(block: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, An
             yield from _fields(value, f"{above}{key}.")
         else:
             yield f"{above}{key}", value
+
+
+def k_of_delay(experiment: Experiment, delay: float) -> float:
+    """Return k_parallel (h/Mpc) of a delay (s) at the centre of the band."""
+    channels, cosmology = experiment.instrument.channels, make_cosmology(experiment.power.cosmology)
+    return float(k_parallel(cosmology, delay, channels.first + channels.width * (channels.count - 1) / 2))
+
+
+def require_long_baselines(run: RunResults, k: float) -> None:
+    """Raise Unevaluated unless the horizon of the longest baseline, and the buffer of the wedge, reach k (h/Mpc).
+
+    Errors of a sky model have delays up to the horizon of the longest baseline that gains are fitted to, and so have
+    those of the gains.
+    """
+    experiment = run.experiment
+    lengths = pdist(make_array(experiment.instrument).enu)
+    fitted = experiment.calibration.baselines if isinstance(experiment.calibration, WeightedFit) else None
+    longest = float((lengths if fitted is None else lengths[fitted.factors(lengths) > 0]).max())
+    reached = k_of_delay(experiment, longest / SPEED_OF_LIGHT + experiment.power.wedge_buffer)
+    if reached < k:
+        raise Unevaluated(
+            f"the longest baseline that gains are fitted to has {longest:.0f} m; its horizon and the buffer reach "
+            f"{reached:.2f} h/Mpc, not {k:g}, so that errors of the model cannot reach all of the window"
+        )
 
 
 def require_same_world(first: RunResults, second: RunResults) -> None:

@@ -52,7 +52,7 @@ def read_member(folder: Path) -> MemberBias:
 
 @style.journal_style()
 def draw_member_bias(members: Mapping[str, MemberBias], stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw |bias| against k, and where it is not above its error the 95 % upper limit as an open symbol.
+    """Draw the absolute value of the bias against k; an open symbol is the 95 % upper limit where it is not above that.
 
     Parameters
     ----------
@@ -77,9 +77,10 @@ def draw_member_bias(members: Mapping[str, MemberBias], stand_ins: Sequence[str]
     axes.axhline(1, color=style.GREY, linewidth=0.7, linestyle="--", zorder=0)
     axes.set_yscale("log")
     axes.set_xlabel(style.WAVENUMBER)
-    axes.set_ylabel(r"$s^2 P^{R_0} / P^S$")
+    axes.set_ylabel(r"$|s^2 P^{R_0} / P^S|$")
     handles = [Line2D([], [], linewidth=0.6, **look(place)) for place in range(len(members))]
-    figure.legend(handles, list(members), loc="outside right upper")
+    handles.append(Line2D([], [], color=style.GREY, marker="o", markerfacecolor="white", linestyle=""))
+    figure.legend(handles, [*members, "open: 95 % upper limit"], loc="outside right upper")
     style.note_stand_ins(figure, stand_ins)
     return figure
 
@@ -93,8 +94,8 @@ class MemberBiasFigure(ComparisonFigure):
 
     titles: ClassVar[Mapping[str, str]] = {}
     caption = (
-        "Bias of each member outside the wedge with 95 % bars; open: 95 % upper limit where it is not above its error. "
-        "The dashed line is the EoR."
+        "Absolute value of the bias of each member outside the wedge with 95 % bars; open symbols: 95 % upper limit "
+        "where it is not above its error. The dashed line is the EoR."
     )
     tolerances: ClassVar[Rules] = ((r".*\.bias", Drawn(_error, "noise and what calibration leaves")),)
 

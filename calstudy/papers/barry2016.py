@@ -8,9 +8,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
+from calstudy.calibrate.interface import PolynomialSmoothing
+from calstudy.calibrate.settings import GainFit
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
+from calstudy.claims.roles import (
+    first_refusal,
+    k_of_delay,
+    other_calibrator,
+    other_faults,
+    other_sky_model,
+    other_weights,
+    require_long_baselines,
+    structured_gains,
+)
+from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
+from calstudy.corrupt.effects.reflection_gains import ReflectionGains
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement, Unevaluated
 
@@ -20,10 +33,23 @@ if TYPE_CHECKING:
 
 WINDOW = (0.2, 0.5)
 """h/Mpc, beyond the wedge and its leakage by the taper."""
-REALISTIC = 0.2
-"""Part of the rms of the foregrounds that a catalogue of realistic completeness lacks at most; one of all sources above
-0.1 Jy lacks 0.07."""
+REALISTIC = (0.01, 0.2)
+"""Part of the rms of the foregrounds that a catalogue of realistic completeness lacks; one of all sources above 0.1 Jy
+lacks 0.07."""
 MISSING = Source("Abstract", ("incomplete_sky_model",))
+JOINT = "the precision of the catalogue and the spectral smoothness of the antennas constrain each other"
+
+
+def _bias(run: RunResults, incomplete: bool = True) -> Finding:
+    """Return the bias in the window, if the array is large enough and the sky model lacks a realistic part."""
+    require_long_baselines(run, WINDOW[1])
+    lacking = run.sky_model_error
+    if incomplete and not REALISTIC[0] <= lacking <= REALISTIC[1]:
+        raise Unevaluated(
+            f"the sky model lacks {100 * lacking:.1f} % of the foregrounds, which is no realistic completeness "
+            f"({100 * REALISTIC[0]:.0f} to {100 * REALISTIC[1]:.0f} %)"
+        )
+    return bias(run, *WINDOW)
 
 
 @MISSING.states(
@@ -34,12 +60,7 @@ MISSING = Source("Abstract", ("incomplete_sky_model",))
     "the EoR cannot be measured below a bias of its own size",
 )
 def incomplete_model_contaminates_window(run: RunResults) -> Finding:
-    if run.sky_model_error > REALISTIC:
-        raise Unevaluated(
-            f"the sky model lacks {100 * run.sky_model_error:.0f} % of the foregrounds, which is no realistic "
-            f"completeness ({100 * REALISTIC:.0f} % at most)"
-        )
-    return bias(run, *WINDOW)
+    return _bias(run)
 
 
 @MISSING.states(
@@ -50,7 +71,29 @@ def incomplete_model_contaminates_window(run: RunResults) -> Finding:
     roles=("complete_sky_model",),
 )
 def complete_model_leaves_window_clean(run: RunResults) -> Finding:
-    return bias(run, *WINDOW)
+    return _bias(run, incomplete=False)
+
+
+@MISSING.states(
+    f"{JOINT}: gains of smooth antennas can be smoothed, which removes what sources that are missing leave",
+    "the same with sources missing and smoothed gains",
+    AtMost(1, sigmas=2),
+    "less than the EoR itself, so that it can be measured",
+    roles=("smooth_antennas",),
+)
+def smooth_antennas_leave_window_clean(run: RunResults) -> Finding:
+    return _bias(run)
+
+
+@MISSING.states(
+    f"{JOINT}: smoothing fails if antennas have structure at the delays of the window",
+    "the same with such antennas",
+    AtLeast(1, sigmas=2),
+    "the EoR cannot be measured below a bias of its own size",
+    roles=("structured_antennas",),
+)
+def structured_antennas_contaminate_window(run: RunResults) -> Finding:
+    return _bias(run)
 
 
 class Barry2016(Paper):
@@ -61,22 +104,58 @@ class Barry2016(Paper):
         "and implications for the SKA, arXiv:1603.00607"
     )
     roles: ClassVar[Mapping[str, str]] = {
-        "complete_sky_model": "a run of sky-based calibration with the true sky as its model",
-        "incomplete_sky_model": "a run of sky-based calibration whose sky model lacks sources",
+        "complete_sky_model": "a run of sky-based calibration, channel by channel, of antennas whose gains are smooth "
+        "in frequency, with the true sky as its model",
+        "incomplete_sky_model": "such a run whose sky model lacks sources",
+        "smooth_antennas": "a run of sky-based calibration that smooths gains by polynomials, of antennas whose "
+        "gains are smooth in frequency, with a sky model that lacks sources",
+        "structured_antennas": "such a run of antennas with structure at the delays of the window, with inverse "
+        "variances as weights",
     }
     usual_members: ClassVar[Mapping[str, str]] = {
-        "complete_sky_model": "sky-based",
-        "incomplete_sky_model": "sky-based-incomplete",
+        "complete_sky_model": "long-sky-based",
+        "incomplete_sky_model": "long-sky-based-incomplete",
+        "smooth_antennas": "long-smoothed-incomplete",
+        "structured_antennas": "long-smoothed-reflections",
     }
 
     def statements(self) -> Sequence[Statement]:
         """Return the statements."""
-        return [incomplete_model_contaminates_window, complete_model_leaves_window_clean]
+        return [
+            incomplete_model_contaminates_window,
+            complete_model_leaves_window_clean,
+            smooth_antennas_leave_window_clean,
+            structured_antennas_contaminate_window,
+        ]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return what of an experiment is not that of the role, or None."""
         return first_refusal(
             other_calibrator(experiment, ("sky-based", "skycal")),
+            _other_smoothing(experiment, smoothed=role in ("smooth_antennas", "structured_antennas")),
+            _no_structure(experiment) if role == "structured_antennas" else structured_gains(experiment),
+            other_weights(experiment),
             other_faults(experiment),
-            other_sky_model(experiment, incomplete=role == "incomplete_sky_model"),
+            other_sky_model(experiment, incomplete=role != "complete_sky_model"),
         )
+
+
+def _other_smoothing(experiment: Experiment, smoothed: bool) -> str | None:
+    calibration = experiment.calibration
+    if isinstance(calibration, GainFit) and calibration.gain_delay is not None:
+        return "calibration.gain_delay is set, so that channels are not fitted by themselves"
+    if not smoothed:
+        return None if calibration.smooth_gains is None else "calibration.smooth_gains is set"
+    # Other kinds may keep structure at the delays of the window.
+    if isinstance(calibration.smooth_gains, PolynomialSmoothing):
+        return None
+    return "calibration.smooth_gains is no polynomial"
+
+
+def _no_structure(experiment: Experiment) -> str | None:
+    """Return in words that no gains have structure at delays of the window, or None if some have."""
+    for effect in experiment.corruption.effects:
+        reflected = isinstance(effect, ReflectionGains) and k_of_delay(experiment, effect.delay)
+        if isinstance(effect, PerChannelGains) or (reflected and WINDOW[0] <= reflected <= WINDOW[1]):
+            return None
+    return f"corruption.effects has no structure of the gains at k of {WINDOW[0]:g} to {WINDOW[1]:g} h/Mpc"

@@ -8,9 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
+
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
+from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model, other_weights
+from calstudy.instrument.layouts import make_array, redundant_groups
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
 
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
 
 CRUCIAL = (0.1, 0.2)
 """h/Mpc, where the noise allows a detection first."""
+EXACT = 1e-3
+"""m, within which redundant baselines of a lattice are equal."""
 MISSING = Source("Abstract", ("redundant_incomplete",))
 
 
@@ -53,8 +58,9 @@ class Byrne2019(Paper):
         "and implications for HERA and the SKA, arXiv:1811.01378"
     )
     roles: ClassVar[Mapping[str, str]] = {
-        "redundant_complete": "a run of redundant calibration (redcal) with the true sky as its model",
-        "redundant_incomplete": "a run of redundant calibration (redcal) whose sky model lacks sources",
+        "redundant_complete": "a run of redundant calibration (redcal) of an exact lattice, with inverse variances as "
+        "weights or gains that are smooth in frequency, and the true sky as its model",
+        "redundant_incomplete": "such a run whose sky model lacks sources",
     }
     usual_members: ClassVar[Mapping[str, str]] = {
         "redundant_complete": "redcal",
@@ -71,6 +77,17 @@ class Byrne2019(Paper):
         return first_refusal(
             other_calibrator(experiment, ("redcal",)),
             None if "omnical" in steps else "calibration.steps has no omnical",
+            other_weights(experiment),
             other_faults(experiment),
             other_sky_model(experiment, incomplete=role == "redundant_incomplete"),
+            _no_lattice(experiment),
         )
+
+
+def _no_lattice(experiment: Experiment) -> str | None:
+    """Return in words that baselines which count as redundant are not equal, or None if they are."""
+    enu = make_array(experiment.instrument).enu
+    first, second = np.triu_indices(len(enu), 1)
+    tolerances = EXACT, getattr(experiment.calibration, "redundancy_tolerance", EXACT)
+    exact, near = (redundant_groups(enu[second] - enu[first], tolerance).index.max() for tolerance in tolerances)
+    return None if exact == near else f"redundant baselines of the array differ by more than {1e3 * EXACT:g} mm"

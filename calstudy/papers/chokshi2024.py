@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model
+from calstudy.claims.roles import (
+    first_refusal,
+    other_calibrator,
+    other_faults,
+    other_sky_model,
+    other_weights,
+    require_long_baselines,
+)
 from calstudy.experiment.assumed import assumed_changes, assumed_world
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
@@ -38,6 +45,7 @@ DEFORMED = Source("Abstract", ("one_beam",))
     "the paper's factor",
 )
 def leakage_exceeds_signal_thousandfold(run: RunResults) -> Finding:
+    require_long_baselines(run, MODES[1])
     return bias(run, *MODES)
 
 
@@ -60,7 +68,8 @@ class Chokshi2024(Paper):
         "reionization detection, arXiv:2409.19875"
     )
     roles: ClassVar[Mapping[str, str]] = {
-        "one_beam": "a run of sky-based calibration of tiles with unequal dipoles, unknown to its model",
+        "one_beam": "a run of sky-based calibration of tiles with unequal dipoles, unknown to its model, with inverse "
+        "variances as weights or gains that are smooth in frequency",
         "all_beams": "the same with the dipoles in calibration.assumed",
     }
     usual_members: ClassVar[Mapping[str, str]] = {"one_beam": "deformed-beams", "all_beams": "deformed-beams-known"}
@@ -75,6 +84,7 @@ class Chokshi2024(Paper):
         refusal = first_refusal(
             other_calibrator(experiment, ("sky-based", "skycal")),
             None if found >= LEAST else f"{AMPLITUDES} is {found:g}, not {LEAST:g} or more",
+            other_weights(experiment),
             other_faults(experiment, SCATTER),
         )
         if refusal is not None or role == "one_beam":

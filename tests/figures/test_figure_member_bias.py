@@ -16,7 +16,10 @@ EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 def test_what_is_not_above_the_noise_is_an_open_upper_limit():
     member = MemberBias(np.array([0.1, 0.2, 0.3]), np.array([50.0, 0.5, -3.0]), np.array([1.0, 1.0, 0.1]))
-    [axes] = draw_member_bias({"one": member}).axes
+    figure = draw_member_bias({"one": member})
+    [axes] = figure.axes
+    [legend] = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["one", "open: 95 % upper limit"]
     open_points = [line for line in axes.lines if line.get_markerfacecolor() == "white"]
     assert [line.get_ydata().tolist() for line in open_points] == [[pytest.approx(0.5 + SIGMAS_95)]]
     [measured] = axes.containers
