@@ -29,6 +29,8 @@ LABELS_WIDTH = 72
 """Characters that fit below the matrix."""
 LARGE_ERROR = 0.1
 """T with a larger standard deviation is not written with two decimals alone, which would look exact."""
+ABSURD = 10.0
+"""T of this size is that of gains that are no solution; its order of magnitude is enough."""
 ROOM_FOR_ERROR = 8
 """Worlds side by side in whose cells T fits with its error; with more, it has one decimal."""
 
@@ -124,6 +126,8 @@ def _bias(bias: float, error: float) -> tuple[float, str]:
 def _transfer(value: float, error: float, n_worlds: int) -> str:
     if not np.isfinite(value):
         return "–"
+    if abs(value) >= ABSURD:
+        return _digits(value)
     if not (np.isfinite(error) and error > LARGE_ERROR):
         return f"{value:.2f}"
     return number(value, error) if n_worlds <= ROOM_FOR_ERROR else f"{value:.1f}"
@@ -140,7 +144,7 @@ def _digits(value: float) -> str:
 class ComparisonMatrix(CasesFigure):
     """A matrix of calibrators and worlds for each band of k: colour and number are the bias, T is written below it."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     caption = (
         "Bias of every calibrator in every world, in units of the EoR (<: 95 % upper limit), and the part T of the EoR "
         "that is left."

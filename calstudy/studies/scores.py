@@ -223,9 +223,8 @@ def _explanation() -> list[str]:
         "EoR's power that is left, the bias the power of the residual without EoR over that of the EoR; both are free "
         "of the flux scale. All columns of the tables are explained in the [guide](guide.md#comparisons).",
         "",
-        "Built-in calibrators weight all visibilities equally unless `weights` says otherwise. Where the noise follows "
-        "gains that are white in frequency, as in the challenge, the order by bias then says little on the calibrators "
-        "themselves ([weights of the comparisons](calibrators.md#weights-of-the-comparisons)).",
+        "Built-in calibrators have the weights of their own gains unless `weights` says otherwise "
+        "([weights](weights.md)).",
     ]
 
 
