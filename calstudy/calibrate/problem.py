@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
@@ -15,6 +16,8 @@ from calstudy.base.observation import Frame
 from calstudy.calibrate.basis import ForegroundBasis
 from calstudy.calibrate.settings import MODELS_AT_ONCE
 
+LARGEST_WEIGHT = 100.0
+"""Of weights from gains, over that of the median of |g_a g_b|^2."""
 Prior = Literal["sum", "post-hoc", "gains", "sky-model", "none"]
 
 
@@ -268,6 +271,9 @@ def flag_weights(flags: np.ndarray) -> np.ndarray:
 def gain_weights(weights: np.ndarray, products: np.ndarray) -> np.ndarray:
     """Return weights over |g_a g_b|^2, with the same mean over baselines and channels.
 
+    |g_a g_b|^2 counts as at least a hundredth of its median: a sample whose gains a fit brings down to zero would have
+    all the weight, and keep them there.
+
     Parameters
     ----------
     weights
@@ -276,7 +282,12 @@ def gain_weights(weights: np.ndarray, products: np.ndarray) -> np.ndarray:
         g_a g_b*, of the same shape; not zero where the weight is not.
     """
     used = weights > 0
-    found = np.where(used, weights, 0) / np.where(used, np.abs(products) ** 2, 1)
+    power = np.where(used, np.abs(products) ** 2, np.nan)
+    with warnings.catch_warnings():
+        # Of all samples without weight there is no median.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        least = np.nanmedian(power, axis=(-2, -1), keepdims=True) / LARGEST_WEIGHT
+    found = np.where(used, weights, 0) / np.where(used, np.maximum(power, least), 1)
     before, after = (np.sum(values, axis=(-2, -1), keepdims=True) for values in (weights, found))
     return found * (before / np.where(after > 0, after, 1))
 

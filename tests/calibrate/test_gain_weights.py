@@ -152,6 +152,9 @@ def test_weights_keep_their_mean_and_samples_without_weight():
     assert np.allclose(found.sum(axis=(1, 2)), weights.sum(axis=(1, 2)))
     ratio = (found * np.abs(products) ** 2 / np.where(weights > 0, weights, 1))[weights > 0]
     assert np.allclose(ratio[:38], ratio[0])
+    # A sample whose gains vanish does not have all the weight.
+    products[0, 0, 0] = 1e-6
+    assert gain_weights(weights, products)[0, 0, 0] < 0.9 * weights[0].sum()
     # Smooth changes do not count, white ones by their rms.
     smooth = weights * (1 + 0.1 * np.linspace(0, 1, 8))
     assert weight_change(smooth, weights) < 0.02
