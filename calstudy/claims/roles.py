@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from scipy.spatial.distance import pdist
 
 from calstudy.base.constants import SPEED_OF_LIGHT
@@ -105,7 +106,7 @@ def _fields(block: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, An
 def k_of_delay(experiment: Experiment, delay: float) -> float:
     """Return k_parallel (h/Mpc) of a delay (s) at the centre of the band."""
     channels, cosmology = experiment.instrument.channels, make_cosmology(experiment.power.cosmology)
-    return float(k_parallel(cosmology, delay, channels.first + channels.width * (channels.count - 1) / 2))
+    return float(k_parallel(cosmology, np.array(delay), channels.first + channels.width * (channels.count - 1) / 2))
 
 
 def require_long_baselines(run: RunResults, k: float) -> None:
