@@ -180,29 +180,47 @@ def test_gains_of_any_kind_are_no_other_fault(members):
 
 def test_an_unrealistic_catalogue_decides_nothing():
     poor = run(50, sky_model_error=0.39)
-    assert verdicts("barry2016", incomplete_sky_model=poor, complete_sky_model=run(0.01)) == ["not evaluated", "PASS"]
+    assert verdicts("barry2016", incomplete_sky_model=poor, complete_sky_model=run(0.01)) == [
+        "not evaluated",
+        "supported",
+    ]
 
 
 def test_delay_weighting_is_compared_with_the_same_sky_model(members):
     first, second = members["sky-based-incomplete"], members["delay-weighted-incomplete"]
     runs = {"sky_based": run(90, product=1e-3, experiment=first), "delay_weighted": run(1, 0.1, 1e-4)}
-    assert verdicts("byrne2023", **runs | {"delay_weighted": run(1, product=1e-4, experiment=second)})[0] == "PASS"
+    assert verdicts("byrne2023", **runs | {"delay_weighted": run(1, product=1e-4, experiment=second)})[0] == "supported"
     assert verdicts("byrne2023", **runs) == ["not evaluated", "not evaluated"]
 
 
 def test_verdicts_follow_the_numbers():
-    assert verdicts("barry2016", incomplete_sky_model=run(50), complete_sky_model=run(0.01)) == ["PASS", "PASS"]
-    assert verdicts("barry2016", incomplete_sky_model=run(0.5), complete_sky_model=run(2)) == ["FAIL", "FAIL"]
+    assert verdicts("barry2016", incomplete_sky_model=run(50), complete_sky_model=run(0.01)) == [
+        "supported",
+        "supported",
+    ]
+    assert verdicts("barry2016", incomplete_sky_model=run(0.5), complete_sky_model=run(2)) == [
+        "contradicted",
+        "contradicted",
+    ]
     # Above the EoR, but within the noise.
-    assert verdicts("barry2016", incomplete_sky_model=run(1.5, 3), complete_sky_model=run(0.0, 3)) == ["FAIL", "FAIL"]
-    assert verdicts("byrne2019", redundant_incomplete=run(20), redundant_complete=run(0.1)) == ["PASS", "PASS"]
-    assert verdicts("byrne2019", redundant_incomplete=run(0.1), redundant_complete=run(20)) == ["FAIL", "FAIL"]
+    assert verdicts("barry2016", incomplete_sky_model=run(1.5, 3), complete_sky_model=run(0.0, 3)) == [
+        "undecided",
+        "undecided",
+    ]
+    assert verdicts("byrne2019", redundant_incomplete=run(20), redundant_complete=run(0.1)) == [
+        "supported",
+        "supported",
+    ]
+    assert verdicts("byrne2019", redundant_incomplete=run(0.1), redundant_complete=run(20)) == [
+        "contradicted",
+        "contradicted",
+    ]
     good, bad = run(1, product=1e-4), run(90, product=1e-3)
-    assert verdicts("byrne2023", sky_based=bad, delay_weighted=good) == ["PASS", "PASS"]
-    assert verdicts("byrne2023", sky_based=good, delay_weighted=bad) == ["FAIL", "FAIL"]
+    assert verdicts("byrne2023", sky_based=bad, delay_weighted=good) == ["supported", "supported"]
+    assert verdicts("byrne2023", sky_based=good, delay_weighted=bad) == ["contradicted", "contradicted"]
     assert verdicts("byrne2023", sky_based=run(0, 1), delay_weighted=good)[1] == "not evaluated"
-    assert verdicts("joseph2020", dead_dipoles=run(1000 / SIGNAL * SCALE**2)) == ["PASS", "PASS"]
-    assert verdicts("joseph2020", dead_dipoles=run(1e-3)) == ["FAIL", "FAIL"]
-    assert verdicts("chokshi2024", one_beam=run(2000), all_beams=run(0.5)) == ["PASS", "PASS"]
-    assert verdicts("chokshi2024", one_beam=run(20), all_beams=run(2)) == ["FAIL", "FAIL"]
+    assert verdicts("joseph2020", dead_dipoles=run(1000 / SIGNAL * SCALE**2)) == ["supported", "supported"]
+    assert verdicts("joseph2020", dead_dipoles=run(1e-3)) == ["contradicted", "contradicted"]
+    assert verdicts("chokshi2024", one_beam=run(2000), all_beams=run(0.5)) == ["supported", "supported"]
+    assert verdicts("chokshi2024", one_beam=run(20), all_beams=run(2)) == ["contradicted", "contradicted"]
     assert verdicts("chokshi2024", one_beam=run(20))[1] == "not evaluated"
