@@ -14,7 +14,14 @@ from calstudy.calibrate.degeneracy import sky_model_slope
 from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, weight_change
-from calstudy.calibrate.settings import GainFit, GainWeights, GaussNewtonSettings, LbfgsSettings
+from calstudy.calibrate.settings import (
+    RUNAWAY,
+    GainFit,
+    GainWeights,
+    GaussNewtonSettings,
+    LbfgsSettings,
+    unsettled_message,
+)
 from calstudy.calibrate.solution import Solution
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
@@ -172,22 +179,27 @@ def _solve_in_passes(
     """
     weighted = problem.weighted_by(problem.initial_gains if warm is None else warm.gains)
     solutions: list[Solution] = []
+    starts: list[WarmStart | None] = []
     change, anew = 0.0, True
     while len(solutions) < settings.passes:
         solution, warm, anew = _solve(weighted, solver, warm, anew)
+        if solutions and not solution.usable:
+            break
         solutions.append(solution)
-        if warm is None:
+        starts.append(warm)
+        if not solution.usable:
             break
         before, weighted = weighted.weights, problem.weighted_by(solution.gains)
         change = weight_change(weighted.weights, before)
         # Weights of gains that are far from the solution lead away from it.
         if change < settings.tolerance or solution.status == "max-steps":
             break
-    solution = _together(solutions)
-    if settings.unsettled(change) and solution.status == "converged":
-        message = f"weights from the gains still changed by {change:.1e} in pass {len(solutions)}"
-        solution = replace(solution, status="max-steps", message=message)
-    return solution, warm, {"passes": len(solutions), "weight_change": change}
+    found, kept = _together(solutions), -1
+    if settings.passes > 1 and change > RUNAWAY:
+        found, kept = replace(found, gains=solutions[0].gains, model=solutions[0].model), 0
+    if settings.unsettled(change) and found.status == "converged":
+        found = replace(found, status="max-steps", message=unsettled_message(change, len(solutions)))
+    return found, starts[kept], {"passes": len(solutions), "weight_change": change}
 
 
 def _together(solutions: Sequence[Solution]) -> Solution:

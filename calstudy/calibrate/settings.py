@@ -105,14 +105,17 @@ Solver = Annotated[
 
 
 UNSETTLED = 10.0
-"""Weights from gains that still change by more than this times the tolerance after the last pass make no result."""
+"""Weights from gains that still change by more than this times the tolerance in the last pass have not converged."""
+RUNAWAY = 1.0
+"""Weights that change by more than themselves in the last pass run away; the first pass is the result then."""
 
 
 class GainWeights(Section):
     """Inverse variance of noise that is received with the sky: 1 / |g_a g_b|^2 of the gains that the fit finds itself.
 
     The first pass has the weights of the gains that it starts from; each other pass those of the gains of the pass
-    before. After a pass that ends at the largest number of steps there is no other.
+    before. After a pass that ends at the largest number of steps there is no other. Where weights run away, as with a
+    signal to noise of one in every sample, the first pass is the result, and its status says so.
     """
 
     kind: Literal["gains"] = "gains"
@@ -133,6 +136,12 @@ class GainWeights(Section):
     def unsettled(self, change: float) -> bool:
         """Whether weights that changed by so much in the last pass are not those of the result."""
         return self.passes > 1 and change > UNSETTLED * self.tolerance
+
+
+def unsettled_message(change: float, passes: int) -> str:
+    """Return what is said of a fit whose weights from its gains have not converged."""
+    sentence = f"weights from the gains still changed by {change:.1e} in pass {passes}"
+    return f"{sentence}, so that the first pass is the result" if change > RUNAWAY else sentence
 
 
 class FlagWeights(Section):

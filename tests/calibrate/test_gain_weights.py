@@ -142,6 +142,21 @@ def test_a_signal_at_all_delays_leaks_into_the_wedge_with_equal_weights_alone():
     assert leak["flags"] == pytest.approx(8 * 0.1**2, rel=0.5)
 
 
+def test_weights_that_run_away_leave_the_result_of_equal_weights():
+    """With a signal to noise of one in every sample, gains by channel are too noisy to make weights."""
+    toy = make_toy(scattered(8), noise=1.0)
+    uvd = make_uvdata(toy, n_times=1)
+    sky = sky_of(uvd, toy.foregrounds)
+    weighted, equal = (
+        run_calibrator(calibrator.model_copy(update={"weights": weights}), uvd, sky)
+        for weights in (GainWeights(), FLAT)
+    )
+    (record,) = weighted.solutions
+    assert record.status == "max-steps"
+    assert "the first pass is the result" in record.message
+    assert np.array_equal(weighted.gains.gain_array, equal.gains.gain_array)
+
+
 def test_weights_keep_their_mean_and_samples_without_weight():
     rng = np.random.default_rng(2)
     weights = rng.uniform(0.5, 2, (3, 5, 8))

@@ -14,7 +14,7 @@ from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
 from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
-from calstudy.calibrate.settings import GainWeights, WeightedFit
+from calstudy.calibrate.settings import RUNAWAY, GainWeights, WeightedFit, unsettled_message
 
 # hera_cal wants a name for the polarization; each is calibrated by itself.
 POL, FEED = "nn", "Jnn"
@@ -156,7 +156,7 @@ class OtherPackage(WeightedFit):
         gains, outcomes = self.solve(measured, groups)
         if not isinstance(settings, GainWeights):
             return gains, outcomes
-        passes = 1
+        first, passes = gains, 1
         while True:
             before, weights = weights, measured.weighted_by(gains, groups).weights
             changes = [weight_change(weights[times], before[times]) for times in groups]
@@ -164,6 +164,8 @@ class OtherPackage(WeightedFit):
                 break
             gains, outcomes = self.solve(measured, groups, gains)
             passes += 1
+        if settings.passes > 1:
+            gains = np.where(np.array(changes) > RUNAWAY, first, gains)
         unsettled = [settings.unsettled(found) for found in changes]
         return gains, [_in_passes(*ended, passes) for ended in zip(outcomes, changes, unsettled, strict=True)]
 
@@ -173,7 +175,7 @@ def _in_passes(outcome: Outcome, change: float, unsettled: bool, passes: int) ->
     diagnostics = {**outcome.diagnostics, "passes": passes, "weight_change": change}
     if not unsettled or outcome.status != "converged":
         return replace(outcome, diagnostics=diagnostics)
-    message = f"weights from the gains still changed by {change:.1e} in pass {passes}"
+    message = unsettled_message(change, passes)
     return replace(outcome, status="max-steps", message=message, diagnostics=diagnostics)
 
 
