@@ -147,10 +147,7 @@ def test_weights_that_run_away_leave_the_result_of_equal_weights():
     toy = make_toy(scattered(8), noise=1.0)
     uvd = make_uvdata(toy, n_times=1)
     sky = sky_of(uvd, toy.foregrounds)
-    weighted, equal = (
-        run_calibrator(calibrator.model_copy(update={"weights": weights}), uvd, sky)
-        for weights in (GainWeights(), FLAT)
-    )
+    weighted, equal = (run_calibrator(SkyBased(weights=weights), uvd, sky) for weights in (GainWeights(), FLAT))
     (record,) = weighted.solutions
     assert record.status == "max-steps"
     assert "the first pass is the result" in record.message
