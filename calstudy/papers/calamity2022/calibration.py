@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from calstudy.claims.results import RunResults
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
-from calstudy.verdicts.statement import Sentence, Source
+from calstudy.verdicts.statement import Source
 
 RESULTS = Source("Simulation Results", ("minimally_redundant",))
-SIMULATED = replace(RESULTS, tests_simulation=True)
 FACTOR_OF_TWO = "the paper's 'similar', 'about' and 'roughly' are read as within a factor of two"
 
 
 def _median(run: RunResults, name: str) -> Finding:
-    """Return the median over antennas or baselines, with their scatter."""
+    """Return the median over antennas or baselines, with their scatter as its uncertainty."""
     found = run.measured(name)
-    return Finding(found.value, found.scatter, "scatter")
+    return Finding(found.value, found.scatter)
 
 
-GAINS = Sentence(
-    "gains-agree",
-    "our fitted gains do not agree particularly well with the true gains, only on the ≲ 20 % level on all delays",
-)
-GAINS_CAPTION = Sentence("gain-residuals", "their residuals are on the order of 10 %")
+GAINS = "our fitted gains do not agree particularly well with the true gains, only on the ≲ 20 % level on all delays"
+GAINS_CAPTION = "their residuals are on the order of 10 %"
 
 
 @RESULTS.states(
@@ -67,9 +61,7 @@ def gains_of_order_10_percent(run: RunResults) -> Finding:
     return _median(run, "gains_aligned")
 
 
-GAINS_BY_DELAY = Sentence(
-    "gain-residuals-by-delay", "even in the delay domain, the residuals are at 10 % at all delays"
-)
+GAINS_BY_DELAY = "even in the delay domain, the residuals are at 10 % at all delays"
 
 
 @RESULTS.states(
@@ -108,10 +100,7 @@ def gains_of_order_10_percent_raw(run: RunResults) -> Finding:
     return _median(run, "gains_raw")
 
 
-MODEL = Sentence(
-    "model-residual",
-    "the residual is on the order of ≈ 10-20 % and significantly exceeds the level of the thermal noise",
-)
+MODEL = "the residual is on the order of ≈ 10-20 % and significantly exceeds the level of the thermal noise"
 
 
 @RESULTS.states(
@@ -131,9 +120,8 @@ def model_error_exceeds_noise(run: RunResults) -> Finding:
     return _median(run, "model_over_noise")
 
 
-PRODUCT = Sentence(
-    "visibility-model",
-    "our visibility model is accurate at the 0.1 % level and at a similar level to the thermal noise at all delays",
+PRODUCT = (
+    "our visibility model is accurate at the 0.1 % level and at a similar level to the thermal noise at all delays"
 )
 
 
@@ -169,7 +157,7 @@ def product_at_tenth_of_percent(run: RunResults) -> Finding:
 def product_far_better_than_gains(run: RunResults) -> Finding:
     gains, product = run.measured("gains_aligned"), run.measured("product_over_data")
     ratio = gains.value / product.value
-    return Finding(ratio, ratio * product.scatter / product.value, "scatter")
+    return Finding(ratio, ratio * product.scatter / product.value)
 
 
 @RESULTS.states(
