@@ -53,7 +53,8 @@ def installed(tmp_path_factory) -> Path:
     wheels = folder / "wheels"
     subprocess.run([*pip, "wheel", str(sources), "--no-deps", "--no-build-isolation", "-w", str(wheels)], check=True)
     (wheel,) = wheels.iterdir()
-    assert wheel.stat().st_size < 15e6
+    # Most of it are the references, of 28 studies; figures of half a megabyte each.
+    assert wheel.stat().st_size < 16e6
     subprocess.run([*pip, "install", "--no-deps", "--target", str(folder / "site"), str(wheel)], check=True)
     shutil.rmtree(sources)
     return folder / "site"

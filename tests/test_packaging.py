@@ -122,7 +122,7 @@ def test_without_tensorflow_commands_say_what_is_missing(arguments, monkeypatch)
 
 def test_a_command_that_takes_no_tensorflow_goes_on_without(monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorflow", None)
-    planned = ["plan", str(ROOT / "experiments" / "quickstart.yaml"), "--set", "calibration.calibrator=none"]
+    planned = ["plan", str(ROOT / "experiments" / "quickstart.yaml"), "--set", "calibration={calibrator: none}"]
     result = CliRunner().invoke(app, planned)
     assert result.exit_code == 0, result.output
 

@@ -33,6 +33,8 @@ from calstudy.studies.study import Budget, run_study
 from calstudy.studies.worlds import load_worlds
 
 ROOT = Path(__file__).parents[2]
+# With the weights of the program of the challenge's page.
+SKYCAL = {"calibrator": "skycal", "weights": "flags"}
 CALAMITY = {"calibrator": "calamity", "prior": "sky-model", "chunks": 1}
 ASSUMED = {"sky.foregrounds.errors": {"flux_scatter": 0.01}}
 NAMES = [f"data-{number}" for number in range(1, 5)]
@@ -49,7 +51,7 @@ def home(tmp_path_factory):
             {"kind": "per-channel-gains", "sigma": 0.1, "seed": 5},
             {"kind": "channel-flags", "band_edges": "400 kHz", "coarse_edges": "0 Hz", "coarse_centres": False},
         ],
-        calibration={"calibrator": "skycal", "chunks": 1, "assumed": ASSUMED},
+        calibration={**SKYCAL, "chunks": 1, "assumed": ASSUMED},
     )
     data["name"] = "secret-name"
     (folder / "secret.yaml").write_text(yaml.safe_dump(data))
@@ -87,7 +89,7 @@ def calibrate(exported, folder, block, models: bool = False):
 
 @pytest.fixture(scope="module")
 def skycal(exported, home):
-    return calibrate(exported, home / "by-skycal", "skycal")
+    return calibrate(exported, home / "by-skycal", SKYCAL)
 
 
 def scores_of(home, folder, name="mine"):
@@ -160,11 +162,11 @@ def test_data_are_those_of_the_run_and_the_sky_model_is_what_is_assumed(exported
     assert 0.01 < np.linalg.norm(sky - truth) / np.linalg.norm(truth) < 0.2
 
 
-@pytest.mark.parametrize(("block", "models"), [("skycal", False), (CALAMITY, True)], ids=["skycal", "calamity"])
+@pytest.mark.parametrize(("block", "models"), [(SKYCAL, False), (CALAMITY, True)], ids=["skycal", "calamity"])
 def test_a_built_in_calibrator_through_files_gives_its_own_row(exported, home, block, models, tmp_path):
     """Gains, and models of double precision, come back as they went: what is left is the order of sums."""
     own = home / "own.json"
-    settings = {"calibrator": "skycal", "chunks": 1} if block == "skycal" else block
+    settings = {**SKYCAL, "chunks": 1} if block == SKYCAL else block
     change = f"calibration={json.dumps({**settings, 'assumed': ASSUMED})}"
     command("score", home / "secret.yaml", "--set", change, "--output", own, "--overwrite", "--workers", 1)
     found = scores_of(home, calibrate(exported, tmp_path / "back", block, models))
@@ -319,7 +321,7 @@ def test_a_folder_takes_part_in_a_comparison_beside_the_built_in_ones(skycal, ho
     data = {
         "name": "compared",
         "experiment": "secret.yaml",
-        "calibrators": {"built in": {"calibrator": "skycal", "chunks": 1}, "mine": {"calibrator": "by-file",
+        "calibrators": {"built in": {**SKYCAL, "chunks": 1}, "mine": {"calibrator": "by-file",
                         "folder": skycal.name}},
         "worlds": {"first": {"calibration.assumed": ASSUMED}, "second": {"corruption.noise.seeds": [7, 8]}},
         "figures": ["comparison-matrix"],

@@ -37,7 +37,8 @@ from calstudy.studies.study import Budget, Run, run_study
 DRAWN = True
 
 ANTENNAS, TIMES, CHANNELS = 12, 4, 48
-CALIBRATION = {"prior": "gains", "solver": {"name": "gauss-newton", "max_steps": 500}, "chunks": 1}
+# Of one pass: what two fits in passes leave differs by the paths that they take.
+CALIBRATION = {"weights": "flags", "prior": "gains", "solver": {"name": "gauss-newton", "max_steps": 500}, "chunks": 1}
 EVERYTHING = ["foregrounds", "eor", "noise"]
 VARIANTS = {
     "uncalibrated": {"components": EVERYTHING, "effects": True},
