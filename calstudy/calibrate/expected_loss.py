@@ -241,6 +241,7 @@ class GainResponse:
 
     def __init__(self, problem: CalibrationProblem, gains: np.ndarray) -> None:
         self._kernels = kernels = compiled(problem.structure, problem.frozen)
+        self._antennas, self._shape = problem.structure.antennas.T, gains.shape
         reduced = kernels.reduce(problem, gains)
         self._unit = reduced.loss_unit
         projection = kernels.project(reduced.gains, *reduced.data)
@@ -268,6 +269,43 @@ class GainResponse:
         eta, _ = self._kernels.solve(self._equations, descent, CG_TOLERANCE, CG_ITERATIONS)
         return eta
 
+    def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
+        """Return what gains absorb of whitened changes W y, without what foregrounds absorb of that, (Nbls, Nfreqs)."""
+        first, second = self._antennas
+        gradient = tangent.slope.conj() * left
+        descent = np.zeros(self._shape, complex)
+        np.add.at(descent, first, gradient)
+        np.add.at(descent, second, gradient.conj())
+        eta = self.solve(descent)
+        return tangent.without_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
+
+
+def linear_response(
+    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signal: np.ndarray
+) -> np.ndarray:
+    """Return what a fit leaves of a small signal in the calibrated data, to first order.
+
+    It is the difference of the residuals of two fits, of data with the signal and without, if both are at the minimum;
+    it does not depend on where these start and stop.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    gains, model
+        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
+    signal
+        Likewise, (Nbls, Nfreqs), in the unit of the model.
+
+    Returns
+    -------
+    Complex, (Nbls, Nfreqs); zero for samples without weight.
+    """
+    tangent = TangentSpace.at(problem, gains, model)
+    left = tangent.without_foregrounds(tangent.roots * signal)
+    left = left - GainResponse(problem, gains).absorbed(tangent, left)
+    return np.divide(left, tangent.roots, out=np.zeros(left.shape, complex), where=tangent.roots > 0)
+
 
 def _stochastic_diagonal(
     problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace, modes: DelayModes, probes: int, seed: int
@@ -279,19 +317,12 @@ def _stochastic_diagonal(
     if probes < 2:
         raise ValueError(f"probes: {probes}, at least 2 are needed")
     response, rng = GainResponse(problem, gains), np.random.default_rng(seed)
-    first, second = problem.structure.antennas.T
     shape, used = tangent.slope.shape, tangent.roots > 0
     sums = np.zeros((2, shape[0], modes.delay.size))
     for _ in range(probes):
         noise = used * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
         left = tangent.without_foregrounds(noise)
-        gradient = tangent.slope.conj() * left
-        descent = np.zeros(gains.shape, complex)
-        np.add.at(descent, first, gradient)
-        np.add.at(descent, second, gradient.conj())
-        eta = response.solve(descent)
-        absorbed = tangent.without_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
-        amplitudes = modes.amplitudes(absorbed)
+        amplitudes = modes.amplitudes(response.absorbed(tangent, left))
         power = np.abs(amplitudes) ** 2
         if tangent.finite:
             power = 2 * np.real(modes.amplitudes(left).conj() * amplitudes) - power

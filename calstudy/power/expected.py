@@ -37,13 +37,22 @@ class ExpectedBins:
     by_length: np.ndarray = field(metadata={"unit": ""})
 
 
-def bin_expected(modes: BaselineModes, edges: ArrayLike, buffer: float, length_bin: float) -> ExpectedBins:
+def bin_expected(
+    modes: BaselineModes,
+    transfer: np.ndarray,
+    error: np.ndarray,
+    edges: ArrayLike,
+    buffer: float,
+    length_bin: float,
+) -> ExpectedBins:
     """Average over bins.
 
     Parameters
     ----------
     modes
-        Expected transfer function of each mode.
+        Where the modes are.
+    transfer, error
+        Expected transfer function of each, (Nbls, Ndelays); NaN without data.
     edges
         Bin edges of |k|, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
     buffer
@@ -52,20 +61,19 @@ def bin_expected(modes: BaselineModes, edges: ArrayLike, buffer: float, length_b
         Width of the bins of baseline length, m.
     """
     limits = np.asarray(edges, float)
-    known = np.isfinite(modes.transfer)
-    outside = known & outside_wedge(modes, buffer)
-    bins = np.searchsorted(limits, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
-    used = outside & (bins >= 0) & (bins < limits.size - 1)
+    known = np.isfinite(transfer)
+    bins, used = _bins_outside(modes, limits, buffer)
+    used &= known
     count = np.bincount(bins[used], minlength=limits.size - 1)
-    total = np.bincount(bins[used], modes.transfer[used], limits.size - 1)
-    square = np.bincount(bins[used], modes.error[used] ** 2, limits.size - 1)
+    total = np.bincount(bins[used], transfer[used], limits.size - 1)
+    square = np.bincount(bins[used], error[used] ** 2, limits.size - 1)
     filled = np.where(count > 0, count, np.nan)
     rows, row = np.unique(np.floor(modes.length / length_bin).astype(int), return_inverse=True)
     spacing = modes.delay[1] - modes.delay[0]
     column = np.abs(np.rint(modes.delay / spacing).astype(int))
     cell = (row[:, None] * (column.max() + 1) + column)[known]
     shape = (rows.size, column.max() + 1)
-    members, sums = (np.bincount(cell, weights, shape[0] * shape[1]) for weights in (None, modes.transfer[known]))
+    members, sums = (np.bincount(cell, weights, shape[0] * shape[1]) for weights in (None, transfer[known]))
     return ExpectedBins(
         k=(limits[1:] + limits[:-1]) / 2,
         bin_edges=limits,
@@ -75,3 +83,33 @@ def bin_expected(modes: BaselineModes, edges: ArrayLike, buffer: float, length_b
         delay=spacing * np.arange(shape[1]),
         by_length=(sums / np.where(members > 0, members, np.nan)).reshape(shape),
     )
+
+
+def bin_response(
+    modes: BaselineModes, signal: np.ndarray, response: np.ndarray, edges: ArrayLike, buffer: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return T = P^D / P^S and C = Re <S* D> / P^S outside the wedge, (Nk,) each; NaN in bins without signal.
+
+    Parameters
+    ----------
+    modes
+        Where the modes are.
+    signal, response
+        Amplitudes of the signal S and of what is left of it, D, (Nbls, Ndelays), complex.
+    edges, buffer
+        As for `bin_expected`.
+    """
+    limits = np.asarray(edges, float)
+    bins, used = _bins_outside(modes, limits, buffer)
+    left, crossed, put_in = (
+        np.bincount(bins[used], np.real(first.conj() * second)[used], limits.size - 1)
+        for first, second in ((response, response), (signal, response), (signal, signal))
+    )
+    put_in = np.where(put_in > 0, put_in, np.nan)
+    return left / put_in, crossed / put_in
+
+
+def _bins_outside(modes: BaselineModes, limits: np.ndarray, buffer: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bin of |k| of each mode, and whether it is in one and outside the wedge."""
+    bins = np.searchsorted(limits, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
+    return bins, outside_wedge(modes, buffer) & (bins >= 0) & (bins < limits.size - 1)

@@ -7,13 +7,17 @@ Of the calibrated residual R of data with the EoR, and R0 of data without it:
   free of the flux scale s as well, for a calibration that makes everything smaller must not look better for it;
 - the recovered power P^R / P^S, as it comes out.
 
+A fit that stops before its minimum leaves a part of the signal that depends on where it started and stopped. Where the
+linear response of the fit is known (`calstudy.calibrate.expected_loss`), which does not, its difference from T is a
+part of the error of T.
+
 Noise is in the errors of the last two, and not in their means, because spectra are crossed between two realizations of
 the noise. Errors are found by leaving out antennas (`calstudy.power.clusters`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,14 +37,15 @@ class CalibratedSpectra:
     ----------
     signal
         Of the EoR alone.
-    response
-        Of what the EoR changes in the residual.
+    response, cross
+        Of what the EoR changes in the residual, and of the EoR times this.
     residual, residual_without_eor
         Of the calibrated residual of data with the EoR and without.
     """
 
     signal: DelaySpectra
     response: DelaySpectra
+    cross: DelaySpectra
     residual: DelaySpectra
     residual_without_eor: DelaySpectra
 
@@ -55,6 +60,9 @@ class Score:
         Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
     transfer, transfer_error
         T s^2, free of the flux scale s, and its standard deviation, (Nk,); NaN if s is not known.
+    cross_transfer
+        C s, the coefficient of the regression of the response on the EoR, (Nk,); NaN if s is not known. It equals T s^2
+        if the fit is at its minimum and its weights are those of the spectra.
     bias, bias_error
         s^2 P^R0 / P^S, free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     recovered, recovered_error
@@ -67,11 +75,17 @@ class Score:
     bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
     transfer: np.ndarray = field(metadata={"unit": ""})
     transfer_error: np.ndarray = field(metadata={"unit": ""})
+    cross_transfer: np.ndarray = field(metadata={"unit": ""})
     bias: np.ndarray = field(metadata={"unit": ""})
     bias_error: np.ndarray = field(metadata={"unit": ""})
     recovered: np.ndarray = field(metadata={"unit": ""})
     recovered_error: np.ndarray = field(metadata={"unit": ""})
     flux_scale: float = field(metadata={"unit": ""})
+
+    def on_other_paths(self, linear: np.ndarray) -> Score:
+        """Return scores whose errors of T include its difference from the linear response, (Nk,); NaN adds nothing."""
+        spread = np.where(np.isfinite(linear), self.transfer - linear, 0.0)
+        return replace(self, transfer_error=np.hypot(self.transfer_error, spread))
 
 
 def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
@@ -95,11 +109,13 @@ def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scal
         clusters.powers(part).ratio(of_signal)
         for part in (spectra.response, spectra.residual_without_eor, spectra.residual)
     )
+    cross_transfer, _ = clusters.powers(spectra.cross).ratio(of_signal)
     return Score(
         k=(limits[1:] + limits[:-1]) / 2,
         bin_edges=limits,
         transfer=transfer * flux_scale**2,
         transfer_error=transfer_error * flux_scale**2,
+        cross_transfer=cross_transfer * flux_scale,
         bias=bias * flux_scale**2,
         bias_error=bias_error * flux_scale**2,
         recovered=recovered,

@@ -113,20 +113,16 @@ class DelaySpectra:
 
 @dataclass(frozen=True)
 class BaselineModes:
-    """Expected T of every baseline and delay, and where these modes are.
+    """The modes of baselines and delays.
 
     Attributes
     ----------
-    transfer, error
-        (Nbls, Ndelays); NaN without data.
     length, k_perp
         m and h/Mpc, (Nbls,).
     delay, k_parallel
         s and h/Mpc, ascending, (Ndelays,).
     """
 
-    transfer: np.ndarray
-    error: np.ndarray
     length: np.ndarray
     k_perp: np.ndarray
     delay: np.ndarray

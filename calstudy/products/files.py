@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -105,6 +106,11 @@ def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:
 def read_json(path: Path) -> Any:
     """Read a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+def json_number(value: float) -> float | None:
+    """Return a number as JSON has it: null if it is not finite."""
+    return float(value) if math.isfinite(value) else None
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

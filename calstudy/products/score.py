@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
-from calstudy.products import calibration, corruption, signal_loss, sky_model, spectra
+from calstudy.products import calibration, corruption, expected_loss, signal_loss, sky_model, spectra
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import DATA, MODEL, SOLUTION, read_in_parts, read_json, write_json
+from calstudy.products.files import DATA, MODEL, SOLUTION, json_number, read_in_parts, read_json, write_json
 from calstudy.products.graph import Graph, once, size_of
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from calstudy.power.score import Score
+    from calstudy.power.score import CalibratedSpectra, Score
     from calstudy.products.selection import Gains
 
 BINS, BANDS, SUMMARY = "score-bins.h5", "score-bands.h5", "score.json"
+MEASURED = 2
+"""Raised where T or the bias of the same residuals change: scores of different numbers are not ranked together."""
 SAMPLES_AT_A_TIME = 14 * 630 * 384
 """Visibilities of each data set that are in memory at a time."""
 
@@ -34,7 +36,7 @@ def score(graph: Graph) -> Task | None:
     residual, without, _ = SIGNAL_LOSS_VARIANTS
     variant = graph.experiment.variants[residual]
     inputs = {
-        **{name: loss.inputs[name] for name in ("signal", "response", "scale")},
+        **{name: loss.inputs[name] for name in ("signal", "response", "cross", "scale")},
         "residual": spectra.power(graph, residual),
         "residual_without_eor": spectra.power(graph, without),
     }
@@ -48,6 +50,8 @@ def score(graph: Graph) -> Task | None:
         inputs["gains"] = corruption.gains(graph)
     if (error := sky_model.error(graph)) is not None:
         inputs["sky_model_error"] = error
+    if (linear := expected_loss.linear_response(graph)) is not None:
+        inputs["linear_response"] = linear
     return Task(SCORE, "score", {"power": graph.experiment.power}, inputs)
 
 
@@ -60,16 +64,19 @@ def make_score(job: Job) -> Mapping[str, Any]:
     from calstudy.power.spherical import make_bin_edges
     from calstudy.power.tables import save_spectrum
 
-    names = ("signal", "response", "residual", "residual_without_eor")
+    names = ("signal", "response", "cross", "residual", "residual_without_eor")
     delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in names}
     measured = CalibratedSpectra(**of_common_units(delays))
     known = read_json(job.inputs["scale"] / signal_loss.SCALE)["flux_scale"]
     scale, power = math.nan if known is None else known, job.settings["power"]
     save_spectrum(job.output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
     bands = measure(measured, EDGES, power.wedge_buffer, scale)
+    linear = _linear_transfer(job, measured)
+    if linear is not None:
+        bands = bands.on_other_paths(linear)
     save_spectrum(job.output / BANDS, bands)
     summary = {
-        "bands": _in_bands(bands),
+        "bands": _in_bands(bands, linear),
         "flux_scale": known,
         "sky_model_error": _sky_model_error(job),
         **_gain_errors(job),
@@ -80,19 +87,26 @@ def make_score(job: Job) -> Mapping[str, Any]:
     return {}
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _in_bands(bands: Score) -> list[dict[str, Any]]:
+def _in_bands(bands: Score, linear: np.ndarray | None) -> list[dict[str, Any]]:
     names = [f"{name}{kind}" for name in ("transfer", "bias", "recovered") for kind in ("", "_error")]
     return [
         {
             "k": bands.bin_edges[band : band + 2].tolist(),
-            **{name: _number(getattr(bands, name)[band]) for name in names},
+            **{name: json_number(getattr(bands, name)[band]) for name in (*names, "cross_transfer")},
+            "linear_transfer": None if linear is None else json_number(linear[band]),
         }
         for band in range(bands.k.size)
     ]
+
+
+def _linear_transfer(job: Job, measured: CalibratedSpectra) -> np.ndarray | None:
+    """Return T of the linear response in bands, or None if it is not known or not of the same baselines."""
+    import numpy as np
+
+    if "linear_response" not in job.inputs or np.any(measured.signal.n_pairs != 1):
+        return None
+    bands = read_json(job.inputs["linear_response"] / expected_loss.RESPONSE)["bands"]
+    return None if bands is None else np.array([band["transfer"] for band in bands], float)
 
 
 def _sky_model_error(job: Job) -> float | None:
@@ -208,4 +222,4 @@ def _cost(task: Task) -> Cost:
     return Cost(0.5 + size.samples * 1.5e-7, LIBRARIES_MEMORY + 8 * part * COMPLEX128, 1e6)
 
 
-SCORE = Stage(name="score", version=2, make=make_score, cost=_cost)
+SCORE = Stage(name="score", version=3, make=make_score, cost=_cost)

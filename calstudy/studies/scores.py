@@ -18,7 +18,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.products.comparison import score_table
 from calstudy.products.files import read_json
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import SCORE, SUMMARY
+from calstudy.products.score import MEASURED, SUMMARY
 from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import upper_limit
 from calstudy.run.execution import Workers
@@ -87,8 +87,8 @@ class Scores(Section):
 
 
 def scoring_of(experiment: Experiment) -> str:
-    """Return a digest of how a calibrator is measured: the settings of the power spectra, and the version of scores."""
-    return digest_json([identity(experiment.power), SCORE.version])
+    """Return a digest of how T and bias are measured: settings of the power spectra, and a version."""
+    return digest_json([identity(experiment.power), MEASURED])
 
 
 def measure_scores(study: Comparison, budget: Budget, console: Console) -> Scores:

@@ -12,7 +12,7 @@ from test_joint_basis import joined
 from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
 from calstudy.calibrate.basis import gain_vectors
-from calstudy.calibrate.expected_loss import DelayModes, expected_transfer
+from calstudy.calibrate.expected_loss import DelayModes, expected_transfer, linear_response
 from calstudy.calibrate.problem import flag_weights, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import WarmStart, solve_warm
@@ -228,6 +228,27 @@ def test_injected_signals_are_left_as_expected():
         chosen = (np.abs(MODES.delay) >= low) & (np.abs(MODES.delay) < high)
         ratio = response[:, chosen].sum() / injected[:, chosen].sum()
         assert ratio == pytest.approx(np.mean(expected[:, chosen]), abs=0.03)
+
+
+@pytest.mark.parametrize("kind", ["any gains", "redundant", "frozen"])
+def test_linear_response_is_what_fits_of_data_with_a_signal_leave(kind):
+    problem, gains, model = case("redundant" if kind == "redundant" else "any gains")
+    if kind == "frozen":
+        problem = replace(problem, sky_model=model, frozen=True)
+    rng = np.random.default_rng(8)
+    signal = 1e-3 * complex_normal(rng, model.shape)
+    left = linear_response(problem, gains, model, signal)
+    products = gain_products(gains, problem.structure.antennas)
+    measured = replace(problem, visibilities=products * (model + signal), prior="none", initial_gains=gains)
+    solution = solve_warm(measured, GaussNewton(tolerance=1e-6, max_steps=30), WarmStart(gains, None))[0]
+    found = measured.visibilities / gain_products(solution.gains, problem.structure.antennas) - solution.model
+    # Where foregrounds and gains are nearly degenerate a fit in single precision stops before its minimum, and terms of
+    # second order are of the order of the signal, 1e-3.
+    assert np.sqrt(np.mean(np.abs(found - left) ** 2) / np.mean(np.abs(left) ** 2)) < 0.02
+    assert 0.1 < np.mean(np.abs(left) ** 2) / np.mean(np.abs(signal) ** 2) < 0.9
+    # It is a projection where foregrounds are free, and leaves everything a second time, but for the solver's damping.
+    again = linear_response(problem, gains, model, left)
+    assert np.sqrt(np.mean(np.abs(again - left) ** 2) / np.mean(np.abs(left) ** 2)) < 0.02
 
 
 def test_what_cannot_be_estimated_is_refused():

@@ -161,6 +161,7 @@ def score(world: World) -> Score:
         bin_edges=EDGES,
         transfer=world.scale_free_transfer * ones,
         transfer_error=0.01 * ones,
+        cross_transfer=world.scale_free_transfer * ones,
         bias=world.flux_scale**2 * np.where(K < 0.5, world.without_eor_bias, 0),
         bias_error=world.flux_scale**2 * error,
         recovered=world.recovered * ones,

@@ -20,8 +20,8 @@ def case(bias=1.0, bias_error=0.1, transfer=0.9, transfer_error=0.01):
     """A case with the same scores in all bands of k."""
     edges = np.array(BANDS)
     columns = {name: np.full(N_BANDS, value) for name, value in locals().items() if name != "edges"}
-    nothing = np.full(N_BANDS, np.nan)
-    score = Score(k=edges[1:], bin_edges=edges, recovered=nothing, recovered_error=nothing, flux_scale=1.0, **columns)
+    unused = dict.fromkeys(("cross_transfer", "recovered", "recovered_error"), np.full(N_BANDS, np.nan))
+    score = Score(k=edges[1:], bin_edges=edges, flux_scale=1.0, **unused, **columns)
     return Case(score, score, {})
 
 
