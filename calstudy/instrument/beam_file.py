@@ -15,14 +15,12 @@ SHA256 = "a7649c6e03b8128a1de4614c2f363af5fa44f3890ae27bf893d56ca337bc48ee"
 
 
 def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
-    """Download the embedded element beam (Sokolowski et al. 2017, 133 MB), or verify an existing copy.
+    """Download the embedded element beam (Sokolowski et al. 2017, 133 MB), or verify a copy, and return its path.
 
     Parameters
     ----------
     directory
-        Where to put it, `calstudy.base.downloads.default_directory` by default; made if need be.
-    progress
-        Whether to show a progress bar.
+        Directory of the copy, created if necessary; by default `calstudy.base.downloads.default_directory`.
 
     Raises
     ------
