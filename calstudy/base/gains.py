@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 def read_gains(path: Path, where: str) -> UVCal:
     """Read a CalH5 or calfits file, or a CASA table (a folder); `where` names the source of the path in errors.
 
-    Raises
-    ------
-    InputError
-        If it does not exist, has none of these formats, or is a CASA table and the package that reads it is missing.
+    Raises InputError if it does not exist, has none of these formats, or is a CASA table and the package that reads it
+    is missing.
     """
     from pyuvdata import UVCal
 
@@ -50,10 +48,7 @@ def read_gains(path: Path, where: str) -> UVCal:
 def at_common_channels(first: UVCal, second: UVCal) -> tuple[UVCal, UVCal]:
     """Return two sets of gains at the channels that both have, within a tenth of a channel, without changing them.
 
-    Raises
-    ------
-    InputError
-        If there is no such channel, or one of them has no gains by channel.
+    Raises InputError if there is no such channel, or one of them has no gains by channel.
     """
     for name, cal in (("first", first), ("second", second)):
         if cal.cal_type != "gain" or cal.wide_band:

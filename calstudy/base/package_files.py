@@ -26,10 +26,7 @@ def experiment_names() -> list[str]:
 def find_experiment(path: Path) -> Path:
     """Return the path of an experiment file, given its path or the name of a published one, such as ``quickstart``.
 
-    Raises
-    ------
-    InputError
-        If it is a name without suffix or folder, and neither a file nor a published experiment.
+    Raises InputError if it is a name without suffix or folder, and neither a file nor a published experiment.
     """
     if path.exists() or path.name != str(path) or path.suffix:
         return path
@@ -42,10 +39,7 @@ def find_experiment(path: Path) -> Path:
 def reference_folder() -> Path:
     """Return the folder of reference results: ``figures`` in the working directory, or the published ones.
 
-    Raises
-    ------
-    InputError
-        If neither exists.
+    Raises InputError if neither exists.
     """
     for folder in (Path("figures"), published("figures")):
         if folder.is_dir():

@@ -173,10 +173,7 @@ class Registry(Generic[P]):
     def find(self, reference: str) -> type[P]:
         """Return the class of a plug-in, given a name or the path of a Python file, with ``:Class`` if it has several.
 
-        Raises
-        ------
-        InputError
-            If there is none; the message does not name the field.
+        Raises InputError if there is none; the message does not name the field.
         """
         if (file := FILE_REFERENCE.fullmatch(reference)) is not None:
             return self._in(load_file(Path(file["path"])), reference, file["name"])
@@ -314,10 +311,8 @@ def _digest_of(path: str, modified: int, size: int) -> str:
 def load_file(path: Path) -> ModuleType:
     """Run a Python file as a module, once for each version of its content, and return the module.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not valid Python, or if running it raises an error; the message names the line.
+    Raises InputError if the file cannot be read or is not valid Python, or if running it raises an error; the message
+    names the line.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -349,10 +344,7 @@ def load_file(path: Path) -> ModuleType:
 def load_function(path: Path, name: str) -> Callable[..., Any]:
     """Return a function that a Python file defines.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be run, or defines no such function.
+    Raises InputError if the file cannot be run, or defines no such function.
     """
     module = load_file(path)
     functions = {

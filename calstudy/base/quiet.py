@@ -25,12 +25,8 @@ def require_tensorflow() -> None:
 def load_tensorflow() -> None:
     """Import TensorFlow without the messages that its native code prints before any setting takes effect.
 
-    Its import would import Keras, and with it scikit-learn. `tf.keras` imports it when it is used.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
+    Its import would import Keras, and with it scikit-learn. `tf.keras` imports it when it is used. Raises InputError if
+    it is not installed.
     """
     require_tensorflow()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

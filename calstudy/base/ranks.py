@@ -56,13 +56,9 @@ def is_helper() -> bool:
 def share(work: Callable[..., Any], *arguments: Any) -> list[Any]:
     """Run ``work(rank, size, *arguments)`` on all ranks, and return the results in the order of the ranks.
 
-    `work` is a function of a module. Without a launcher it is run in this process only.
-
-    Raises
-    ------
-    InputError
-        If the work raises an InputError, MemoryError or OSError on any rank. Any other error is a defect: it shows its
-        traceback and ends all ranks.
+    `work` is a function of a module. Without a launcher it is run in this process only. Raises InputError if the work
+    raises an InputError, MemoryError or OSError on any rank. Any other error is a defect: it shows its traceback and
+    ends all ranks.
     """
     if count() == 1:
         return [work(0, 1, *arguments)]

@@ -33,10 +33,7 @@ def total_memory() -> int:
 def parse_memory(text: str) -> float:
     """Return the number of bytes in a text such as ``6 GB`` or ``500MB``.
 
-    Raises
-    ------
-    InputError
-        If it is not a positive number with one of the units MB, GB, TB.
+    Raises InputError if it is not a positive number with one of the units MB, GB, TB.
     """
     found = re.fullmatch(r"\s*([0-9.]+)\s*([MGT]B)\s*", text)
     try:

@@ -38,12 +38,8 @@ def _fail(value: Any, reason: str) -> PydanticCustomError:
 def parse_quantity(value: Any, target: str, example: str) -> float:
     """Convert ``"80 kHz"`` or an astropy quantity to a float in the unit `target`.
 
-    `example` is a valid value for error messages.
-
-    Raises
-    ------
-    PydanticCustomError
-        If the value has no unit, an unknown unit, or a unit of another dimension, or is not finite.
+    `example` is a valid value for error messages. Raises PydanticCustomError if the value has no unit, an unknown unit,
+    or a unit of another dimension, or is not finite.
     """
     hint = f'write a number with a unit, such as "{example}"'
     if hasattr(value, "unit"):

@@ -48,13 +48,8 @@ class AntennaBeams:
 def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | AntennaBeams:
     """Return the beam of all antennas, or the beams of an array that has several.
 
-    Antennas whose beams as built are equal share one.
-
-    Raises
-    ------
-    InputError
-        If a beam file is missing, cannot be read, or does not cover the channels, or the beam cannot have the errors of
-        `instrument.as_built`.
+    Antennas whose beams as built are equal share one. Raises InputError if a beam file is missing, cannot be read, or
+    does not cover the channels, or the beam cannot have the errors of `instrument.as_built`.
     """
     assigned = assigned_beams(settings, n_antennas)
     # Antennas with `instrument.beam` first.

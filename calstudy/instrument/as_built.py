@@ -179,10 +179,7 @@ def position_offsets(settings: PositionErrors, count: int) -> np.ndarray:
 def dipole_amplitudes(settings: DipoleErrors, count: int) -> np.ndarray:
     """Return the amplitudes of the dipoles of `count` tiles, (count, 2 [x, y], 16), zero where dead.
 
-    Raises
-    ------
-    InputError
-        If all dipoles of a feed are dead.
+    Raises InputError if all dipoles of a feed are dead.
     """
     draws = np.random.default_rng(settings.seed).spawn(4)
     shape = (count, len(FEEDS), DIPOLES)

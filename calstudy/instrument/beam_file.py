@@ -36,10 +36,7 @@ def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
 def find_beam() -> Path:
     """Return the path of the beam file in the mwa_pb package or, if that has none, of the downloaded file.
 
-    Raises
-    ------
-    InputError
-        If there is neither.
+    Raises InputError if there is neither.
     """
     packaged = Path(str(files("mwa_pb") / "data" / FILE))
     if packaged.is_file():

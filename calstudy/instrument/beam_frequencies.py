@@ -32,10 +32,7 @@ def fit_range(band: tuple[float, float]) -> tuple[float, float]:
 def choose_frequencies(available: np.ndarray, band: tuple[float, float], interpolation: str) -> slice:
     """Select the tabulated frequencies, (Ntab,), Hz, ascending, from which a beam is interpolated in a band (Hz).
 
-    Raises
-    ------
-    InputError
-        If they do not enclose the band, or are fewer than `POINTS_NEEDED`.
+    Raises InputError if they do not enclose the band, or are fewer than `POINTS_NEEDED`.
     """
     low, high = fit_range(band)
     # A coarse table may have its next frequency beyond the range.
@@ -59,10 +56,7 @@ def choose_frequencies(available: np.ndarray, band: tuple[float, float], interpo
 def mwa_frequencies(path: Path | None) -> np.ndarray:
     """Return the frequencies (Hz, ascending) of an MWA beam file, by default that of `find_beam`.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, or has no frequencies of dipoles.
+    Raises InputError if the file is missing, or has no frequencies of dipoles.
     """
     path = find_beam() if path is None else path
     if not path.is_file():

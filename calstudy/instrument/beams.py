@@ -152,12 +152,7 @@ def make_beam(settings: Plugin, channels: Channels | None = None) -> Beam:
     """Return the beam of the `instrument.beam` section, by default for the channels of the paper.
 
     Tabulated beams are read and fitted over a slightly wider band than the channels, and do not accept frequencies
-    outside it.
-
-    Raises
-    ------
-    InputError
-        If a beam file is missing, cannot be read, or does not cover the channels.
+    outside it. Raises InputError if a beam file is missing, cannot be read, or does not cover the channels.
     """
     with guarded(settings):
         return model_of(settings).make(Channels() if channels is None else channels)

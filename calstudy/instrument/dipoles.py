@@ -24,12 +24,8 @@ from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_elemen
 class DipoleFields:
     """The fields of the sixteen dipoles of a tile, each driven alone, with the response of the others.
 
-    Parameters are those of `mwa_embedded_element`. `whole` is the beam of a tile with identical dipoles.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or does not cover the band.
+    Parameters are those of `mwa_embedded_element`. `whole` is the beam of a tile with identical dipoles. Raises
+    InputError if the file cannot be read or does not cover the band.
     """
 
     def __init__(self, path: Path | None, band: tuple[float, float], interpolation: str) -> None:

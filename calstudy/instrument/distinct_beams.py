@@ -41,13 +41,7 @@ def beam_count(settings: InstrumentSettings, count: int) -> int:
 
 
 def assigned_beams(settings: InstrumentSettings, count: int) -> list[AssignedBeam]:
-    """Return the beams of `count` antennas as built.
-
-    Raises
-    ------
-    InputError
-        If all dipoles of a feed are dead.
-    """
+    """Return the beams of `count` antennas as built; raises InputError if all dipoles of a feed are dead."""
     distinct, index = nominal_beams(settings), np.zeros(count, dtype=int)
     for group in settings.antenna_beams.values():
         index[list(group.antennas)] = distinct.index(group.beam)

@@ -113,10 +113,7 @@ class RedundantGroups:
 def make_layout(settings: section.Layout) -> Layout:
     """Return the antennas of the `instrument.layout` section.
 
-    Raises
-    ------
-    InputError
-        If a CSV file is missing or does not contain antenna positions.
+    Raises InputError if a CSV file is missing or does not contain antenna positions.
     """
     if isinstance(settings, section.MwaLayout):
         return _mwa(settings)

@@ -40,10 +40,7 @@ class NominalBeam:
     def splined(self, frequencies: np.ndarray) -> tuple[UVBeam | AnalyticBeam, np.ndarray]:
         """Return the E-field beam, and the coefficients of `_spline_table`, which are empty for a beam in closed form.
 
-        Raises
-        ------
-        InputError
-            If a table does not cover all azimuths.
+        Raises InputError if a table does not cover all azimuths.
         """
         if self._kept is not None and np.array_equal(self._kept[0], frequencies):
             return self._kept[1:]
@@ -71,10 +68,7 @@ class MisalignedBeam:
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
         """Return the E-field beam at `frequencies` (Hz, (Nfreqs,)).
 
-        Raises
-        ------
-        InputError
-            If feeds are exchanged and there is only one, or a table does not cover all azimuths.
+        Raises InputError if feeds are exchanged and there is only one, or a table does not cover all azimuths.
         """
         beam, splines = self._beam.splined(frequencies)
         if self._misalignment.swapped and list(beam.feed_array) != ["x", "y"]:

@@ -38,12 +38,7 @@ def make_template(settings: InstrumentSettings, autos: bool = False, as_built: b
     Baselines are (a, b) with a before b in the layout, ordered by a and then b, all of them at every time, time by
     time. The telescope drifts (unprojected phase centre); feed x is the east-west dipole, feed y the north-south one.
     Fluxes are in Jy with the convention V_xx = ½∫A I, i.e. I = XX + YY. With `as_built` the antennas have the positions
-    of `instrument.as_built`, otherwise the nominal ones.
-
-    Raises
-    ------
-    InputError
-        If the layout's file cannot be used.
+    of `instrument.as_built`, otherwise the nominal ones. Raises InputError if the layout's file cannot be used.
     """
     keep_compiled_pyuvdata()
     layout = make_array(settings)

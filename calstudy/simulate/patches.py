@@ -69,12 +69,8 @@ def visibilities(
     """Simulate an unpolarized sky, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
 
     With a tolerance of 0 every source is simulated at every integration and channel. `dtype` is the precision of the
-    products, float64 or float32; by default single precision if the tolerance allows it.
-
-    Raises
-    ------
-    InputError
-        If a polarization is not xx or yy, or `calstudy.simulate.patterns.power_pattern` does not support the beam.
+    products, float64 or float32; by default single precision if the tolerance allows it. Raises InputError if a
+    polarization is not xx or yy, or `calstudy.simulate.patterns.power_pattern` does not support the beam.
     """
     array = PatchedArray(beam, template, accuracy)
     dtype = dtype or (np.float32 if accuracy.tolerance >= SINGLE_PRECISION else np.float64)

@@ -60,10 +60,7 @@ class Catalogue:
 def brightest(flux: np.ndarray, settings: PointSources) -> np.ndarray:
     """Return the indices of the sources above the flux limit, brightest first, at most `count` of them.
 
-    Raises
-    ------
-    InputError
-        If no source is above the limit.
+    Raises InputError if no source is above the limit.
     """
     order = np.argsort(-flux, kind="stable")
     order = order[flux[order] >= settings.flux_limit][: settings.count]
@@ -84,12 +81,8 @@ def read_gleam_table(path: Path) -> Catalogue:
     """Read a table with the columns of the GLEAM catalogue (VOTable or FITS).
 
     Fluxes are the integrated ones of the wide-band image (170 to 231 MHz, effectively 200 MHz). Sources without a
-    fitted spectral index get the mean one, -0.8; sources without a flux are left out.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, cannot be read or lacks a column.
+    fitted spectral index get the mean one, -0.8; sources without a flux are left out. Raises InputError if the file is
+    missing, cannot be read or lacks a column.
     """
     if not path.is_file():
         raise InputError(f"sky.foregrounds.path: there is no file {path}")

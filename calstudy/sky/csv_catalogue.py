@@ -17,12 +17,8 @@ from calstudy.sky.settings import CsvColumns
 def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     """Read point sources from a CSV file with a header line; rows without a position or flux density are left out.
 
-    The columns are right ascension and declination (ICRS, degrees), flux density (Jy) and spectral index.
-
-    Raises
-    ------
-    ValueError
-        If a column is missing or not numeric, or a selected source has no spectral index.
+    The columns are right ascension and declination (ICRS, degrees), flux density (Jy) and spectral index. Raises
+    ValueError if a column is missing or not numeric, or a selected source has no spectral index.
     """
     table = Table.read(path, format="ascii.csv")
     wanted = {key: getattr(columns, key) for key in ("right_ascension", "declination", "flux", "spectral_index")}

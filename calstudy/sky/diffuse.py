@@ -30,10 +30,7 @@ FINEST_NSIDE = 256
 def brightness_temperature(settings: section.HaslamMap | section.SyntheticDiffuse) -> np.ndarray:
     """Return the brightness temperature of all pixels at the map's frequency, K, (Npixels,), RING order, ICRS.
 
-    Raises
-    ------
-    InputError
-        If the installed mwa_pb lacks its copy of the Haslam map.
+    Raises InputError if the installed mwa_pb lacks its copy of the Haslam map.
     """
     if isinstance(settings, section.HaslamMap):
         return healpy.ud_grade(_haslam(Path(str(HASLAM_FILE))), settings.nside)

@@ -54,10 +54,7 @@ def make_foregrounds(
 ) -> Foregrounds:
     """Return point sources and diffuse emission, as further points, for channels in Hz, (Nfreqs,).
 
-    Raises
-    ------
-    InputError
-        If a catalogue or a map is missing or cannot be used.
+    Raises InputError if a catalogue or a map is missing or cannot be used.
     """
     points = _points(settings, frequencies)
     if diffuse is None or isinstance(diffuse, section.NoDiffuse):

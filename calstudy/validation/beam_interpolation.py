@@ -54,10 +54,7 @@ def require_tabulated(beam: Plugin) -> None:
 def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> BeamInterpolation:
     """Compare the smooth fit of a beam with its table, and other interpolations with the fit at every `step`th channel.
 
-    Raises
-    ------
-    InputError
-        If the beam is not tabulated.
+    Raises InputError if the beam is not tabulated.
     """
     require_tabulated(instrument.beam)
     beams = {name: interpolated(instrument.beam, instrument.channels, name) for name in INTERPOLATIONS}

@@ -56,12 +56,8 @@ def compare_floors(
     """Simulate the foregrounds of an experiment at its middle integration, once with every interpolation.
 
     Every channel is simulated, so that only the beam is interpolated. `announce` is called with the name of each
-    interpolation before its simulation.
-
-    Raises
-    ------
-    InputError
-        If the beam is not tabulated, or a catalogue or beam file is missing.
+    interpolation before its simulation. Raises InputError if the beam is not tabulated, or a catalogue or beam file is
+    missing.
     """
     instrument = experiment.instrument
     require_tabulated(instrument.beam)

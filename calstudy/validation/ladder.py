@@ -43,12 +43,8 @@ def run_ladder(steps: Sequence[Step], store: Path, folder: Path, workers: int, c
     """Measure steps of the ladder, all of one scale, and judge them, reusing every product in the store.
 
     `folder` receives the tables, and a folder per step with its measurement, figures and manifest. Those of a failed
-    step are also kept under ``failed/``, by step and key, and never overwritten by a later run.
-
-    Raises
-    ------
-    InputError
-        If the store or the folder cannot be written. A step whose products cannot be made fails, with the reason.
+    step are also kept under ``failed/``, by step and key, and never overwritten by a later run. Raises InputError if
+    the store or the folder cannot be written. A step whose products cannot be made fails, with the reason.
     """
     products = Store(store)
     products.prepare()

@@ -47,10 +47,7 @@ def _products(step: Step, graph: Graph) -> Mapping[str, Task]:
 def measure(job: Job) -> Mapping[str, Any]:
     """Write the findings of a measurement to measurement.json, with its figures and tables.
 
-    Raises
-    ------
-    InputError
-        If a user's own measurement fails, or does not return Findings.
+    Raises InputError if a user's own measurement fails, or does not return Findings.
     """
     measurement = job.settings["measurement"]
     with guarded(measurement):

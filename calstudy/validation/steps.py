@@ -182,10 +182,7 @@ def load_ladder(
 ) -> list[Step]:
     """Read the steps with these names from a folder, or all of them, in the order of their numbers; see `load_step`.
 
-    Raises
-    ------
-    InputError
-        As for `load_step`, and if the folder contains no steps, or none of a given name.
+    Raises InputError as `load_step`, and if the folder contains no steps, or none of a given name.
     """
     if scale not in SCALES:
         raise InputError(f"--scale {scale}: not a scale of the ladder (allowed: {', '.join(SCALES)})")
