@@ -18,19 +18,9 @@ def default_directory() -> Path:
 def download(url: str, path: Path, instead: str, known_hash: str | None = None, progress: bool = True) -> None:
     """Download a file, completely or not at all, and create its folder.
 
-    Parameters
-    ----------
-    path
-        Path of the file. An existing file is kept if it has the hash, otherwise it is replaced.
-    instead
-        Alternative for the user, for the error message.
-    known_hash
-        SHA-256 that the file must have, if it is known.
-
-    Raises
-    ------
-    InputError
-        If the server cannot be reached or has no such file, the folder cannot be written, or the hash differs.
+    An existing file is kept if its SHA-256 is `known_hash`, otherwise it is replaced. `instead` is the alternative for
+    the user in the error message. Raises InputError if the server cannot be reached or has no such file, the folder
+    cannot be written, or the hash differs.
     """
     import pooch
     import requests

@@ -153,26 +153,11 @@ def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, 
 def solutions(
     cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, polarizations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains of antennas that are in `cal`, at the channels nearest to frequencies (Hz).
+    """Return gains of antennas that are in `cal`, at the channels nearest to frequencies (Hz), and their flags.
 
-    The gains should satisfy `require_solutions`.
-
-    Parameters
-    ----------
-    polarizations
-        AIPS numbers.
-
-    Returns
-    -------
-    gains
-        Complex, (len(numbers), len(frequencies), Ntimes of `cal`, len(polarizations)), in the convention "divide".
-    flags
-        Boolean, of the same shape.
-
-    Raises
-    ------
-    InputError
-        If `cal` lacks a polarization.
+    The gains should satisfy `require_solutions`. They are complex and in the convention "divide"; both arrays are
+    (len(numbers), len(frequencies), Ntimes of `cal`, len(polarizations)). `polarizations` are AIPS numbers; raises
+    InputError if `cal` lacks one.
     """
     for pol in polarizations:
         if pol not in cal.jones_array:

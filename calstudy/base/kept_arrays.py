@@ -28,18 +28,10 @@ DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZ
 def kept_arrays(
     name: str, identity: Mapping[str, Any], compute: Callable[[], Mapping[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Read arrays that an earlier process stored or, if there are none, compute and store them.
+    """Read arrays that an earlier process stored under a name or, if there are none, compute and store them.
 
-    If the folder cannot be written, only time is lost.
-
-    Parameters
-    ----------
-    name
-        Name of the arrays, a part of the file's name.
-    identity
-        All values on which the arrays depend; JSON-able.
-    compute
-        Computes the arrays. Strings and numbers are returned as arrays without axes.
+    `identity` are all values on which the arrays depend, JSON-able. Strings and numbers are returned as arrays without
+    axes. If the folder cannot be written, only time is lost.
     """
     path = default_directory() / f"{name}-{digest_json(identity)}.npz"
     try:

@@ -25,14 +25,9 @@ Source = TypeVar("Source")
 
 @dataclass(frozen=True)
 class AntennaBeams:
-    """The distinct beams of an array, and the beam of each antenna.
+    """The distinct beams of an array, and the index of the beam of each antenna in the order of the layout, (Nants,).
 
-    Attributes
-    ----------
-    beams
-        Distinct beams; the first is `instrument.beam`, as built for the first antenna that has it.
-    index
-        Index into `beams` for each antenna, in the order of the layout, (Nants,) int.
+    The first beam is `instrument.beam`, as built for the first antenna that has it.
     """
 
     beams: tuple[AntennaBeam, ...]

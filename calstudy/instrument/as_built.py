@@ -205,7 +205,7 @@ def misalignments(settings: BeamErrors, count: int) -> list[Misalignment]:
     draws = np.random.default_rng(settings.seed).standard_normal((count, 4))
     tilts = np.radians(settings.pointing_scatter) * draws[:, :2]
     rotations = np.radians(settings.rotation_scatter) * draws[:, 2]
-    # Not below a tenth, whatever is drawn.
+    # Widths are at least a tenth of the nominal one for any draw.
     widths = np.maximum(1 + settings.width_scatter * draws[:, 3], 0.1)
     return [
         Misalignment(float(east), float(north), float(rotation), float(width), antenna in settings.swapped)

@@ -17,15 +17,8 @@ SHA256 = "a7649c6e03b8128a1de4614c2f363af5fa44f3890ae27bf893d56ca337bc48ee"
 def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
     """Download the embedded element beam (Sokolowski et al. 2017, 133 MB), or verify a copy, and return its path.
 
-    Parameters
-    ----------
-    directory
-        Directory of the copy, created if necessary; by default `calstudy.base.downloads.default_directory`.
-
-    Raises
-    ------
-    InputError
-        If the download fails or is not the file.
+    The directory is by default `calstudy.base.downloads.default_directory`, and is created if necessary. Raises
+    InputError if the download fails or is not the file.
     """
     path = (default_directory() if directory is None else directory) / FILE
     instead = "set instrument.beam.path to your own copy, or use the file of the mwa_pb package (the default)"

@@ -109,13 +109,7 @@ class GriddedBeam:
         self._table = table
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
-        """Return the E-field beam tabulated at `frequencies` (Hz, (Nfreqs,)).
-
-        Raises
-        ------
-        InputError
-            If a frequency is outside the band for which the beam was made.
-        """
+        """Return the E-field beam tabulated at `frequencies` (Hz); raises InputError for any outside its band."""
         return self._table.at(frequencies)
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:

@@ -66,19 +66,11 @@ HERA_SIDES = {"hera-19": 3, "hera-37": 4}
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of the antennas of an array.
+    """Positions of the antennas of an array: east, north, up in metres about the array centre, (Nants, 3).
 
-    Attributes
-    ----------
-    numbers : (Nants,) int
-        Antenna numbers, unique. The number of an MWA tile is its index in the 128-tile configuration, also in layouts
-        that use a part of it.
-    names
-        Antenna names, unique.
-    enu : (Nants, 3) float
-        East, north, up in metres about the array centre.
-    place
-        Site of the array: its centre, for arrays at their own site.
+    Antenna numbers, (Nants,), and names are unique. The number of an MWA tile is its index in the 128-tile
+    configuration, also in layouts that use a part of it. `place` is the site: the centre of the array, for arrays at
+    their own site.
     """
 
     name: str
@@ -95,15 +87,9 @@ class Layout:
 
 @dataclass(frozen=True)
 class RedundantGroups:
-    """Redundant groups of baselines.
+    """The redundant group of each baseline, (Nbls,), numbered by first baseline, and whether it is conjugated, (Nbls,).
 
-    Attributes
-    ----------
-    index : (Nbls,) int
-        Group of each baseline; groups are numbered by their first baseline.
-    conjugated : (Nbls,) bool
-        Whether a baseline is opposite to the first baseline of its group, so that its visibility is the complex
-        conjugate of that of the group.
+    A baseline that is opposite to the first one of its group has the complex conjugate of the group's visibility.
     """
 
     index: np.ndarray

@@ -49,7 +49,7 @@ def place_of(site: Site | Coordinates) -> Place:
 def east_north_up(vectors: np.ndarray, place: Place) -> np.ndarray:
     """Return the components of geocentric vectors (N, 3) to the east, to the north and up at a place.
 
-    `pyuvdata.utils.ENU_from_ECEF` does the same, but its import dominates the time of a plan.
+    `pyuvdata.utils.ENU_from_ECEF` does the same, but importing it is slow compared with a plan.
     """
     longitude, latitude = np.radians(place.longitude), np.radians(place.latitude)
     up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]

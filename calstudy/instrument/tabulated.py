@@ -92,7 +92,7 @@ def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> d
 
 
 class TabulatedBeam:
-    """Jones components on a grid of directions, as continuous functions of frequency.
+    """Jones components on a grid of directions, as continuous functions of frequency, from `fit_table`.
 
     Interpolation "chebyshev" fits one smooth polynomial in frequency to the table, for each direction, feed and
     component. Its power at large delays is at the level of rounding. "cubic", "linear" and "nearest" interpolate from
@@ -101,21 +101,14 @@ class TabulatedBeam:
     The result is divided by its zenith value, for each feed. For these beams the zenith value is the peak. It is a
     smooth function of frequency; the largest tabulated value (the maximum over pixels and feeds) need not be.
 
-    Parameters
-    ----------
-    fitted
-        From `fit_table`.
-
     Attributes
     ----------
-    zenith_angles
-        In radians, (Nza,).
-    tabulated_frequencies
-        Those in the band, and those next to its ends, in Hz, (Ntab,).
+    zenith_angles : (Nza,) float
+        In radians.
+    tabulated_frequencies : (Ntab,) float
+        Those in the band, and those next to its ends, in Hz.
     fit_error
         Largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`.
-    description
-        From `describe`.
     """
 
     def __init__(self, fitted: Mapping[str, Any]) -> None:

@@ -33,12 +33,9 @@ class TwoDomains:
 
 
 def in_two_domains(frequency: np.ndarray, values: np.ndarray) -> TwoDomains:
-    """Transform spectra (..., Nfreqs) on equally spaced channels `frequency` (Nfreqs,) Hz to delay.
+    """Transform spectra (..., Nfreqs) on channels `frequency` (Nfreqs,) Hz to delay.
 
-    Raises
-    ------
-    ValueError
-        If the channels are not equally spaced and ascending or do not match the spectra.
+    Raises ValueError if the channels are not equally spaced and ascending or do not match the spectra.
     """
     values = np.asarray(values)
     width = channel_width(frequency)

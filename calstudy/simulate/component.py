@@ -34,19 +34,9 @@ CHECKED = 2
 class Component:
     """Sources or the EoR seen by the instrument as built; expensive parts are made on demand.
 
-    Parameters
-    ----------
-    cosmology
-        Name of the cosmology that converts the P(k) of the EoR to brightness.
-    diffuse
-        Diffuse emission that is added to the sources, or None.
-
-    Attributes
-    ----------
-    template
-        The observation with the nominal antenna positions, which data files have.
-    as_built
-        The observation with the true antenna positions, for which it is simulated.
+    `template` is the observation with the nominal antenna positions, which data files have. `as_built` has the true
+    positions, for which it is simulated. The cosmology converts the P(k) of the EoR to brightness. Diffuse emission is
+    added to sources.
     """
 
     def __init__(

@@ -35,14 +35,8 @@ class SourceTracks:
     """Direction of every component at any time within a span.
 
     The transformation is astropy's, which pyuvsim uses, at a few Chebyshev times. Directions in between are those of
-    the interpolating polynomial, equal to rounding.
-
-    Attributes
-    ----------
-    nodes : (n,) float
-        Julian dates (UTC).
-    vectors : (n, 3, Ncomponents) float
-        Unit vectors in east, north, up at these times.
+    the interpolating polynomial, equal to rounding. `nodes` are the times, (n,), Julian dates (UTC), and `vectors` are
+    unit vectors in east, north, up at these times, (n, 3, Ncomponents).
     """
 
     nodes: np.ndarray
@@ -113,22 +107,11 @@ def _enu(coordinates: SkyCoord, location: EarthLocation, time_jd: float) -> np.n
 
 
 def split_by_horizon(tracks: SourceTracks, times_jd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Separate the components that stay above the horizon from those that rise or set.
+    """Return the indices of components that are above the horizon at all times, and of those that rise or set.
 
-    The height of a source is a sinusoid of at most unit amplitude. Between two sampled times that are an angle h apart,
-    it exceeds the range of its sampled values by at most h^2 / 8.
-
-    Parameters
-    ----------
-    times_jd : (Ntimes,) float
-        All times that will be simulated or interpolated to.
-
-    Returns
-    -------
-    always_up : (N,) int
-        Indices of the components above the horizon at every time.
-    crossing : (M,) int
-        Indices of those above it at some times only, or so close to it that they might be.
+    The times are all those that will be simulated or interpolated to. Components so close to the horizon that they
+    might cross it are among the second. The height of a source is a sinusoid of at most unit amplitude. Between two
+    sampled times that are an angle h apart, it exceeds the range of its sampled values by at most h^2 / 8.
     """
     looked_at = np.unique(np.concatenate([tracks.nodes, [times_jd.min(), times_jd.max()]]))
     heights = np.stack([tracks.at(time)[2] for time in looked_at])

@@ -36,18 +36,10 @@ def make_window(taper: Taper, n_channels: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DelayFloor:
-    """Power beyond the horizon plus a buffer relative to the peak, in bins of baseline length.
+    """Power beyond the horizon plus a buffer (s) relative to the peak, in bins of baseline length with edges in m.
 
-    Attributes
-    ----------
-    edges : (Nbins + 1,) float
-        Edges of the bins in baseline length, m.
-    rms_db : (Nbins,) float
-        Rms beyond horizon + buffer over the largest rms at any delay, amplitude dB; NaN for an empty bin.
-    max_db : (Nbins,) float
-        The same for the delay with the largest rms beyond horizon + buffer.
-    buffer
-        Delay added to the horizon, s.
+    `rms_db`, (Nbins,), is the rms beyond horizon + buffer over the largest rms at any delay, in amplitude dB, and NaN
+    for an empty bin. `max_db`, (Nbins,), is the same for the delay with the largest rms beyond horizon + buffer.
     """
 
     edges: np.ndarray

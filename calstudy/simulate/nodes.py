@@ -58,14 +58,9 @@ EXACT = Accuracy(tolerance=0.0, beam_extent=0.0)
 
 @dataclass(frozen=True)
 class Axis:
-    """Nodes along time or frequency, and the matrix that interpolates from them.
+    """Nodes along time or frequency, Julian dates (UTC) or Hz, (n,), and the matrix that interpolates from them.
 
-    Attributes
-    ----------
-    nodes : (n,) float
-        Julian dates (UTC), or Hz.
-    matrix : (m, n) float
-        From values at the nodes to values at the m samples of the axis.
+    The matrix, (m, n), is from values at the nodes to values at the m samples of the axis.
     """
 
     nodes: np.ndarray
@@ -102,14 +97,9 @@ def make_axis(samples: np.ndarray, bandwidth: float, tolerance: float) -> Axis:
 def chebyshev_count(bandwidth: float, tolerance: float) -> int:
     """Return the number of Chebyshev nodes that interpolate every phasor of a bandwidth to a tolerance.
 
-    It is the smallest n with 4 sum_{k >= n} |J_k(c)| < tolerance, a bound of the error of the interpolant on n nodes.
-
-    Parameters
-    ----------
-    bandwidth
-        Half the phase in radians through which the fastest phasor turns over the interval: c in exp(i c x), |x| <= 1.
-    tolerance
-        Largest error for a phasor of unit amplitude.
+    It is the smallest n with 4 sum_{k >= n} |J_k(c)| < tolerance, a bound of the error of the interpolant on n nodes
+    for phasors of unit amplitude. The bandwidth c is half the phase in radians through which the fastest phasor exp(i c
+    x) turns over the interval |x| <= 1.
     """
     # Beyond c + 12 c^(1/3) + 40 the Bessel functions are below the smallest double that matters.
     orders = np.arange(int(bandwidth + 12 * np.cbrt(bandwidth) + 40))

@@ -96,14 +96,7 @@ def visibilities(
 
 
 class Patches:
-    """Sources sorted by the patch of the sky to which they belong.
-
-    Parameters
-    ----------
-    components : (N,) int
-        Components that are divided into patches.
-    nside
-        Resolution of the grid whose cells are the patches; 0: one patch.
+    """Sources sorted by patch of the sky; the patches are the cells of a grid, or one patch if `nside` is 0.
 
     Attributes
     ----------
@@ -200,7 +193,7 @@ class PatchedArray:
         return best if MARGIN * seconds[best] < products else small
 
     def sums(self, frequencies: np.ndarray, dtype: type, sources: float, radius: float) -> PairSums | FlatSums:
-        """Return the faster summation for a typical patch, with its number of sources and its radius (rad).
+        """Return the summation that is faster for a typical patch, given its number of sources and its radius (rad).
 
         `frequencies` are in Hz. `dtype` is the precision of products; transforms have single precision.
         """

@@ -31,17 +31,8 @@ def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
 
     VizieR generates the table for every request and publishes no hash of it. The first download is accepted if it has
     the required columns and the published number of sources, 307,455. Its SHA-256 is then saved next to it, and
-    checked at every later use.
-
-    Parameters
-    ----------
-    directory
-        Directory of the copy, created if necessary; by default `default_directory`.
-
-    Raises
-    ------
-    InputError
-        If the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
+    checked at every later use. The directory is by default `default_directory`, and is created if necessary. Raises
+    InputError if the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
     """
     directory = default_directory() if directory is None else directory
     path = directory / FILE

@@ -49,18 +49,10 @@ class GroupAgreement:
 class EngineAgreement:
     """Agreement of two simulations of the same foregrounds.
 
-    Attributes
-    ----------
-    groups
-        Ranges of baseline length that contain baselines, ascending.
-    largest, rms
-        Largest and rms difference of all visibilities over their rms.
-    worst_slot
-        Largest difference of any integration and channel over the rms of that integration and channel.
-    taper
-        Taper of the delay spectra.
-    floors, differences
-        Delay floors of the visibilities and of the difference, by taper, relative to the same peaks.
+    `groups` are ranges of baseline length that contain baselines, ascending. `largest` and `rms` are differences of all
+    visibilities over their rms. `worst_slot` is the largest difference of any integration and channel over the rms of
+    that integration and channel. `floors` and `differences` are delay floors of the visibilities and of the difference,
+    by taper, relative to the same peaks.
     """
 
     groups: tuple[GroupAgreement, ...]
@@ -93,12 +85,8 @@ class EngineAgreement:
 def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreement:
     """Compare two simulations of the same sky, beam and observation, in Jy on equally spaced channels.
 
-    Raises
-    ------
-    InputError
-        If the band leaves no delays beyond the horizon of the longest baseline.
-    ValueError
-        If the observations differ.
+    Raises InputError if the band leaves no delays beyond the horizon of the longest baseline, and ValueError if the
+    observations differ.
     """
     for name in ("baseline_array", "time_array", "freq_array", "polarization_array"):
         if not np.array_equal(getattr(foregrounds, name), getattr(reference, name)):

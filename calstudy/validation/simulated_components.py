@@ -55,18 +55,10 @@ class BaselineDelays:
 class SimulatedComponents:
     """The simulated components of an experiment, each alone.
 
-    Attributes
-    ----------
-    wedge
-        Cylindrical spectrum of F.
-    eor
-        P(k) of S as simulated, over all modes, with its sample variance.
-    expected : (Nk,) float
-        The P(k) from which S was drawn, at the centres of the bins, mK^2 h^-3 Mpc^3.
-    baselines
-        A short, a median and a long baseline.
-    buffer
-        Delay beyond the horizon at which the experiment's window starts, s.
+    `wedge` is the cylindrical spectrum of F, and `eor` is P(k) of S as simulated, over all modes, with its sample
+    variance. `expected`, (Nk,), is the P(k) from which S was drawn, at the centres of the bins, mK^2 h^-3 Mpc^3.
+    `baselines` are a short, a median and a long one. `buffer` is the delay beyond the horizon at which the experiment's
+    window starts, s.
     """
 
     wedge: CylindricalSpectrum

@@ -38,16 +38,8 @@ def first_integrations(uvd: UVData, count: int = 1) -> UVData:
 class SingleIntegration:
     """One integration of one polarization, and its parts.
 
-    Attributes
-    ----------
-    foregrounds
-        Simulated foregrounds.
-    structure, numbers
-        Structure of the fit, and the antenna numbers of its indices.
-    noise_std
-        Standard deviation of the complex noise of one sample, Jy.
-    true_gains
-        Gains of this integration, (Nants, Nfreqs), in the order of the fit's antennas.
+    `numbers` are the antenna numbers of the indices in `structure`. `noise_std` is the standard deviation of the
+    complex noise of one sample, Jy. `true_gains` are (Nants, Nfreqs), in the order of the fit's antennas.
     """
 
     foregrounds: UVData

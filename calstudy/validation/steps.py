@@ -117,19 +117,9 @@ class Step:
 def load_step(path: Path, scale: str = "full", overrides: Sequence[str] = ()) -> Step:
     """Read one step of the ladder from its YAML file.
 
-    Parameters
-    ----------
-    scale
-        "full", or "small" for the experiments and parameters under `small`.
-    overrides
-        ``path=value`` texts, applied to every experiment after all other changes.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read.
-    ExperimentError
-        If fields of the step or of an experiment are unknown, missing, or have values that are not allowed.
+    Scale "small" selects the experiments and parameters under `small`. `overrides` are ``path=value`` texts, applied to
+    every experiment after all other changes. Raises InputError if a file cannot be read, and ExperimentError if fields
+    of the step or of an experiment are unknown, missing, or have values that are not allowed.
     """
     data = read_mapping(path)
     try:
