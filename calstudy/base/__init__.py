@@ -1,1 +1,1 @@
-"""What every part builds on: errors, units, schema, data cubes, gains, this machine."""
+"""Common foundations: errors, units, schema, data cubes, gains, and the resources of the machine."""

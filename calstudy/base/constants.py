@@ -1,8 +1,8 @@
-"""Constants of nature that light modules need too."""
+"""Physical constants, without imports."""
 
 HYDROGEN_LINE = 1420405751.768
-"""Rest frequency of the 21 cm line, in Hz."""
+"""Rest frequency of the 21 cm line, Hz."""
 SPEED_OF_LIGHT = 299_792_458.0
-"""m/s."""
+"""Speed of light, m/s."""
 BOLTZMANN = 1.380649e-23
-"""J/K."""
+"""Boltzmann constant, J/K."""

@@ -9,32 +9,18 @@ from calstudy.base.errors import InputError
 
 
 def default_directory() -> Path:
-    """Return where downloads are kept on this machine."""
+    """Return the folder of downloads on this machine."""
     import pooch
 
     return Path(pooch.os_cache("calstudy"))
 
 
 def download(url: str, path: Path, instead: str, known_hash: str | None = None, progress: bool = True) -> None:
-    """Download a file, whole or not at all.
+    """Download a file, completely or not at all, and create its folder.
 
-    Parameters
-    ----------
-    url
-        Where it is.
-    path
-        Where it goes; folders are made. A file that is there already is kept if it has the hash, and else replaced.
-    instead
-        What the user can do if it cannot be had, for the error message.
-    known_hash
-        SHA-256 that it must have, if that is known.
-    progress
-        Whether to show a progress bar.
-
-    Raises
-    ------
-    InputError
-        If the server cannot be reached or has no such file, the folder cannot be written, or the hash is another.
+    An existing file is kept if its SHA-256 is `known_hash`, otherwise it is replaced. `instead` is the alternative for
+    the user in the error message. Raises InputError if the server cannot be reached or has no such file, the folder
+    cannot be written, or the hash differs.
     """
     import pooch
     import requests
@@ -43,7 +29,7 @@ def download(url: str, path: Path, instead: str, known_hash: str | None = None, 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if known_hash is None:
-            # pooch takes a file without a known hash as it is.
+            # pooch accepts any existing file if no hash is known.
             path.unlink(missing_ok=True)
         pooch.retrieve(url, known_hash=known_hash, fname=path.name, path=path.parent, progressbar=progress)
     except (requests.ConnectionError, requests.Timeout):

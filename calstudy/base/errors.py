@@ -19,11 +19,11 @@ REFUSALS = (
     errno.EIO,
     errno.ESTALE,
 )
-"""What a file system refuses for reasons that no program can know before; a file that is not there is none of them."""
+"""Errors of a file system that a program cannot foresee; a missing file is not one of them."""
 
 
 class InputError(ValueError):
-    """Something the user gave (a field, a file, a path) cannot be used; the message says what is allowed."""
+    """A user's input (a field, a file, a path) cannot be used; the message says what is allowed."""
 
 
 class ExperimentError(InputError):
@@ -38,7 +38,7 @@ class ExperimentError(InputError):
 
 
 def refusal_of_disk(error: OSError | RuntimeError) -> str | None:
-    """Return in words why a file could not be read or written, or None if the file system did not refuse it.
+    """Return the reason why a file could not be read or written, or None if the file system did not refuse it.
 
     HDF5 reports a failed write as a RuntimeError or an OSError without errno, with the number in its message.
     """
@@ -47,7 +47,7 @@ def refusal_of_disk(error: OSError | RuntimeError) -> str | None:
 
 
 def error_number(error: OSError | RuntimeError) -> int | None:
-    """Return the errno of an error, also of one of HDF5; None if it has none."""
+    """Return the errno of an error, including HDF5 errors, or None if it has none."""
     number = getattr(error, "errno", None)
     if number is None and (found := re.search(r"errno = (\d+)", str(error))):
         number = int(found[1])

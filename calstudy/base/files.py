@@ -1,4 +1,4 @@
-"""The hash of a file, and files that are there whole or not at all."""
+"""The hash of a file, and files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import IO
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hexadecimal, read anew."""
+    """Return the SHA-256 of a file's content, in hexadecimal, without a cache."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Open a stream whose content becomes `path` once the block has ended without error."""
+    """Open a stream whose content replaces `path` when the block ends without error."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     partial_file = Path(name)
     try:

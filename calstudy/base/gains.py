@@ -1,4 +1,4 @@
-"""Antenna gains as UVCal: the bridge between the standard files and arrays.
+"""Antenna gains as UVCal: conversion between standard files and arrays.
 
 The convention everywhere is that of the paper, V_ab = g_a g_b* m_ab, which pyuvdata calls "divide": calibrating divides
 by g_a g_b*.
@@ -15,7 +15,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs
 
 CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
-"""Reads and writes CASA tables and measurement sets."""
+"""Package that reads and writes CASA tables and measurement sets."""
 SAME_CHANNEL = 0.1
 """Channels of two files are the same if they differ by less than this, in units of their width."""
 
@@ -26,13 +26,10 @@ if TYPE_CHECKING:
 
 
 def read_gains(path: Path, where: str) -> UVCal:
-    """Read a CalH5 or calfits file, or a CASA table (which is a folder).
+    """Read a CalH5 or calfits file, or a CASA table (a folder); `where` names the source of the path in errors.
 
-    Raises
-    ------
-    InputError
-        If it does not exist, is none of them, or a CASA table without the package that reads it; `where` says who
-        asked for it.
+    Raises InputError if it does not exist, has none of these formats, or is a CASA table and the package that reads it
+    is missing.
     """
     from pyuvdata import UVCal
 
@@ -42,19 +39,16 @@ def read_gains(path: Path, where: str) -> UVCal:
         raise InputError(f"{where} = {str(path)!r}: no such file or folder")
     try:
         return UVCal.from_file(str(path))
-    # The readers raise whatever their libraries do; a file that cannot be read is the user's to mend.
+    # The readers raise the errors of their libraries; the user must correct a file that cannot be read.
     except (OSError, ValueError, KeyError, IndexError, RuntimeError) as error:
         kind = "CASA table of gains" if path.is_dir() else "CalH5 or calfits file"
         raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({error})") from None
 
 
 def at_common_channels(first: UVCal, second: UVCal) -> tuple[UVCal, UVCal]:
-    """Return two sets of gains at the channels that both have, within a tenth of a channel; neither is changed.
+    """Return two sets of gains at the channels that both have, within a tenth of a channel, without changing them.
 
-    Raises
-    ------
-    InputError
-        If there is no such channel, or one of them holds no gains by channel.
+    Raises InputError if there is no such channel, or one of them has no gains by channel.
     """
     for name, cal in (("first", first), ("second", second)):
         if cal.cal_type != "gain" or cal.wide_band:
@@ -81,8 +75,8 @@ def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = N
     template
         Gives telescope, channels, polarizations (xx, yy) and times.
     gains
-        Complex, shape (Nants_telescope, Nfreqs, Ntimes, Npols) in the order of `telescope.antenna_numbers`. Ntimes is
-        the template's, or 1 for gains that hold for the whole run.
+        Complex, (Nants_telescope, Nfreqs, Ntimes, Npols) in the order of `telescope.antenna_numbers`. Ntimes is
+        the template's, or 1 for gains that are constant during the run.
     flags
         Boolean of the same shape; none flagged by default.
     """
@@ -124,14 +118,14 @@ def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
 
     Returns
     -------
-    ndarray, complex128, shape (Nants_telescope, Nfreqs, Ntimes of `cal`, Npols)
+    (Nants_telescope, Nfreqs, Ntimes of `cal`, Npols) complex128
         In the order of `template.telescope.antenna_numbers` and in the convention "divide"; NaN where they are flagged,
         and for antennas that are in no baseline of the template and not in `cal`.
 
     Raises
     ------
     InputError
-        If `cal` holds delays, or lacks an antenna, a channel or a polarization of the template.
+        If `cal` has delays, or lacks an antenna, a channel or a polarization of the template.
     """
     known = template.telescope.antenna_numbers
     require_solutions(cal, np.unique(antenna_pairs(template)), template.freq_array, np.min(template.channel_width))
@@ -143,19 +137,7 @@ def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
 
 
 def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, width: float) -> None:
-    """Raise InputError if gains are delays, or lack antennas or channels.
-
-    Parameters
-    ----------
-    cal
-        The gains.
-    numbers
-        Of antennas that must have some.
-    frequencies
-        Of channels that must have some, Hz; theirs may differ by a tenth of a channel.
-    width
-        Of the channels, Hz.
-    """
+    """Raise InputError if gains are delays, or lack antennas (numbers) or channels (Hz, to a tenth of `width`)."""
     if cal.cal_type != "gain" or cal.wide_band:
         kind = f"{cal.cal_type} solutions" if cal.cal_type != "gain" else "gains of whole bands"
         raise InputError(f"gains: holds {kind}; gains by channel are needed")
@@ -171,30 +153,11 @@ def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, 
 def solutions(
     cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, polarizations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains of antennas that are in `cal`, at the channels closest to some frequencies.
+    """Return gains of antennas that are in `cal`, at the channels nearest to frequencies (Hz), and their flags.
 
-    Parameters
-    ----------
-    cal
-        The gains, see `require_solutions`.
-    numbers
-        Of antennas.
-    frequencies
-        Of channels, Hz.
-    polarizations
-        AIPS numbers.
-
-    Returns
-    -------
-    gains
-        Complex, (len(numbers), len(frequencies), Ntimes of `cal`, len(polarizations)), of the convention "divide".
-    flags
-        Of the same shape.
-
-    Raises
-    ------
-    InputError
-        If `cal` lacks a polarization.
+    The gains should satisfy `require_solutions`. They are complex and in the convention "divide"; both arrays are
+    (len(numbers), len(frequencies), Ntimes of `cal`, len(polarizations)). `polarizations` are AIPS numbers; raises
+    InputError if `cal` lacks one.
     """
     for pol in polarizations:
         if pol not in cal.jones_array:

@@ -1,4 +1,4 @@
-"""What decides a product: the fields of its settings that differ from their defaults, and the content of files."""
+"""The identity of a product: the fields of its settings that differ from their defaults, and the content of files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from calstudy.base.schema import defaults
 
 
 def digest_json(value: Any) -> str:
-    """Return a 32-digit key of any JSON-able value; equal values have equal keys, whatever the order of their keys."""
+    """Return a 32-digit key of any JSON-able value, which does not depend on the order of keys in it."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
@@ -23,16 +23,11 @@ def digest_json(value: Any) -> str:
 def identity(value: Any) -> Any:
     """Return settings as JSON that is the same for settings that give the same result.
 
-    Fields of sections are left out where they have their default, so that a field that comes later leaves the keys of
-    earlier products alone; a default that changes must raise the version of the stages that read it. The tag of a
-    choice between blocks is always there unless it is the default choice. The path of an input file counts by the
-    file's content, that of a folder by the names and contents of its files, and a plug-in by the content of its file or
+    Fields of sections are omitted if they have their default, so that a new field does not change the keys of
+    earlier products; a change of a default requires a new version of the stages that read it. The tag of a
+    choice between blocks is always present unless it is the default choice. An input file is identified by its
+    content, a folder by the names and contents of its files, and a plug-in by the content of its file or
     the version of its package.
-
-    Parameters
-    ----------
-    value
-        Sections, mappings, sequences and plain values, nested as they may be.
     """
     if isinstance(value, BaseModel):
         return _identity_of_section(value)
@@ -61,7 +56,7 @@ def _identity_of_section(section: BaseModel) -> dict[str, Any]:
             continue
         elif value != default:
             content = identity(value)
-            # A block that differs in nothing that counts is left out as well.
+            # A block with the identity of the default is left out as well.
             if not (type(value) is type(default) and isinstance(value, BaseModel) and content == identity(default)):
                 found[name] = content
     return found

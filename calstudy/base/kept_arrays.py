@@ -1,4 +1,4 @@
-"""Arrays that take long to compute, kept on this machine for later processes."""
+"""Arrays that are slow to compute, stored on this machine for later processes."""
 
 from __future__ import annotations
 
@@ -20,26 +20,18 @@ from calstudy.base.identity import digest_json
 logger = logging.getLogger(__name__)
 
 MOST = 16
-"""Files of one name that are kept: those that were used last."""
+"""Number of files of one name that are kept: the most recently used ones."""
 DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What numpy raises for an .npz file that was changed or cut short."""
+"""Errors that numpy raises for an .npz file that was changed or truncated."""
 
 
 def kept_arrays(
     name: str, identity: Mapping[str, Any], compute: Callable[[], Mapping[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Read arrays that an earlier process kept or, if there are none, compute and keep them.
+    """Read arrays that an earlier process stored under a name or, if there are none, compute and store them.
 
-    A folder that cannot be written costs the time alone.
-
-    Parameters
-    ----------
-    name
-        Of the arrays, as part of a file's name.
-    identity
-        All that decides their values; JSON-able.
-    compute
-        Computes them. Strings and numbers come back as arrays without axes.
+    `identity` are all values on which the arrays depend, JSON-able. Strings and numbers are returned as arrays without
+    axes. If the folder cannot be written, only time is lost.
     """
     path = default_directory() / f"{name}-{digest_json(identity)}.npz"
     try:
@@ -65,7 +57,7 @@ def kept_arrays(
 
 
 def _remove_oldest(folder: Path, name: str) -> None:
-    """Remove the files of a name beyond `MOST`; a process that reads one of them keeps what it has opened."""
+    """Remove the files of a name beyond `MOST`; a process that reads one of them keeps it open."""
     kept = sorted(folder.glob(f"{name}-*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
     for path in kept[MOST:]:
         path.unlink(missing_ok=True)

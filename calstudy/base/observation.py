@@ -1,6 +1,7 @@
-"""Visibilities, and what they were measured on, as plain arrays: read off a UVData once, and not derived again.
+"""Visibilities and the metadata of their array as plain arrays, extracted once from a UVData.
 
-`Frame` is what is known before there are data: antennas, baselines, channels. `Observation` adds the visibilities.
+`Frame` has the metadata that are known before there are data: antennas, baselines, channels. `Observation` adds the
+visibilities.
 """
 
 from __future__ import annotations
@@ -18,24 +19,20 @@ if TYPE_CHECKING:
 
 
 class Frame:
-    """Antennas, baselines and channels.
+    """Antennas, baselines and channels. All arrays are read-only.
 
     Parameters
     ----------
-    numbers
-        Antenna number of each antenna that is in a baseline, ascending, shape (Nants,).
-    positions
-        Antenna positions, east, north, up, m, shape (Nants, 3).
-    antennas
-        The two antennas (a, b) of each baseline as indices into `numbers`, shape (Nbls, 2).
-    frequencies
-        Channel centres, Hz, shape (Nfreqs,).
+    numbers : (Nants,) int
+        Number of each antenna that is in a baseline, ascending.
+    positions : (Nants, 3) float
+        Antenna positions, east, north, up, m.
+    antennas : (Nbls, 2) int
+        The two antennas (a, b) of each baseline as indices into `numbers`.
+    frequencies : (Nfreqs,) float
+        Channel centres, Hz.
     n_times, n_polarizations
-        How many integrations and polarizations there are.
-
-    Notes
-    -----
-    All arrays are read-only.
+        Numbers of integrations and polarizations.
     """
 
     def __init__(
@@ -58,7 +55,7 @@ class Frame:
 
     @property
     def n_baselines(self) -> int:
-        """Number of baselines, autocorrelations included where there are any."""
+        """Number of baselines, including autocorrelations if there are any."""
         return len(self.antennas)
 
     @property
@@ -73,26 +70,26 @@ class Frame:
 
     @cached_property
     def pairs(self) -> np.ndarray:
-        """Antenna numbers (a, b) of each baseline, shape (Nbls, 2)."""
+        """Antenna numbers (a, b) of each baseline, (Nbls, 2)."""
         return read_only(self.numbers[self.antennas])
 
     @cached_property
     def autos(self) -> np.ndarray:
-        """Which baselines are autocorrelations, bool, shape (Nbls,)."""
+        """Whether each baseline is an autocorrelation, bool, (Nbls,)."""
         return read_only(self.antennas[:, 0] == self.antennas[:, 1])
 
     @cached_property
     def vectors(self) -> np.ndarray:
-        """Baseline vectors x_b - x_a, east, north, up, m, shape (Nbls, 3)."""
+        """Baseline vectors x_b - x_a, east, north, up, m, (Nbls, 3)."""
         return read_only(self.positions[self.antennas[:, 1]] - self.positions[self.antennas[:, 0]])
 
     @cached_property
     def lengths(self) -> np.ndarray:
-        """Baseline lengths, m, shape (Nbls,)."""
+        """Baseline lengths, m, (Nbls,)."""
         return read_only(np.linalg.norm(self.vectors, axis=1))
 
     def baselines(self, chosen: np.ndarray) -> Frame:
-        """Return the same with a part of the baselines, chosen by a bool array of shape (Nbls,)."""
+        """Return the same with some of the baselines, selected by a bool array (Nbls,)."""
         kept, antennas = np.unique(self.antennas[chosen], return_inverse=True)
         return Frame(
             self.numbers[kept],
@@ -105,20 +102,20 @@ class Frame:
 
 
 class Observation(Frame):
-    """Visibilities of every baseline at every time, and what they were measured on.
+    """Visibilities of every baseline at every time, with their antennas, baselines and channels.
 
     Parameters
     ----------
     uvd
         Rectangular and time-major: all baselines of the first integration, then of the second, and so on. It is not
-        copied, and must not be changed afterwards. It may be without data; then there are no visibilities to be had.
+        copied, and must not be changed afterwards. It may be without data; then there are no visibilities.
 
     Attributes
     ----------
-    times
-        Julian date of each integration, shape (Ntimes,).
-    polarizations
-        AIPS numbers, such as -5 for XX, shape (Npols,).
+    times : (Ntimes,) float
+        Julian date of each integration.
+    polarizations : (Npols,) int
+        AIPS numbers, such as -5 for XX.
 
     Raises
     ------
@@ -148,17 +145,17 @@ class Observation(Frame):
 
     @cached_property
     def visibilities(self) -> np.ndarray:
-        """Visibilities in the unit of the data, complex, shape (Ntimes, Nbls, Nfreqs, Npols)."""
+        """Visibilities in the unit of the data, complex, (Ntimes, Nbls, Nfreqs, Npols)."""
         return read_only(to_cube(self._uvd))
 
     @cached_property
     def flags(self) -> np.ndarray:
-        """Which samples are flagged, bool, shape (Ntimes, Nbls, Nfreqs, Npols)."""
+        """Flags of the samples, bool, (Ntimes, Nbls, Nfreqs, Npols)."""
         return read_only(flag_cube(self._uvd))
 
     @cached_property
     def nsamples(self) -> np.ndarray:
-        """How often each sample was measured, float64, shape (Ntimes, Nbls, Nfreqs, Npols)."""
+        """Number of measurements of each sample, float64, (Ntimes, Nbls, Nfreqs, Npols)."""
         return read_only(np.asarray(self._uvd.nsample_array, float).reshape(self.shape))
 
     @cached_property
@@ -171,7 +168,7 @@ class Observation(Frame):
         return shell
 
     def baselines(self, chosen: np.ndarray) -> Observation:
-        """Return the same with a part of the baselines, chosen by a bool array of shape (Nbls,)."""
+        """Return the same with some of the baselines, selected by a bool array (Nbls,)."""
         if chosen.all():
             return self
         rows = np.flatnonzero(np.tile(chosen, self.n_times))

@@ -1,4 +1,4 @@
-"""The files that calstudy publishes: experiments, and reference results of them.
+"""The files that calstudy publishes: experiments, and their reference results.
 
 In a checkout they are its folders ``experiments`` and ``figures``, to which ``calstudy/published`` links; an installed
 package has copies.
@@ -24,17 +24,9 @@ def experiment_names() -> list[str]:
 
 
 def find_experiment(path: Path) -> Path:
-    """Return the file of an experiment.
+    """Return the path of an experiment file, given its path or the name of a published one, such as ``quickstart``.
 
-    Parameters
-    ----------
-    path
-        Of a file, or the name of a published experiment, such as ``quickstart``.
-
-    Raises
-    ------
-    InputError
-        If it is a bare name, and neither.
+    Raises InputError if it is a name without suffix or folder, and neither a file nor a published experiment.
     """
     if path.exists() or path.name != str(path) or path.suffix:
         return path
@@ -45,12 +37,9 @@ def find_experiment(path: Path) -> Path:
 
 
 def reference_folder() -> Path:
-    """Return the folder of reference results: ``figures`` of the working directory, or the published ones.
+    """Return the folder of reference results: ``figures`` in the working directory, or the published ones.
 
-    Raises
-    ------
-    InputError
-        If neither is there.
+    Raises InputError if neither exists.
     """
     for folder in (Path("figures"), published("figures")):
         if folder.is_dir():

@@ -1,9 +1,9 @@
-"""Kinds of things that can be added: calibrators, effects, estimators, figures, papers, engines.
+"""Kinds of plug-ins: calibrators, effects, estimators, figures, papers, engines.
 
-A thing is a class: its fields are its settings, its methods what it does. The built-in ones are modules of one
-package, a file each. Others are found by an entry point of an installed package, or by the path of a Python file, which
-an experiment file may give wherever it may give a name: ``calibrator: mean-gain``, ``calibrator: mine.py`` or, where a
-file holds several, ``calibrator: mine.py:MeanGain``.
+A plug-in is a class: its fields are its settings, and its methods are its behaviour. The built-in ones are modules of
+one package, a file each. Others are found by an entry point of an installed package, or by the path of a Python file,
+which an experiment file may give wherever it may give a name: ``calibrator: mean-gain``, ``calibrator: mine.py`` or, if
+a file has several, ``calibrator: mine.py:MeanGain``.
 """
 
 from __future__ import annotations
@@ -43,18 +43,19 @@ from calstudy.base.schema import Section, fault
 
 FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
 NESTED = "nested"
-"""Type of the validation error that holds the faults of a plug-in's own settings."""
+"""Type of the validation error that contains the faults of a plug-in's own settings."""
 
 
 class Plugin(Section):
-    """The base of every thing that can be added. Subclasses declare settings as fields, and what they do as methods.
+    """The base class of all plug-ins. Subclasses declare settings as fields, and behaviour as methods.
 
     Attributes
     ----------
     registry
-        The kind of thing; set by the base class of each kind.
+        The kind of plug-in; set by the base class of each kind.
     version
-        Of a built-in thing; raised whenever its results change, so that the products that depend on it are made again.
+        Version of a built-in plug-in, increased whenever its results change, so that the products that depend on it are
+        made again.
     """
 
     registry: ClassVar[Registry]
@@ -62,26 +63,26 @@ class Plugin(Section):
 
     @property
     def reference(self) -> str:
-        """The name or path under which the thing was asked for."""
+        """The name or path by which the plug-in was requested."""
         return getattr(self, self.registry.tag)
 
     @model_validator(mode="before")
     @classmethod
     def _refer_to_class(cls, data: Any) -> Any:
-        """Fill in the name where a thing is made in Python: an experiment file always gives it."""
+        """Add the name of a plug-in that is made in Python; an experiment file always gives it."""
         if isinstance(data, Mapping) and cls.registry.tag not in data:
             return {**data, cls.registry.tag: cls.registry.reference_of(cls)}
         return data
 
     @property
     def label(self) -> str:
-        """The name of the thing in file names and tables: its own, its class's in a file, or the file's."""
+        """The name of the plug-in in file names and tables: its own, its class's in a file, or the file's."""
         file = FILE_REFERENCE.fullmatch(self.reference)
         return self.reference if file is None else file["name"] or Path(file["path"]).stem
 
     @property
     def is_built_in(self) -> bool:
-        """Whether the thing is one of calstudy's own."""
+        """Whether the plug-in is one of calstudy's own."""
         return type(self).__module__.startswith(f"{self.registry.package}.")
 
     def __reduce__(self) -> tuple:
@@ -99,13 +100,13 @@ P = TypeVar("P", bound=Plugin)
 
 @dataclass(frozen=True, kw_only=True)
 class PluginField(WrapValidator):
-    """The validator of a field that holds a thing of one kind, from `Registry.field`."""
+    """The validator of a field for one kind of plug-in, from `Registry.field`."""
 
     registry: Registry[Any]
     default: str | None = None
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the JSON schema of the names, of the blocks of built-in things, and of what refers to a file."""
+        """Return the JSON schema of the names, of the blocks of built-in plug-ins, and of references to files."""
         del core
         tag, file = self.registry.tag, {"type": "string", "pattern": r"\.py(:\w+)?$"}
         allowed: list[JsonSchemaValue] = [{"enum": self.registry.names()}, file]
@@ -122,25 +123,25 @@ class PluginField(WrapValidator):
 
 
 class Registry(Generic[P]):
-    """All things of one kind: the built-in ones, those of installed packages, and those in files.
+    """All plug-ins of one kind: the built-in ones, those of installed packages, and those in files.
 
     Parameters
     ----------
     noun
-        What one of them is called, such as "calibrator".
+        Name of the kind, such as "calibrator".
     package
-        Package whose modules hold the built-in ones; module `sky_based` holds ``sky-based``. Modules whose name starts
-        with an underscore hold none.
+        Package whose modules contain the built-in ones; module `sky_based` contains ``sky-based``. Modules whose name
+        starts with an underscore contain none.
     base_path
-        ``module:class`` of the base class of all of them.
+        ``module:class`` of the base class of the kind.
     tag
-        The field of an experiment file that holds the name.
+        The field of an experiment file that contains the name.
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind") -> None:
         self.noun, self.package, self.base_path, self.tag = noun, package, base_path, tag
         self.group = f"calstudy.{noun}s"
-        # Of built-in things that were asked for: plans of comparisons ask ten thousand times.
+        # Classes of built-in plug-ins, because plans of comparisons look them up ten thousand times.
         self._found: dict[str, type[P]] = {}
         self.a_noun = f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
 
@@ -151,12 +152,12 @@ class Registry(Generic[P]):
         return getattr(import_module(module), name)
 
     def built_in(self) -> list[str]:
-        """Return the names of the built-in things."""
+        """Return the names of the built-in plug-ins."""
         return list(self._modules)
 
     @cached_property
     def _modules(self) -> dict[str, str]:
-        """The modules of the built-in things, by name."""
+        """The modules of the built-in plug-ins, by name."""
         found = [module.name for module in pkgutil.iter_modules(import_module(self.package).__path__)]
         names = {name.replace("_", "-"): f"{self.package}.{name}" for name in found if not name.startswith("_")}
         return dict(sorted(names.items()))
@@ -170,17 +171,9 @@ class Registry(Generic[P]):
         return [*self.built_in(), *sorted(set(self.installed()) - set(self.built_in()))]
 
     def find(self, reference: str) -> type[P]:
-        """Return the class of a thing.
+        """Return the class of a plug-in, given a name or the path of a Python file, with ``:Class`` if it has several.
 
-        Parameters
-        ----------
-        reference
-            A name, or the path of a Python file, with ``:Class`` where it holds several.
-
-        Raises
-        ------
-        InputError
-            If there is none; the message does not name the field.
+        Raises InputError if there is none; the message does not name the field.
         """
         if (file := FILE_REFERENCE.fullmatch(reference)) is not None:
             return self._in(load_file(Path(file["path"])), reference, file["name"])
@@ -197,7 +190,7 @@ class Registry(Generic[P]):
         raise InputError(f"{reference!r} is not {self.a_noun}{hint} (there are: {', '.join(names)}; or a file.py)")
 
     def reference_of(self, thing: type[P]) -> str:
-        """Return the name or path under which `find` finds a class; its bare name if it is in no file."""
+        """Return the name or path by which `find` finds a class, or its bare name if it is in no file."""
         package, _, name = thing.__module__.rpartition(".")
         if package == self.package:
             return name.replace("_", "-")
@@ -210,7 +203,7 @@ class Registry(Generic[P]):
             return thing.__name__
 
     def _in(self, module: ModuleType, reference: str, name: str | None = None) -> type[P]:
-        """Return the class that a module defines, the named one of several."""
+        """Return the only class that a module defines, or the one of this name."""
         found = {key: value for key, value in vars(module).items() if self._is_thing(value, module)}
         if name is not None and name not in found:
             raise InputError(f"{reference!r} holds no {self.noun} of this name (it has: {', '.join(found) or 'none'})")
@@ -230,23 +223,23 @@ class Registry(Generic[P]):
         return found
 
     def make(self, block: Any, default: str | None = None, folder: Path | None = None) -> P:
-        """Return the thing that a block of settings describes.
+        """Return the plug-in that a block of settings describes.
 
         Parameters
         ----------
         block
-            A name or path, a block of settings with the tag, or a thing, which is returned as it is.
+            A name or path, a block of settings with the tag, or a plug-in, which is returned unchanged.
         default
-            Name that a block without the tag has.
+            Name for a block without the tag.
         folder
-            Where relative paths of files start; the working directory if None.
+            Folder to which paths of files are relative; the working directory if None.
 
         Raises
         ------
         pydantic.ValidationError
-            For wrong settings.
+            If the settings are invalid.
         InputError
-            If there is no such thing.
+            If there is no such plug-in.
         """
         if isinstance(block, self.base):
             return block
@@ -255,7 +248,7 @@ class Registry(Generic[P]):
         return found.model_validate({**block, self.tag: reference}, context={"folder": folder})
 
     def class_of(self, block: Mapping[str, Any], default: str | None, folder: Path | None) -> tuple[type[P], str]:
-        """Return the class that a block of settings is for, and its name or absolute path; raises as `make`."""
+        """Return the class for a block of settings, and its name or absolute path; raises as `make`."""
         reference = block.get(self.tag, default)
         if not isinstance(reference, str):
             raise InputError(f"needs {self.tag!r}, the name of {self.a_noun} ({', '.join(self.names())}) or a file.py")
@@ -269,7 +262,7 @@ class Registry(Generic[P]):
         return self.find(reference), reference
 
     def field(self, default: str | None = None) -> PluginField:
-        """Return the validator of a field of an experiment file that holds a thing of this kind."""
+        """Return the validator of a field of an experiment file for a plug-in of this kind."""
 
         def validate(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> P:
             del handler
@@ -290,7 +283,7 @@ class Registry(Generic[P]):
         return PluginField(validate, registry=self, default=default)
 
     def identity(self, reference: str) -> str:
-        """Return what identifies the code of a thing: its name or package with a version, or the digest of its file."""
+        """Return the identity of a plug-in's code: its name or package with a version, or the digest of its file."""
         file = FILE_REFERENCE.fullmatch(reference)
         if file is not None:
             return f"sha256:{digest_file(Path(file['path']))}:{file['name'] or ''}"
@@ -304,7 +297,7 @@ class Registry(Generic[P]):
 
 
 def digest_file(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hexadecimal, remembered for a file that does not change."""
+    """Return the SHA-256 of a file's content, in hexadecimal, cached while the file does not change."""
     status = path.stat()
     return _digest_of(str(path), status.st_mtime_ns, status.st_size)
 
@@ -316,12 +309,10 @@ def _digest_of(path: str, modified: int, size: int) -> str:
 
 
 def load_file(path: Path) -> ModuleType:
-    """Run a Python file as a module, once for each content that it has, and return the module.
+    """Run a Python file as a module, once for each version of its content, and return the module.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not valid Python, or if running it raises an error; the message names the line.
+    Raises InputError if the file cannot be read or is not valid Python, or if running it raises an error; the message
+    names the line.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -353,10 +344,7 @@ def load_file(path: Path) -> ModuleType:
 def load_function(path: Path, name: str) -> Callable[..., Any]:
     """Return a function that a Python file defines.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be run, or defines no such function.
+    Raises InputError if the file cannot be run, or defines no such function.
     """
     module = load_file(path)
     functions = {
@@ -371,22 +359,15 @@ def load_function(path: Path, name: str) -> Callable[..., Any]:
 
 
 class UserCodeError(InputError):
-    """The user's own code raised an error; the message has its type, text, file and line, and nothing of calstudy."""
+    """A user's own code raised an error; the message has its type, text, file and line, and nothing of calstudy."""
 
 
 @contextmanager
 def user_code(name: str) -> Iterator[None]:
-    """Run code of a user's; what it raises, SystemExit included, becomes a `UserCodeError` that names its line.
+    """Run a user's code; its errors, SystemExit included, become a `UserCodeError` that names the line, or else `name`.
 
-    Parameters
-    ----------
-    name
-        What the code is called in the message.
-
-    Notes
-    -----
     `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
-    ours, except where the call itself does not fit the user's function.
+    defects of calstudy, except where the call itself does not fit the user's function.
     """
     try:
         yield
@@ -406,15 +387,15 @@ def user_code(name: str) -> Iterator[None]:
 
 
 def _is_users(filename: str) -> bool:
-    """Return whether a file is neither of calstudy, nor of Python or an installed package."""
+    """Return whether a file belongs neither to calstudy, nor to Python or an installed package."""
     ours = str(Path(__file__).resolve().parents[1])
     path = str(Path(filename).resolve())
     return not path.startswith((ours, sys.base_prefix, sys.prefix)) and "site-packages" not in path and "<" not in path
 
 
 def guarded(thing: Plugin) -> AbstractContextManager[None]:
-    """Return a context for calls of a thing's methods: what a user's raises becomes a sentence that names its line.
+    """Return a context for calls of a plug-in's methods, in which errors of a user's code become `UserCodeError`.
 
-    An error of a built-in thing is ours, and passes as it is.
+    Errors of built-in plug-ins pass unchanged.
     """
     return nullcontext() if thing.is_built_in else user_code(thing.label)

@@ -1,4 +1,4 @@
-"""TensorFlow: whether it is there, and its import without start-up messages and without Keras."""
+"""Detection of TensorFlow, and its import without start-up messages and without Keras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KERAS = "TF_USE_LEGACY_KERAS"
 
 
 def require_tensorflow() -> None:
-    """Raise InputError if TensorFlow is not installed; imports nothing."""
+    """Raise InputError if TensorFlow is not installed, without importing it."""
     if find_spec("tensorflow") is None:
         raise InputError(
             "TensorFlow is not installed: pip install 'calstudy[cpu]', or 'calstudy[gpu]' for TensorFlow with CUDA"
@@ -23,14 +23,10 @@ def require_tensorflow() -> None:
 
 
 def load_tensorflow() -> None:
-    """Import TensorFlow without what its native code writes to standard error before any setting is heeded.
+    """Import TensorFlow without the messages that its native code prints before any setting takes effect.
 
-    Its import would import Keras, and with it scikit-learn. `tf.keras` imports it when it is used.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
+    Its import would import Keras, and with it scikit-learn. `tf.keras` imports it when it is used. Raises InputError if
+    it is not installed.
     """
     require_tensorflow()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -42,7 +38,7 @@ def load_tensorflow() -> None:
 
 @contextmanager
 def _without_keras() -> Iterator[None]:
-    """Let TensorFlow look for the Keras of old, which is not installed; not so later, when `tf.keras` is used."""
+    """Let TensorFlow look for the legacy Keras, which is not installed; later uses of `tf.keras` are not affected."""
     given = KERAS in os.environ
     os.environ.setdefault(KERAS, "1")
     try:
@@ -54,7 +50,7 @@ def _without_keras() -> Iterator[None]:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Discard what is written to standard error within the block."""
+    """Discard output to standard error within the block."""
     sys.stderr.flush()
     kept = os.dup(2)
     silence = os.open(os.devnull, os.O_WRONLY)

@@ -1,8 +1,8 @@
-"""One run on several MPI ranks: the first leads it, the others help where the work can be shared.
+"""One run on several MPI ranks: the first leads it, and the others help where the work can be divided.
 
 Under ``mpiexec -n 8 python -m calstudy run FILE`` rank 0 is an ordinary run in one process. The others wait in `serve`,
-asleep rather than polling, until rank 0 calls `share`, and leave when rank 0 leaves `leading`, however that ends. All
-MPI calls are made in the main thread, so any level of thread support will do.
+sleeping between checks, until rank 0 calls `share`, and leave when rank 0 leaves `leading`, however that ends. All
+MPI calls are made in the main thread, so any level of thread support is sufficient.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from calstudy.base.errors import InputError
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-# How the launchers of MPICH and Open MPI tell a process which one it is, of how many.
+# Variables in which the launchers of MPICH and Open MPI give a process its rank and the number of ranks.
 LAUNCHERS = (("PMI_RANK", "PMI_SIZE"), ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"))
 WORK, END = 1, 2
 PAUSE = 0.02
-"""Seconds between two looks for work: short against any simulation, and no load on a core."""
+"""Seconds between two checks for work: short compared with any simulation, and no load on a core."""
 FLUSHED = 1.0
-"""Seconds in which the launcher passes on what a rank wrote before it aborts."""
+"""Seconds in which the launcher forwards the output of a rank before it aborts."""
 
 EXPECTED = (InputError, MemoryError, OSError)
 """Errors that all ranks survive and rank 0 reports; any other ends all of them."""
@@ -44,30 +44,21 @@ def _place() -> tuple[int, int]:
 
 
 def count() -> int:
-    """Return how many ranks a launcher started, 1 without one; imports nothing."""
+    """Return the number of ranks that a launcher started, 1 without a launcher, without importing anything."""
     return _place()[1]
 
 
 def is_helper() -> bool:
-    """Return whether this process is not the one that leads; imports nothing."""
+    """Return whether this process is not rank 0, without importing anything."""
     return _place()[0] > 0
 
 
 def share(work: Callable[..., Any], *arguments: Any) -> list[Any]:
-    """Do a piece of work on all ranks and return what each returns, in the order of the ranks.
+    """Run ``work(rank, size, *arguments)`` on all ranks, and return the results in the order of the ranks.
 
-    Parameters
-    ----------
-    work
-        A function of a module, called on every rank as ``work(rank, size, *arguments)``.
-    arguments
-        Sent to every rank. Without a launcher the work is simply done here.
-
-    Raises
-    ------
-    InputError
-        If the work raises an InputError, MemoryError or OSError on any rank. Any other error is a defect: it shows its
-        traceback and ends all ranks.
+    `work` is a function of a module. Without a launcher it is run in this process only. Raises InputError if the work
+    raises an InputError, MemoryError or OSError on any rank. Any other error is a defect: it shows its traceback and
+    ends all ranks.
     """
     if count() == 1:
         return [work(0, 1, *arguments)]
@@ -78,7 +69,7 @@ def share(work: Callable[..., Any], *arguments: Any) -> list[Any]:
 
 
 def serve() -> None:
-    """Help rank 0 until it leaves `leading`; what goes wrong here is reported there."""
+    """Help rank 0 until it leaves `leading`; rank 0 reports the errors that occur here."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Rank 0 gets the same signal, and decides.
     logging.captureWarnings(True)
     communicator = _communicator()
@@ -96,7 +87,7 @@ def serve() -> None:
 
 @contextmanager
 def leading() -> Iterator[None]:
-    """Let the other ranks go when the block ends, with an error or without; a no-op without a launcher."""
+    """Release the other ranks when the block ends, with or without an error; without a launcher do nothing."""
     try:
         yield
     finally:
@@ -139,7 +130,7 @@ def _contribute(communicator: MPI.Comm, work: Callable[..., Any], arguments: tup
 
 
 class _AllOrNone:
-    """End all ranks if one meets an error that the others do not know of: they would wait for it for ever."""
+    """End all ranks if one has an error that the others do not receive, because they would wait for it forever."""
 
     def __init__(self, communicator: MPI.Comm) -> None:
         self._communicator = communicator
@@ -153,7 +144,7 @@ class _AllOrNone:
         if kind is not None and not issubclass(kind, InputError):
             if not issubclass(kind, KeyboardInterrupt):
                 traceback.print_exception(kind, error, trace)
-                # The launcher ends all ranks at once, and what they have not written yet is lost.
+                # The launcher ends all ranks at once, and output that is not yet written is lost.
                 sys.stderr.flush()
                 time.sleep(FLUSHED)
             self._communicator.Abort(1)

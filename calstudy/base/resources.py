@@ -1,4 +1,4 @@
-"""What this machine has, and what a piece of work takes of it."""
+"""Resources of the machine, and the cost of a piece of work."""
 
 from __future__ import annotations
 
@@ -16,27 +16,24 @@ BYTES = {"MB": 1e6, "GB": 1e9, "TB": 1e12}
 
 
 def cores() -> int:
-    """Return the number of processor cores this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def free_memory() -> int:
-    """Return the bytes of memory that can be taken without swapping."""
+    """Return the memory in bytes that is available without swapping."""
     return psutil.virtual_memory().available
 
 
 def total_memory() -> int:
-    """Return the bytes of memory of this machine."""
+    """Return the memory of the machine in bytes."""
     return psutil.virtual_memory().total
 
 
 def parse_memory(text: str) -> float:
-    """Return the bytes that a text such as ``6 GB`` or ``500MB`` stands for.
+    """Return the number of bytes in a text such as ``6 GB`` or ``500MB``.
 
-    Raises
-    ------
-    InputError
-        If it is not a positive number with one of the units MB, GB, TB.
+    Raises InputError if it is not a positive number with one of the units MB, GB, TB.
     """
     found = re.fullmatch(r"\s*([0-9.]+)\s*([MGT]B)\s*", text)
     try:
@@ -49,12 +46,12 @@ def parse_memory(text: str) -> float:
 
 
 def resident_memory() -> int:
-    """Return the bytes of memory that this process holds now."""
+    """Return the resident memory of this process in bytes."""
     return psutil.Process().memory_info().rss
 
 
 def cpu_time() -> float:
-    """Return the processor seconds of this process so far, and of the programs that it started and waited for."""
+    """Return the CPU time in seconds of this process so far, and of the finished programs that it started."""
     # os.times counts the process itself in steps of 10 ms on Linux, which is more than some solves take.
     times = os.times()
     return time.process_time() + times.children_user + times.children_system
@@ -62,9 +59,9 @@ def cpu_time() -> float:
 
 @dataclass
 class Usage:
-    """Elapsed seconds, processor seconds and peak resident memory (bytes) of a block of code.
+    """Elapsed seconds, CPU seconds and peak resident memory (bytes) of a block of code.
 
-    Use as a context manager; the figures are there after the block. Processor seconds are those of all threads of this
+    Use it as a context manager; the values are available after the block. CPU seconds are those of all threads of this
     process, and of programs that it started, once it has waited for their end; these are counted in steps of 10 ms on
     Linux, and not at all on Windows. The memory is that of this process alone, sampled every 50 ms.
     """
@@ -95,7 +92,7 @@ class Usage:
 
 
 LIBRARIES_MEMORY = 0.8e9
-"""Bytes that a process takes for Python and the libraries alone."""
+"""Memory in bytes of a process with Python and the libraries alone."""
 COMPLEX128, COMPLEX64 = 16, 8
 """Bytes of a complex number."""
 

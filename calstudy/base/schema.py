@@ -1,4 +1,4 @@
-"""The base of every section of an experiment file."""
+"""The base class of every section of an experiment file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 UNKEYED: JsonDict = {"keyed": False}
-"""`json_schema_extra` of a field that changes how results are made, and not what they are (but for rounding)."""
+"""`json_schema_extra` of a field that affects how results are computed, but not their values (except for rounding)."""
 FOLDER: JsonDict = {"folder": True}
 """`json_schema_extra` of a path that is a folder of input files."""
 
@@ -29,16 +29,16 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     def reset(self, *names: str) -> Self:
-        """Return a copy in which the named fields have their defaults: for what does not read them."""
+        """Return a copy in which the named fields have their defaults, for code that does not read them."""
         found = defaults(type(self))
         return self.model_copy(update={name: found[name] for name in names})
 
 
 @cache
 def defaults(section: type[BaseModel]) -> Mapping[str, Any]:
-    """Return the default of every field of a section, not to be changed.
+    """Return the default of every field of a section; it must not be changed.
 
-    pydantic makes a new copy whenever it is asked, which would be half the time of a plan.
+    The defaults are cached, because pydantic makes a new copy at every call, which is slow.
     """
     return {name: field.get_default(call_default_factory=True) for name, field in section.model_fields.items()}
 
@@ -75,9 +75,9 @@ class ChoiceValidator(BeforeValidator):
 
 
 def choice(key: str, default: str | None = None) -> BeforeValidator:
-    """Make the tag `key` of a choice between blocks easy to write.
+    """Allow short forms of a choice between blocks with the tag `key`.
 
-    A bare string stands for the block with its defaults (``beam: airy`` for ``beam: {kind: airy}``), and a block
+    A bare string means the block with its defaults (``beam: airy`` for ``beam: {kind: airy}``), and a block
     without the tag is the `default` one.
     """
 
@@ -92,5 +92,5 @@ def choice(key: str, default: str | None = None) -> BeforeValidator:
 
 
 def fault(path: str, sentence: str) -> PydanticCustomError:
-    """Return the error for a fault that involves several fields; `path` is the dotted path to name, `sentence` why."""
+    """Return the error for a fault that involves several fields, with the dotted `path` of a field and a sentence."""
     return PydanticCustomError("fault", "{sentence}", {"path": path, "sentence": sentence})

@@ -1,4 +1,4 @@
-"""TensorFlow as everything here imports it: from this module."""
+"""TensorFlow, imported from this module everywhere in calstudy."""
 
 from calstudy.base.quiet import load_tensorflow
 

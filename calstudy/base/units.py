@@ -1,4 +1,4 @@
-"""Physical quantities in experiment files: strings with units outside, SI floats inside.
+"""Physical quantities in experiment files: strings with units in the file, SI floats in the program.
 
 Each type below is a field type for `calstudy.base.schema.Section`: it accepts a string such as ``"80 kHz"`` (or an
 astropy `Quantity`), refuses a bare number, and yields a float in the type's own unit. It serializes back to a string
@@ -22,7 +22,7 @@ NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$
 
 @lru_cache(maxsize=256)
 def _factor(unit: str, target: str) -> float:
-    """Multiply a number in `unit` by this to have it in `target`; raises ValueError if the dimensions differ."""
+    """Return the factor from `unit` to `target`; raises ValueError if the dimensions differ."""
     from astropy import units
 
     try:
@@ -36,21 +36,10 @@ def _fail(value: Any, reason: str) -> PydanticCustomError:
 
 
 def parse_quantity(value: Any, target: str, example: str) -> float:
-    """Turn ``"80 kHz"`` or an astropy quantity into a float in the unit `target`.
+    """Convert ``"80 kHz"`` or an astropy quantity to a float in the unit `target`.
 
-    Parameters
-    ----------
-    value
-        A string of a number and a unit, or an astropy `Quantity`.
-    target
-        Unit of the returned float, in astropy's notation.
-    example
-        A valid value, shown in error messages.
-
-    Raises
-    ------
-    PydanticCustomError
-        If the value has no unit, an unknown unit, or a unit of another dimension, or is not finite.
+    `example` is a valid value for error messages. Raises PydanticCustomError if the value has no unit, an unknown unit,
+    or a unit of another dimension, or is not finite.
     """
     hint = f'write a number with a unit, such as "{example}"'
     if hasattr(value, "unit"):
@@ -70,12 +59,12 @@ def parse_quantity(value: Any, target: str, example: str) -> float:
         factor = _factor(unit, target)
     except (ValueError, TypeError):
         raise _fail(value, f"has a unit that cannot be converted to {target}: {hint}") from None
-    # Decimal units read better, and hash the same however they were written, without binary dust.
+    # Rounding removes binary errors: numbers are easier to read, and equal quantities in any unit have equal hashes.
     return float(f"{number * factor:.15g}")
 
 
 def parse_decibel(value: Any) -> float:
-    """Turn ``"-40 dB"`` into the float -40.0; raises PydanticCustomError for anything else."""
+    """Convert ``"-40 dB"`` to the float -40.0; raises PydanticCustomError for anything else."""
     match = NUMBER.match(value) if isinstance(value, str) else None
     if match is None or match[2] != "dB":
         raise _fail(value, 'is not a level in decibel: write for example "-40 dB"')
@@ -85,7 +74,7 @@ def parse_decibel(value: Any) -> float:
 
 
 def parse_hour_angle(value: Any) -> float:
-    """Turn ``"1.8 h"`` or an angle (``"27 deg"``) into a float in hours of right ascension."""
+    """Convert ``"1.8 h"`` or an angle (``"27 deg"``) to a float in hours of right ascension."""
     match = NUMBER.match(value) if isinstance(value, str) else None
     if match is not None and match[2] in ("h", "hr", "hour"):
         return float(match[1])
@@ -93,7 +82,7 @@ def parse_hour_angle(value: Any) -> float:
 
 
 def parse_wavenumber(value: Any) -> float:
-    """Turn ``"0.2 h/Mpc"`` into a float in h/Mpc; other units are refused, for h is a choice of cosmology."""
+    """Convert ``"0.2 h/Mpc"`` to a float in h/Mpc; other units are refused, because h depends on the cosmology."""
     match = NUMBER.match(value) if isinstance(value, str) else None
     if match is None or match[2].replace(" ", "") not in ("h/Mpc", "hMpc-1", "hMpc^-1"):
         raise _fail(value, 'is not a wavenumber: write for example "0.2 h/Mpc"')
@@ -101,7 +90,7 @@ def parse_wavenumber(value: Any) -> float:
 
 
 def parse_fraction(value: Any) -> float:
-    """Turn ``"15 %"`` or the number 0.15 into the float 0.15; raises PydanticCustomError for anything else."""
+    """Convert ``"15 %"`` or the number 0.15 to the float 0.15; raises PydanticCustomError for anything else."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         if not math.isfinite(value):
             raise _fail(value, "is not finite")

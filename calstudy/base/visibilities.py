@@ -1,7 +1,7 @@
-"""Visibilities as one rectangular cube: the bridge between UVData and the numerical core.
+"""Visibilities as one rectangular cube: conversion between UVData and arrays.
 
 Every data set of a study has all its baselines at all its times, ordered time-major (all baselines of the first
-integration, then of the second, and so on). The functions here check that and reshape; they copy nothing they need not.
+integration, then of the second, and so on). The functions here check that and reshape, without unnecessary copies.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 @cache
 def keep_compiled_pyuvdata() -> None:
-    """Keep on disk what pyuvdata compiles for the numbers of baselines: 3 s in every process, for 20 ms of work.
+    """Cache pyuvdata's compiled conversions of baseline numbers on disk, because each process would compile them again.
 
-    Numba keeps it beside the package, or in the user's cache folder if that cannot be written.
+    Numba stores them beside the package, or in the user's cache folder if that cannot be written.
     """
     from pyuvdata.utils import antnums_to_baseline, baseline_to_antnums, bls
 
@@ -28,10 +28,10 @@ def keep_compiled_pyuvdata() -> None:
     for name in names:
         enable = getattr(getattr(bls, name, None), "enable_caching", None)
         if enable is not None:
-            # No folder can be written: it is compiled in every process.
+            # If no folder can be written, it is compiled in every process.
             with suppress(RuntimeError):
                 enable()
-    # A full disk stops numba once for each function, which then serves this process.
+    # On a full disk numba fails once for each function, which can then be used in this process.
     for _ in names:
         with suppress(OSError):
             numbers = antnums_to_baseline(np.zeros(1, int), np.ones(1, int), Nants_telescope=2)
@@ -63,9 +63,9 @@ def flag_cube(uvd: UVData) -> np.ndarray:
 
 
 def from_cube(template: UVData, cube: np.ndarray) -> UVData:
-    """Return a copy of `template` that holds `cube`, of shape (Ntimes, Nbls, Nfreqs, Npols).
+    """Return a copy of `template` with the visibilities `cube`, of shape (Ntimes, Nbls, Nfreqs, Npols).
 
-    Flags and nsamples are the template's, or none flagged and one where it has none.
+    Flags and nsamples are the template's; if it has none, nothing is flagged and nsamples are one.
     """
     require_rectangular(template)
     shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
@@ -83,25 +83,25 @@ def from_cube(template: UVData, cube: np.ndarray) -> UVData:
 
 
 def antenna_pairs(uvd: UVData) -> np.ndarray:
-    """Return the antenna numbers (a, b) of each baseline, shape (Nbls, 2), in the order of `to_cube`."""
+    """Return the antenna numbers (a, b) of each baseline, (Nbls, 2), in the order of `to_cube`."""
     return np.column_stack([uvd.ant_1_array[: uvd.Nbls], uvd.ant_2_array[: uvd.Nbls]])
 
 
 def antenna_indices(uvd: UVData) -> np.ndarray:
-    """Return `antenna_pairs` as indices into `uvd.telescope.antenna_numbers`, shape (Nbls, 2)."""
+    """Return `antenna_pairs` as indices into `uvd.telescope.antenna_numbers`, (Nbls, 2)."""
     order = np.argsort(uvd.telescope.antenna_numbers)
     return order[np.searchsorted(uvd.telescope.antenna_numbers, antenna_pairs(uvd), sorter=order)]
 
 
 def antenna_rows(uvd: UVData) -> np.ndarray:
-    """Return where the antennas of the baselines, by ascending number, are in `uvd.telescope.antenna_numbers`."""
+    """Return the indices in `uvd.telescope.antenna_numbers` of the antennas of the baselines, by ascending number."""
     order = np.argsort(uvd.telescope.antenna_numbers)
     numbers = np.unique(antenna_pairs(uvd))
     return order[np.searchsorted(uvd.telescope.antenna_numbers, numbers, sorter=order)]
 
 
 def baseline_vectors(uvd: UVData) -> np.ndarray:
-    """Return x_b - x_a in east, north, up metres for each baseline (a, b), shape (Nbls, 3)."""
+    """Return x_b - x_a in east, north, up metres for each baseline (a, b), (Nbls, 3)."""
     enu = uvd.telescope.get_enu_antpos()
     first, second = antenna_indices(uvd).T
     return enu[second] - enu[first]

@@ -25,14 +25,9 @@ Source = TypeVar("Source")
 
 @dataclass(frozen=True)
 class AntennaBeams:
-    """The distinct beams of an array, and the beam of each antenna.
+    """The distinct beams of an array, and the index of the beam of each antenna in the order of the layout, (Nants,).
 
-    Attributes
-    ----------
-    beams
-        Distinct beams; the first is `instrument.beam`, as the first antenna that has it is built.
-    index
-        Index into `beams` for each antenna, in the order of the layout, (Nants,) int.
+    The first beam is `instrument.beam`, as built for the first antenna that has it.
     """
 
     beams: tuple[AntennaBeam, ...]
@@ -40,7 +35,7 @@ class AntennaBeams:
 
     @property
     def stand_in(self) -> str | None:
-        """The stand-in for the paper's beam: that of `instrument.beam`, and the number of antennas with other beams."""
+        """The note on the beam of `instrument.beam`, and the number of antennas with other beams."""
         others = f"antennas with another: {int((self.index > 0).sum())}"
         return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
 
@@ -48,18 +43,8 @@ class AntennaBeams:
 def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | AntennaBeams:
     """Return the beam of all antennas, or the beams of an array that has several.
 
-    Parameters
-    ----------
-    settings
-        The `instrument` section. Antennas with equal beams, as built, share one.
-    n_antennas
-        Antennas of the layout.
-
-    Raises
-    ------
-    InputError
-        If a beam file is missing, cannot be read, or does not cover the channels, or the beam cannot have the errors of
-        `instrument.as_built`.
+    Antennas whose beams as built are equal share one. Raises InputError if a beam file is missing, cannot be read, or
+    does not cover the channels, or the beam cannot have the errors of `instrument.as_built`.
     """
     assigned = assigned_beams(settings, n_antennas)
     # Antennas with `instrument.beam` first.
@@ -70,7 +55,6 @@ def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | A
 
 
 def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[AntennaBeam]:
-    """Return the distinct beams of an array."""
     models = nominal_beams(settings)
     made: dict[tuple, Beam] = {}
     for model in dict.fromkeys(beam.model for beam in distinct):
@@ -90,7 +74,7 @@ def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[An
 
 
 def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source | AntennaBeam, ...], np.ndarray]:
-    """Return the distinct beams of an array, and which of them each antenna of the telescope has, (Nants,) int."""
+    """Return the distinct beams of an array, and the index of the beam of each antenna, (Nants,) int."""
     if isinstance(beam, AntennaBeams):
         return beam.beams, beam.index
     return (beam,), np.zeros(template.telescope.Nants, dtype=int)

@@ -1,6 +1,6 @@
-"""How the antennas are built: what makes the true instrument differ from the nominal one, by antenna.
+"""The antennas as built: differences between the true and the nominal instrument, by antenna.
 
-Simulations are of the instrument as built. Data files, calibrators and figures have the nominal one. Draws are scaled
+Simulations use the instrument as built. Data files, calibrators and figures use the nominal one. Draws are scaled
 by their scatter or compared with their fraction, so that a seed gives the same pattern of errors at every severity.
 """
 
@@ -49,7 +49,7 @@ class DipoleErrors(Section):
     """Amplitudes of the 16 dipoles of MWA tiles, nominally one, for the beam `mwa-embedded-element`.
 
     The beam of a tile is computed from its dipoles with their mutual coupling, and is one at the zenith like all beams
-    here: what a tile loses there is a gain, and gains are effects.
+    here: a loss at the zenith is a gain error, and gains are effects.
     """
 
     dead_fraction: Fraction = Field(
@@ -78,8 +78,8 @@ class DipoleErrors(Section):
 class BeamErrors(Section):
     """True less nominal orientation and width of the beams of antennas, of any kind of beam.
 
-    An antenna is turned as a whole, with its polarization. The beams of unpolarized formulas (gaussian, airy) are
-    turned without it.
+    An antenna is rotated as a whole, with its polarization. The beams of unpolarized formulas (gaussian, airy) are
+    rotated without it.
     """
 
     pointing_scatter: Angle = Field(
@@ -114,7 +114,7 @@ class BeamErrors(Section):
 
 
 class AsBuilt(Section):
-    """True less nominal instrument: what is simulated, and what nobody but the simulation knows."""
+    """True less nominal instrument: it is simulated, but calibrators do not know it."""
 
     positions: PositionErrors = PositionErrors()
     dipoles: DipoleErrors = DipoleErrors()
@@ -122,7 +122,7 @@ class AsBuilt(Section):
 
     @property
     def drawn_seeds(self) -> dict[str, int]:
-        """The seeds from which numbers are drawn, by block; dipoles have generators that are spawned, independent."""
+        """The seeds that are used, by block; those of dipoles are left out, because their generators are spawned."""
         beams = self.beams
         drawn = {
             "positions": self.positions.scatter > 0,
@@ -132,7 +132,7 @@ class AsBuilt(Section):
 
     @property
     def note(self) -> str | None:
-        """What differs from the nominal instrument, in words, or None."""
+        """A description of the differences from the nominal instrument, or None."""
         dipoles, beams = self.dipoles, self.beams
         found = {
             "positions": f"{100 * self.positions.scatter:g} cm" if self.positions.scatter else "",
@@ -153,23 +153,15 @@ COLUMNS = (
     *("east_m", "north_m", "up_m", "dipoles_x", "dipoles_y"),
     *("tilt_east_deg", "tilt_north_deg", "rotation_deg", "width", "swapped"),
 )
-"""What `as_built_rows` says of an antenna."""
+"""Columns of `as_built_rows`."""
 
 
 @dataclass(frozen=True)
 class Misalignment:
     """Orientation and width of the beam of one antenna.
 
-    Attributes
-    ----------
-    east, north
-        Tilt of the antenna's axis towards east and north, rad.
-    rotation
-        About the vertical, from east towards north, rad.
-    width
-        Over the nominal width.
-    swapped
-        Whether its feeds are exchanged.
+    `east` and `north` are the tilts of the antenna's axis towards east and north, and `rotation` is about the vertical
+    from east towards north, rad. `width` is relative to the nominal width.
     """
 
     east: float = 0.0
@@ -187,10 +179,7 @@ def position_offsets(settings: PositionErrors, count: int) -> np.ndarray:
 def dipole_amplitudes(settings: DipoleErrors, count: int) -> np.ndarray:
     """Return the amplitudes of the dipoles of `count` tiles, (count, 2 [x, y], 16), zero where dead.
 
-    Raises
-    ------
-    InputError
-        If all dipoles of a feed are dead.
+    Raises InputError if all dipoles of a feed are dead.
     """
     draws = np.random.default_rng(settings.seed).spawn(4)
     shape = (count, len(FEEDS), DIPOLES)
@@ -216,7 +205,7 @@ def misalignments(settings: BeamErrors, count: int) -> list[Misalignment]:
     draws = np.random.default_rng(settings.seed).standard_normal((count, 4))
     tilts = np.radians(settings.pointing_scatter) * draws[:, :2]
     rotations = np.radians(settings.rotation_scatter) * draws[:, 2]
-    # Not below a tenth, whatever is drawn.
+    # Widths are at least a tenth of the nominal one for any draw.
     widths = np.maximum(1 + settings.width_scatter * draws[:, 3], 0.1)
     return [
         Misalignment(float(east), float(north), float(rotation), float(width), antenna in settings.swapped)
@@ -225,9 +214,9 @@ def misalignments(settings: BeamErrors, count: int) -> list[Misalignment]:
 
 
 def as_built_rows(settings: AsBuilt, count: int) -> list[tuple[str, ...]]:
-    """Return what differs from the nominal instrument for each of `count` antennas, as texts in the order of `COLUMNS`.
+    """Return the differences of `count` antennas from the nominal instrument, as texts in the order of `COLUMNS`.
 
-    Dipoles are 16 amplitudes, nominally one and zero where dead; the width is that over the nominal one.
+    Dipoles are 16 amplitudes, nominally one and zero where dead; the width is relative to the nominal one.
     """
     offsets = position_offsets(settings.positions, count)
     amplitudes = dipole_amplitudes(settings.dipoles, count)

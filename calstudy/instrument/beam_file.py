@@ -15,19 +15,10 @@ SHA256 = "a7649c6e03b8128a1de4614c2f363af5fa44f3890ae27bf893d56ca337bc48ee"
 
 
 def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
-    """Download the embedded element beam (Sokolowski et al. 2017, 133 MB), or verify an existing copy.
+    """Download the embedded element beam (Sokolowski et al. 2017, 133 MB), or verify a copy, and return its path.
 
-    Parameters
-    ----------
-    directory
-        Where to put it, `calstudy.base.downloads.default_directory` by default; made if need be.
-    progress
-        Whether to show a progress bar.
-
-    Raises
-    ------
-    InputError
-        If the download fails or is not the file.
+    The directory is by default `calstudy.base.downloads.default_directory`, and is created if necessary. Raises
+    InputError if the download fails or is not the file.
     """
     path = (default_directory() if directory is None else directory) / FILE
     instead = "set instrument.beam.path to your own copy, or use the file of the mwa_pb package (the default)"
@@ -38,10 +29,7 @@ def fetch_beam(directory: Path | None = None, progress: bool = True) -> Path:
 def find_beam() -> Path:
     """Return the path of the beam file in the mwa_pb package or, if that has none, of the downloaded file.
 
-    Raises
-    ------
-    InputError
-        If there is neither.
+    Raises InputError if there is neither.
     """
     packaged = Path(str(files("mwa_pb") / "data" / FILE))
     if packaged.is_file():

@@ -1,4 +1,4 @@
-"""The tabulated frequencies from which a beam is interpolated: what a plan can check without reading the beam."""
+"""Selection of the tabulated frequencies from which a beam is interpolated, without reading the beam."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FIT_BAND = 36e6
 FIT_MARGIN = 2.56e6
 POINTS_NEEDED = {"chebyshev": 1, "cubic": 4, "linear": 2, "nearest": 1}
 MWA_GROUP = re.compile(r"[XY]\d+_(\d+)")
-"""Groups of an MWA beam file: dipole and frequency in Hz."""
+"""Names of the groups of an MWA beam file: dipole and frequency in Hz."""
 
 
 def fit_range(band: tuple[float, float]) -> tuple[float, float]:
@@ -30,21 +30,9 @@ def fit_range(band: tuple[float, float]) -> tuple[float, float]:
 
 
 def choose_frequencies(available: np.ndarray, band: tuple[float, float], interpolation: str) -> slice:
-    """Return which tabulated frequencies serve to interpolate a beam in a band.
+    """Select the tabulated frequencies, (Ntab,), Hz, ascending, from which a beam is interpolated in a band (Hz).
 
-    Parameters
-    ----------
-    available
-        Frequencies of the table in Hz, ascending, (Ntab,).
-    band
-        Lowest and highest frequency of interest in Hz.
-    interpolation
-        One of `POINTS_NEEDED`.
-
-    Raises
-    ------
-    InputError
-        If they do not enclose the band, or are too few.
+    Raises InputError if they do not enclose the band, or are fewer than `POINTS_NEEDED`.
     """
     low, high = fit_range(band)
     # A coarse table may have its next frequency beyond the range.
@@ -68,10 +56,7 @@ def choose_frequencies(available: np.ndarray, band: tuple[float, float], interpo
 def mwa_frequencies(path: Path | None) -> np.ndarray:
     """Return the frequencies (Hz, ascending) of an MWA beam file, by default that of `find_beam`.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, or has no frequencies of dipoles.
+    Raises InputError if the file is missing, or has no frequencies of dipoles.
     """
     path = find_beam() if path is None else path
     if not path.is_file():
@@ -94,5 +79,5 @@ def _mwa_frequencies(path: Path, modified: int) -> np.ndarray:
 
 
 def megahertz(low: float, high: float) -> str:
-    """Write a range of frequencies, given in Hz."""
+    """Format a range of frequencies, given in Hz."""
     return f"{low / 1e6:g} to {high / 1e6:g} MHz"

@@ -1,7 +1,7 @@
 """Beams of UVBeam files, on grids or HEALPix, E-field or power, as E-fields on a grid of azimuth and zenith angle.
 
-Components along azimuth and zenith angle jump at the zenith. Between pixels it is therefore the components along two
-fixed directions that are interpolated (`fixed_components`).
+Components along azimuth and zenith angle are discontinuous at the zenith. Therefore the components along two fixed
+directions are interpolated between pixels (`fixed_components`).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from calstudy.base.errors import InputError
 POLARIZATIONS = {"x": -5, "y": -6}
 # HEALPix maps finer than this are put on a grid finer than one point per degree.
 DEGREE_NSIDE = 64
-# Of the splines across the rings of a HEALPix map.
+# Degree of the splines across the rings of a HEALPix map.
 SPLINE_DEGREE = 5
-# Of a ring of n pixels, orders above (n - 1) / 2 by this are taken for zero: amplitudes grow as a power of the angle.
+# In a ring of n pixels, orders that exceed (n - 1) / 2 by this are zero: amplitudes grow as a power of the angle.
 UNRESOLVED = 2
 # Rings below the horizon that splines may use (rad).
 BELOW = np.radians(15)
@@ -33,11 +33,8 @@ def read_beamfits(path: Path) -> UVBeam:
     """Read a beam from a beamfits file, as an E-field on a grid of azimuth and zenith angle from the zenith.
 
     The phases of a power beam are lost: its field is the square root of the power, along the direction of the feed.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, cannot be read, or has other feeds than x and y, or not the sky above the horizon.
+    Raises InputError if the file is missing, cannot be read, has feeds other than x and y, or lacks a part of the sky
+    above the horizon.
     """
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
@@ -48,11 +45,11 @@ def read_beamfits(path: Path) -> UVBeam:
 def _read(path: Path, modified: int) -> UVBeam:
     del modified
     with warnings.catch_warnings():
-        # Files of earlier versions lack what pyuvdata now wants to know; what is used here is checked below.
+        # Files of earlier versions lack metadata that pyuvdata now requires; those used here are checked below.
         warnings.simplefilter("ignore")
         try:
             beam = UVBeam.from_file(path, file_type="beamfits")
-        # A damaged file makes the reader raise whatever its libraries do.
+        # For a damaged file the reader raises the exceptions of its libraries.
         except (OSError, KeyError, ValueError, IndexError, TypeError, AttributeError, NotImplementedError) as error:
             raise InputError(f"instrument.beam.path: {path} cannot be read as beamfits ({error})") from error
     feeds = _feeds(beam)
@@ -115,7 +112,7 @@ def _on_grid(beam: UVBeam, feeds: list[str], path: Path) -> UVBeam:
 
 
 def _smooth_values(beam: UVBeam, feeds: list[str]) -> np.ndarray:
-    """Return what is smooth at the zenith: power, (Nfeeds, ...), or fixed components of the field, (2, Nfeeds, ...)."""
+    """Return power, (Nfeeds, ...), or fixed field components, (2, Nfeeds, ...), which are smooth at the zenith."""
     if beam.beam_type == "power":
         places = [list(beam.polarization_array).index(POLARIZATIONS[feed]) for feed in feeds]
         return beam.data_array[0, places].real.astype(complex)
@@ -128,21 +125,11 @@ def _smooth_values(beam: UVBeam, feeds: list[str]) -> np.ndarray:
 class HealpixRings:
     """The rings of a HEALPix beam above the horizon and a little below.
 
-    The pixels of a ring are equally spaced, and give its Fourier coefficients in azimuth as far as they are many
-    enough. Splines in zenith angle join those of all rings, order by order. They go on beyond the zenith, where a
-    coefficient of order m returns with the sign (-1)^m, and at which all but that of order 0 vanish.
-
-    Parameters
-    ----------
-    beam
-        On HEALPix; azimuth from east through north is the longitude.
-    path
-        For messages.
-
-    Raises
-    ------
-    InputError
-        If a pixel above the horizon is missing.
+    The pixels of a ring are equally spaced, and give its Fourier coefficients in azimuth up to the order that their
+    number allows. Splines in zenith angle join those of all rings, order by order. They continue beyond the zenith,
+    where a coefficient of order m returns with the sign (-1)^m, and at which all but that of order 0 vanish. The
+    azimuth, from east through north, is the longitude of the beam. Raises InputError if a pixel above the horizon is
+    missing.
     """
 
     def __init__(self, beam: UVBeam, path: Path) -> None:
@@ -163,7 +150,7 @@ class HealpixRings:
             self._rings.append((members, float(longitude[start])))
             angles.append(angle)
         self._zenith_angles = np.array(angles)
-        # Coefficients of a higher order cannot be told from those of a lower one.
+        # Coefficients of a higher order are aliased with those of a lower one.
         self._resolved = np.array([(len(members) - 1) // 2 for members, _ in self._rings])
 
     def on_grid(self, values: np.ndarray, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
@@ -185,7 +172,7 @@ class HealpixRings:
 
     def _along_zenith_angle(self, order: int, coefficients: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
         """Return the coefficients (Nrings, ...) of an order at other zenith angles, (Nza, ...)."""
-        # Rings of too few pixels are left out where the coefficient may matter, and are zero further in.
+        # Rings of too few pixels are left out where the coefficient may matter, and are zero closer to the zenith.
         used = (self._resolved >= abs(order)) | (self._resolved < abs(order) - UNRESOLVED)
         angles, sign = self._zenith_angles[used], (-1) ** abs(order)
         nodes, values = [-angles[::-1], angles], [sign * coefficients[used][::-1], coefficients[used]]
@@ -196,20 +183,16 @@ class HealpixRings:
 
 
 def fixed_components(polar: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    """Return the components along and across feed x (Ludwig's third definition), (2, ..., Ndirections), of a field.
+    """Return a field's components along and across feed x (Ludwig's third definition), (2, ..., Ndirections).
 
-    Parameters
-    ----------
-    polar
-        Its components along azimuth and zenith angle, (2, ..., Ndirections).
-    azimuth
-        From east through north, rad, (Ndirections,).
+    `polar` are its components along azimuth and zenith angle, (2, ..., Ndirections). The azimuth runs from east through
+    north, rad, (Ndirections,).
     """
     sine, cosine = np.sin(azimuth), np.cos(azimuth)
     return np.stack([cosine * polar[1] - sine * polar[0], sine * polar[1] + cosine * polar[0]])
 
 
 def polar_components(fixed: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    """Return the components along azimuth and zenith angle of what `fixed_components` returned."""
+    """Return the components along azimuth and zenith angle of a field given by its `fixed_components`."""
     sine, cosine = np.sin(azimuth), np.cos(azimuth)
     return np.stack([cosine * fixed[1] - sine * fixed[0], cosine * fixed[0] + sine * fixed[1]])

@@ -1,7 +1,7 @@
-"""Primary beams: efield beams for the simulators, and the solid angles that power spectra need.
+"""Primary beams: E-field beams for the simulators, and the solid angles that power spectra need.
 
 Throughout, A(θ, φ) = |J_az|² + |J_za|² of a feed is the power beam, one at the zenith (where all beams here peak);
-a visibility is V_xx = ½ ∫ A I exp(−2πi ν b·s/c) dΩ.
+a visibility is V_xx = ½ ∫ A I exp(2πi ν b·s/c) dΩ with b = x_b − x_a for baseline (a, b).
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ TILE_HEIGHT = 0.278
 class MwaTile(AnalyticBeam):
     """An ideal 4 x 4 MWA tile pointed at zenith.
 
-    Short dipoles, east-west and north-south, 1.1 m apart and 0.278 m above an infinite conducting ground screen,
-    without mutual coupling. It is chromatic, and one at zenith. An analytic beam rather than a table: it is evaluated
+    Short dipoles, east-west and north-south, are 1.1 m apart and 0.278 m above an infinite conducting ground screen,
+    without mutual coupling. The beam is chromatic, and one at zenith. It is analytic, not a table: it is evaluated
     exactly at every source and frequency.
     """
 
     basis_vector_type = "az_za"
 
     def _efield_eval(self, *, az_grid: np.ndarray, za_grid: np.ndarray, f_grid: np.ndarray) -> np.ndarray:
-        """Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
+        """Return Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
         wavenumber = 2 * np.pi * f_grid / speed_of_light
         east = np.sin(za_grid) * np.cos(az_grid)
         north = np.sin(za_grid) * np.sin(az_grid)
@@ -59,7 +59,7 @@ class MwaTile(AnalyticBeam):
 
 
 def _row_factor(wavenumber: np.ndarray) -> np.ndarray:
-    """Array factor of one row of dipoles for a wavenumber along it, one at zenith."""
+    """Return the array factor of one row of dipoles for a wavenumber along it, one at zenith."""
     offsets = TILE_SPACING * (np.arange(TILE_DIPOLES) - (TILE_DIPOLES - 1) / 2)
     return sum(np.cos(wavenumber * offset) for offset in offsets) / TILE_DIPOLES
 
@@ -73,11 +73,11 @@ class ExactBeam:
         self._analytic = analytic
 
     def at(self, frequencies: np.ndarray) -> AnalyticBeam:
-        """Return the analytic efield beam; it holds at any frequency (Hz)."""
+        """Return the analytic E-field beam, which is valid at any frequency (Hz)."""
         return self._analytic
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return Ω_p and Ω_pp in sr, each of shape (Nfreqs,); see `Beam`."""
+        """Return Ω_p and Ω_pp in sr, (Nfreqs,) each; see `Beam`."""
         azimuth, zenith_angle = (grid.ravel() for grid in np.meshgrid(AZIMUTHS, ZENITH_ANGLES))
         angles = []
         for frequency in frequencies:
@@ -98,7 +98,7 @@ class GriddedBeam:
         Largest difference of a Jones component from the tabulated one within the band, relative to the zenith
         (`TabulatedBeam`).
     tabulated_frequencies
-        Frequencies of the table in and next to the band, in Hz, shape (Ntab,).
+        Frequencies of the table in and next to the band, in Hz, (Ntab,).
     """
 
     def __init__(self, table: TabulatedBeam | Tile, name: str, stand_in: str | None) -> None:
@@ -109,22 +109,16 @@ class GriddedBeam:
         self._table = table
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
-        """Return the efield beam tabulated at `frequencies` (Hz, shape (Nfreqs,)).
-
-        Raises
-        ------
-        InputError
-            If a frequency is outside the band for which the beam was made.
-        """
+        """Return the E-field beam tabulated at `frequencies` (Hz); raises InputError for any outside its band."""
         return self._table.at(frequencies)
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return Ω_p and Ω_pp in sr, each of shape (Nfreqs,); see `Beam`."""
+        """Return Ω_p and Ω_pp in sr, (Nfreqs,) each; see `Beam`."""
         first, second = _solid_angles(self._table, tuple(np.asarray(frequencies, dtype=float)), FEEDS[polarization])
         return first.copy(), second.copy()
 
 
-# Spectra of one run, which are made one after the other, have the same beam.
+# The spectra of one run are made one after the other, and have the same beam.
 @lru_cache(maxsize=4)
 def _solid_angles(
     table: TabulatedBeam | Tile, frequencies: tuple[float, ...], feed: int
@@ -140,12 +134,7 @@ def _solid_angles(
 def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> tuple[float, float]:
     """Return ∫A dΩ and ∫A² dΩ above the horizon, in sr.
 
-    Parameters
-    ----------
-    power
-        A on a grid of zenith angles and equally spaced azimuths, shape (Nza, Naz).
-    zenith_angles
-        In radians, increasing from 0, shape (Nza,).
+    A is on a grid of zenith angles, (Nza,), in radians, increasing from 0, and equally spaced azimuths, (Nza, Naz).
     """
     horizon = min(np.pi / 2, zenith_angles[-1])
     rings = [2 * np.pi * np.sin(zenith_angles) * values.mean(axis=1) for values in (power, power**2)]
@@ -154,20 +143,10 @@ def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> tuple[float
 
 
 def make_beam(settings: Plugin, channels: Channels | None = None) -> Beam:
-    """Return the beam that the `instrument.beam` section asks for.
+    """Return the beam of the `instrument.beam` section, by default for the channels of the paper.
 
-    Parameters
-    ----------
-    settings
-        Any `BeamModel`.
-    channels
-        The channels of the observation, by default those of the paper. Tabulated beams are read and fitted over a
-        slightly wider band, and do not accept frequencies outside it.
-
-    Raises
-    ------
-    InputError
-        If a beam file is missing, cannot be read, or does not cover the channels.
+    Tabulated beams are read and fitted over a slightly wider band than the channels, and do not accept frequencies
+    outside it. Raises InputError if a beam file is missing, cannot be read, or does not cover the channels.
     """
     with guarded(settings):
         return model_of(settings).make(Channels() if channels is None else channels)

@@ -1,7 +1,7 @@
 """Beams of MWA tiles whose dipoles have different amplitudes, from the full embedded element model.
 
-The field of a tile is linear in the voltages of its dipoles, each of which excites its neighbours as well. So the
-fields of the sixteen dipoles by themselves are computed once, and a tile's beam is their weighted sum.
+The field of a tile is linear in the voltages of its dipoles, each of which excites its neighbours as well. Therefore
+the fields of the sixteen dipoles are computed once, and the beam of a tile is their weighted sum.
 """
 
 from __future__ import annotations
@@ -22,26 +22,10 @@ from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_elemen
 
 
 class DipoleFields:
-    """The fields of the sixteen dipoles of a tile, each driven by itself, with the others' response to it.
+    """The fields of the sixteen dipoles of a tile, each driven alone, with the response of the others.
 
-    Parameters
-    ----------
-    path
-        Beam file, by default the one that `calstudy.instrument.beam_file.find_beam` finds.
-    band
-        Lowest and highest frequency of interest, Hz.
-    interpolation
-        In frequency, as for `TabulatedBeam`.
-
-    Attributes
-    ----------
-    whole
-        The beam of a tile whose dipoles are all alike.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or does not cover the band.
+    Parameters are those of `mwa_embedded_element`. `whole` is the beam of a tile with identical dipoles. Raises
+    InputError if the file cannot be read or does not cover the band.
     """
 
     def __init__(self, path: Path | None, band: tuple[float, float], interpolation: str) -> None:
@@ -56,12 +40,7 @@ class DipoleFields:
     def combined(self, amplitudes: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
         """Return J of a tile, one at the zenith, (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex.
 
-        Parameters
-        ----------
-        amplitudes
-            Of its dipoles, (2 [x, y], 16).
-        frequencies
-            In Hz, (Nfreqs,).
+        `amplitudes` are those of its dipoles, (2 [x, y], 16), and `frequencies` are in Hz, (Nfreqs,).
         """
         frequencies = self.whole.require_within(frequencies)
         reduced = np.empty(self._reduced.shape[1:], dtype=complex)
@@ -71,15 +50,7 @@ class DipoleFields:
 
 
 class Tile:
-    """The table of the beam of one tile; used like a `TabulatedBeam`.
-
-    Parameters
-    ----------
-    fields
-        Of its dipoles.
-    amplitudes
-        Of its dipoles, (2 [x, y], 16).
-    """
+    """The table of the beam of one tile with dipole amplitudes (2 [x, y], 16); used like a `TabulatedBeam`."""
 
     def __init__(self, fields: DipoleFields, amplitudes: np.ndarray) -> None:
         whole = fields.whole
@@ -92,18 +63,18 @@ class Tile:
         return self._fields.combined(self._amplitudes, frequencies)
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
-        """Return the efield beam tabulated at `frequencies` in Hz, shape (Nfreqs,)."""
+        """Return the E-field beam tabulated at `frequencies` in Hz, (Nfreqs,)."""
         return tabulate(self._description, self.jones(frequencies), frequencies)
 
 
 @lru_cache(maxsize=1)
 def dipole_fields(path: Path | None, band: tuple[float, float], interpolation: str) -> DipoleFields:
-    """Return `DipoleFields`, which take some 15 s and 0.5 GB, once for each process."""
+    """Return `DipoleFields`, which are slow to compute and take 0.5 GB, once for each process."""
     return DipoleFields(path, band, interpolation)
 
 
 def _single_fields(path: Path, low: float, high: float) -> Iterator[np.ndarray]:
-    """Yield J of each dipole in its turn, (Ntab, 2 [azimuth, zenith angle], 2 [x, y], Nza, Naz), complex.
+    """Yield J of each dipole, (Ntab, 2 [azimuth, zenith angle], 2 [x, y], Nza, Naz), complex.
 
     These are the steps of `UVBeam.read_mwa_beam`, which would read the modes of all dipoles and frequencies each time
     and take six times as long.
@@ -123,7 +94,7 @@ def _single_fields(path: Path, low: float, high: float) -> Iterator[np.ndarray]:
             delays=np.zeros((len(feeds), 1), dtype=int),
             amplitudes=np.ones((len(feeds), 1)),
         )
-        # Modes of the other dipoles may go to a higher degree, and the reader makes room for them.
+        # Modes of the other dipoles may have a higher degree, and the reader allocates space for them.
         for mode in (mode for by_frequency in modes.values() for mode in by_frequency.values()):
             mode.update({name: mode[name][: len(mode["M"])] for name in ("Q1", "Q2")})
         jones = reader._get_response(

@@ -1,4 +1,4 @@
-"""Which antennas share a beam, from the settings alone: for plans, before anything is made."""
+"""Assignment of beams to antennas, from the settings alone."""
 
 from __future__ import annotations
 
@@ -12,16 +12,10 @@ from calstudy.instrument.settings import InstrumentSettings
 
 
 class AssignedBeam(NamedTuple):
-    """What the beam of an antenna is made of; antennas for which it is equal share a beam.
+    """Specification of the beam of an antenna; antennas with equal ones share a beam.
 
-    Attributes
-    ----------
-    model
-        Index of its nominal beam in what `nominal_beams` returns.
-    amplitudes
-        Of the dipoles of its feeds x and y; None if they are all one.
-    misalignment
-        Orientation and width.
+    `model` is the index of the nominal beam in the result of `nominal_beams`. `amplitudes` are those of the dipoles of
+    feeds x and y, or None if they are all one.
     """
 
     model: int
@@ -39,7 +33,7 @@ def nominal_beams(settings: InstrumentSettings) -> list[Plugin]:
 
 
 def beam_count(settings: InstrumentSettings, count: int) -> int:
-    """Return how many different beams `count` antennas have as built; parameters and errors as `assigned_beams`."""
+    """Return the number of distinct beams of `count` antennas as built; errors are those of `assigned_beams`."""
     built = settings.as_built
     if not (settings.antenna_beams or built.dipoles.differ or built.beams != BeamErrors()):
         return 1
@@ -47,20 +41,7 @@ def beam_count(settings: InstrumentSettings, count: int) -> int:
 
 
 def assigned_beams(settings: InstrumentSettings, count: int) -> list[AssignedBeam]:
-    """Return what the beam of each antenna as built is made of.
-
-    Parameters
-    ----------
-    settings
-        The `instrument` section.
-    count
-        Antennas of the layout.
-
-    Raises
-    ------
-    InputError
-        If all dipoles of a feed are dead.
-    """
+    """Return the beams of `count` antennas as built; raises InputError if all dipoles of a feed are dead."""
     distinct, index = nominal_beams(settings), np.zeros(count, dtype=int)
     for group in settings.antenna_beams.values():
         index[list(group.antennas)] = distinct.index(group.beam)

@@ -22,7 +22,7 @@ NORTH_CORNER = np.array([-29, 31]) / 3
 OUTRIGGER_STEP = 10
 OUTRIGGER_SIDE = 4
 OUTRIGGER_CENTRE = np.array([2.0, 7.0])
-# Of the outriggers in the eastern and the northern third; both are a third of the unit cell's long diagonal.
+# Displacements of the outriggers in the eastern and the northern third, a third of the unit cell's long diagonal.
 EAST_SHIFT = np.array([-1, 2]) / 3
 NORTH_SHIFT = np.array([1, -2]) / 3
 
@@ -30,7 +30,7 @@ NORTH_SHIFT = np.array([1, -2]) / 3
 def core_positions() -> np.ndarray:
     """Return east and north of the 320 antennas of the core in the order of their numbers, (320, 2), m.
 
-    Numbers run from the south: a row of the western sectors, then the row of the eastern sector that lies next to it.
+    Numbers run from the south: a row of the western sectors, then the adjacent row of the eastern sector.
     """
     column, row = np.arange(LONG_ROW), np.arange(SHORT_ROW)
     south = [np.column_stack([column - step, np.full(LONG_ROW, step)]) for step in row]
@@ -53,14 +53,14 @@ def outrigger_positions() -> np.ndarray:
     for row in range(1 - OUTRIGGER_SIDE, OUTRIGGER_SIDE):
         for column in range(2 * OUTRIGGER_SIDE - 1 - abs(row)):
             offset = np.array([column - (OUTRIGGER_SIDE - 1) - min(row, 0), row])
-            # The innermost seven places are the core's.
+            # The core occupies the innermost seven places.
             if max(abs(offset[0]), abs(offset[1]), abs(offset.sum())) > 1:
                 found.append(OUTRIGGER_CENTRE + OUTRIGGER_STEP * offset + _displacement(offset))
     return np.array(found) @ LATTICE
 
 
 def _displacement(offset: np.ndarray) -> np.ndarray:
-    """Return the displacement of an outrigger of the sector in which its place about the centre is."""
+    """Return the displacement of the outriggers in the sector of this offset from the centre."""
     east, north = offset @ LATTICE
     angle = round(float(np.degrees(np.arctan2(north, east))), 6)
     if -120 < angle <= 0:

@@ -23,8 +23,6 @@ class AntennaBeam(Protocol):
 
     Attributes
     ----------
-    name
-        Name of the beam.
     stand_in
         A note if it is not the beam of the paper, otherwise None.
     """
@@ -33,33 +31,33 @@ class AntennaBeam(Protocol):
     stand_in: str | None
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
-        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)), feeds x (east-west) and y (north-south)."""
+        """Return the E-field beam at `frequencies` (Hz, (Nfreqs,)), feeds x (east-west) and y (north-south)."""
 
 
 class Beam(AntennaBeam, Protocol):
     """A nominal beam, one at the zenith, with the solid angles by which power spectra are normalized."""
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return Ω_p = ∫A dΩ and Ω_pp = ∫A² dΩ above the horizon, in sr, each of shape (Nfreqs,).
+        """Return Ω_p = ∫A dΩ and Ω_pp = ∫A² dΩ above the horizon, in sr, (Nfreqs,) each.
 
         `frequencies` are in Hz; `polarization` is "xx" or "yy".
         """
 
 
 def model_of(section: Plugin) -> BeamModel:
-    """Return what a field of a beam holds; its registry lets no other plug-ins in."""
+    """Return the value of a beam field as a `BeamModel`; its registry admits no other plug-ins."""
     return cast(BeamModel, section)
 
 
 class BeamModel(Plugin, ABC):
-    """The settings of a beam, and how it is made of them. Fields of a subclass are its settings.
+    """The settings of a beam, from which the beam is made. Fields of a subclass are its settings.
 
-    Its module is imported when an experiment file is read: import libraries that take long inside `make`.
+    Its module is imported when an experiment file is read: import slow libraries inside `make`.
 
     Attributes
     ----------
     dipoles
-        Of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
+        Number of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
     """
 
     registry: ClassVar = BEAMS
@@ -85,19 +83,14 @@ class BeamModel(Plugin, ABC):
         Raises
         ------
         InputError
-            As `make`.
+            As for `make`.
         """
         raise NotImplementedError(f"the beam {self.label} has no dipoles")
 
     def require_usable(self, channels: Channels) -> None:
-        """Raise InputError if `make` would, as far as can be said in a second or two: before anything is simulated.
+        """Raise InputError if `make` would, as far as this can be checked quickly before anything is simulated.
 
-        A beam that needs no file, or is made at once, need not do anything here.
-
-        Parameters
-        ----------
-        channels
-            As for `make`.
+        A beam that needs no file, or is made quickly, need not do anything here.
         """
         del channels
 
@@ -108,7 +101,7 @@ class BeamModel(Plugin, ABC):
         Parameters
         ----------
         channels
-            To be observed. A beam need not be known far outside their band.
+            Channels of the observation. The beam need not be known far outside their band.
 
         Raises
         ------

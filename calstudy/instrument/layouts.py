@@ -66,21 +66,11 @@ HERA_SIDES = {"hera-19": 3, "hera-37": 4}
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of the antennas of an array.
+    """Positions of the antennas of an array: east, north, up in metres about the array centre, (Nants, 3).
 
-    Attributes
-    ----------
-    name
-        Name of the layout.
-    numbers
-        Antenna numbers, unique, int array of shape (Nants,). The number of an MWA tile is its place in the 128-tile
-        configuration, also in layouts that use a part of it.
-    names
-        Antenna names, unique.
-    enu
-        East, north, up in metres about the array centre, float64, shape (Nants, 3).
-    place
-        Where the array is: its centre, for arrays at their own site.
+    Antenna numbers, (Nants,), and names are unique. The number of an MWA tile is its index in the 128-tile
+    configuration, also in layouts that use a part of it. `place` is the site: the centre of the array, for arrays at
+    their own site.
     """
 
     name: str
@@ -91,21 +81,15 @@ class Layout:
 
     @property
     def location(self) -> EarthLocation:
-        """Where the array is, as astropy has it."""
+        """The site of the array as an astropy `EarthLocation`."""
         return self.place.location
 
 
 @dataclass(frozen=True)
 class RedundantGroups:
-    """Redundant groups of baselines.
+    """The redundant group of each baseline, (Nbls,), numbered by first baseline, and whether it is conjugated, (Nbls,).
 
-    Attributes
-    ----------
-    index
-        Group of each baseline, int array of shape (Nbls,); groups are numbered by their first baseline.
-    conjugated
-        Whether a baseline has the opposite direction of the first baseline of its group, so that its visibility is the
-        complex conjugate of that of the group, bool array of shape (Nbls,).
+    A baseline that is opposite to the first one of its group has the complex conjugate of the group's visibility.
     """
 
     index: np.ndarray
@@ -115,15 +99,7 @@ class RedundantGroups:
 def make_layout(settings: section.Layout) -> Layout:
     """Return the antennas of the `instrument.layout` section.
 
-    Parameters
-    ----------
-    settings
-        Any kind of layout section.
-
-    Raises
-    ------
-    InputError
-        If a CSV file is missing or does not hold antenna positions.
+    Raises InputError if a CSV file is missing or does not contain antenna positions.
     """
     if isinstance(settings, section.MwaLayout):
         return _mwa(settings)
@@ -135,30 +111,17 @@ def make_layout(settings: section.Layout) -> Layout:
 
 
 def make_array(settings: section.InstrumentSettings) -> Layout:
-    """Return the antennas of an instrument, where `instrument.location` says or at the layout's own site.
+    """Return the antennas of an instrument, at `instrument.location` or at the layout's own site.
 
-    Parameters
-    ----------
-    settings
-        The `instrument` section.
-
-    Raises
-    ------
-    InputError
-        If a CSV file is missing or does not hold antenna positions.
+    Errors are those of `make_layout`.
     """
     return replace(make_layout(settings.layout), place=place_of(settings.site))
 
 
 def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
-    """Sort baselines into redundant groups. A baseline and its reverse are in the same group.
+    """Sort baseline vectors, (Nbls, 3), m, into groups that agree to a tolerance in m.
 
-    Parameters
-    ----------
-    vectors
-        Baseline vectors in metres, shape (Nbls, 3).
-    tolerance
-        Baselines that differ by less than this, in metres, are redundant.
+    A baseline and its reverse are in the same group.
     """
     from pyuvdata.utils import redundancy
 
@@ -174,8 +137,8 @@ def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
 
 
 def _mwa(settings: section.MwaLayout) -> Layout:
-    """Tiles from the observatory positions that pyuvdata carries (ECEF relative to the array centre)."""
-    # Not importlib.resources, which would import the package: a second of every plan.
+    """Return tiles at the observatory positions in pyuvdata (ECEF relative to the array centre)."""
+    # importlib.resources would import the package, which is slow.
     package = find_spec("pyuvdata")
     assert package is not None, "a dependency"
     with (Path(str(package.origin)).parent / "data" / "mwa_ant_pos.csv").open() as table:
@@ -191,7 +154,7 @@ def _mwa(settings: section.MwaLayout) -> Layout:
 
 
 def _synthetic(settings: section.ArrayLayout, positions: np.ndarray, prefix: str | None = None) -> Layout:
-    """Flat array of (east, north) positions about their mean, at the site of the layout."""
+    """Return a flat array of (east, north) positions about their mean, at the site of the layout."""
     enu = np.column_stack([positions - positions.mean(axis=0), np.zeros(len(positions))])
     numbers = np.arange(len(enu))
     kind = settings.kind
@@ -200,7 +163,7 @@ def _synthetic(settings: section.ArrayLayout, positions: np.ndarray, prefix: str
 
 
 def _hera(settings: section.HeraLayout) -> np.ndarray:
-    """Positions of HERA's antennas, in the order of their numbers."""
+    """Return the positions of HERA's antennas, in the order of their numbers."""
     if settings.kind in HERA_SIDES:
         positions = _hex(section.HexLayout(kind="hex", side=HERA_SIDES[settings.kind], spacing=f"{SPACING} m"))
     else:
@@ -245,7 +208,7 @@ SYNTHETIC: dict[str, Callable[[Any], np.ndarray]] = {
 
 
 def _from_csv(path: Path) -> Layout:
-    """Positions, and names and numbers where given, from a CSV file."""
+    """Read positions, and optional names and numbers, from a CSV file."""
     if not path.is_file():
         raise InputError(f"instrument.layout.path: there is no file {path}")
     try:

@@ -1,4 +1,4 @@
-"""Beams of antennas that are tilted, turned, wider or narrower than designed, or have their feeds exchanged."""
+"""Beams of antennas that are tilted, rotated, wider or narrower than designed, or have their feeds exchanged."""
 
 from __future__ import annotations
 
@@ -17,21 +17,15 @@ from calstudy.instrument.interface import AntennaBeam
 from calstudy.instrument.splines import bspline_coefficients, cells, spline_fields
 from calstudy.instrument.tabulated import describe, tabulate
 
-# Rows by which a table is extended beyond the zenith: splines forget their ends within a few.
+# Rows by which a table is extended beyond the zenith; the end of a spline affects only a few.
 MARGIN = 12
 
 
 class NominalBeam:
     """The nominal beam of antennas that are misaligned, each in its own way (`AntennaBeam`).
 
-    It keeps what the antennas have in common: the splines of the table at the frequencies that were asked for last.
-
-    Parameters
-    ----------
-    beam
-        As designed.
-    keep
-        Whether several antennas have it, so that it is worth the memory.
+    It keeps the splines of the table at the frequencies that were requested last, if `keep` is true: that is worth the
+    memory if several antennas have the beam.
     """
 
     def __init__(self, beam: AntennaBeam, keep: bool = True) -> None:
@@ -40,16 +34,13 @@ class NominalBeam:
         self._kept: tuple[np.ndarray, UVBeam, np.ndarray] | None = None
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
-        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,))."""
+        """Return the E-field beam at `frequencies` (Hz, (Nfreqs,))."""
         return self._beam.at(frequencies)
 
     def splined(self, frequencies: np.ndarray) -> tuple[UVBeam | AnalyticBeam, np.ndarray]:
-        """Return the efield beam, and of a tabulated one the coefficients of `_spline_table`, otherwise none.
+        """Return the E-field beam, and the coefficients of `_spline_table`, which are empty for a beam in closed form.
 
-        Raises
-        ------
-        InputError
-            If a table does not go all around.
+        Raises InputError if a table does not cover all azimuths.
         """
         if self._kept is not None and np.array_equal(self._kept[0], frequencies):
             return self._kept[1:]
@@ -65,15 +56,8 @@ class NominalBeam:
 class MisalignedBeam:
     """The beam of an antenna whose orientation, width or feeds are not as designed (`AntennaBeam`).
 
-    Its pattern moves with the antenna, and so does its polarization. It is one where the nominal beam is, at the
-    antenna's own axis.
-
-    Parameters
-    ----------
-    beam
-        As designed; a `NominalBeam` where several antennas have it.
-    misalignment
-        What differs.
+    Its pattern moves with the antenna, and so does its polarization. It is one on the antenna's own axis, as the
+    nominal beam is at the zenith. If several antennas have the nominal beam, it should be a `NominalBeam`.
     """
 
     def __init__(self, beam: AntennaBeam, misalignment: Misalignment) -> None:
@@ -82,19 +66,16 @@ class MisalignedBeam:
         self._misalignment = misalignment
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
-        """Return the efield beam at `frequencies` (Hz, shape (Nfreqs,)).
+        """Return the E-field beam at `frequencies` (Hz, (Nfreqs,)).
 
-        Raises
-        ------
-        InputError
-            If feeds are exchanged and there is only one, or a table does not go all around.
+        Raises InputError if feeds are exchanged and there is only one, or a table does not cover all azimuths.
         """
         beam, splines = self._beam.splined(frequencies)
         if self._misalignment.swapped and list(beam.feed_array) != ["x", "y"]:
             raise InputError(f"instrument.as_built.beams.swapped: the beam {self.name} does not have feeds x and y")
         if isinstance(beam, UVBeam):
             return tabulate(describe(beam), _turned_table(beam, splines, self._misalignment), frequencies)
-        # A formula may have settings of its own for its feeds; they are those of what it describes.
+        # A formula may have its own settings for its feeds, which are those of the nominal beam.
         return TurnedBeam(
             nominal=beam, misalignment=self._misalignment, feed_array=beam.feed_array, feed_angle=beam.feed_angle
         )
@@ -110,7 +91,7 @@ class TurnedBeam(AnalyticBeam):
     basis_vector_type = "az_za"
 
     def _efield_eval(self, *, az_grid: np.ndarray, za_grid: np.ndarray, f_grid: np.ndarray) -> np.ndarray:
-        """Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
+        """Return Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
         # The same directions at all frequencies.
         frame = AntennaFrame(self.misalignment, az_grid[0], za_grid[0])
         jones = self.nominal.efield_eval(
@@ -122,22 +103,11 @@ class TurnedBeam(AnalyticBeam):
 
 
 class AntennaFrame:
-    """Directions in the frame of a misaligned antenna.
+    """Directions (Ndirections,) in the frame of a misaligned antenna.
 
-    Parameters
-    ----------
-    misalignment
-        Of the antenna.
-    azimuth, zenith_angle
-        Directions, rad, azimuth from east through north, (Ndirections,).
-
-    Attributes
-    ----------
-    azimuth
-        In the frame of the antenna, rad.
-    nominal_zenith_angle
-        At which the nominal beam has the value of this one, rad, at most pi / 2: what is below the antenna's own
-        horizon has the value there.
+    All angles are in rad; azimuths run from east through north. `nominal_zenith_angle` is the one at which the nominal
+    beam has the value of this one. It is at most pi / 2: directions below the antenna's own horizon have the value
+    there.
     """
 
     def __init__(self, misalignment: Misalignment, azimuth: np.ndarray, zenith_angle: np.ndarray) -> None:
@@ -150,7 +120,7 @@ class AntennaFrame:
         self.nominal_zenith_angle = np.minimum(self._zenith_angle / misalignment.width, np.pi / 2)
 
     def to_ground(self, jones: np.ndarray) -> np.ndarray:
-        """Return azimuth and zenith angle components, (2, ..., Ndirections), on the ground of those of the antenna."""
+        """Convert azimuth and zenith angle components of the antenna, (2, ..., Ndirections), to those of the ground."""
         own = [self._turn.apply(vector) for vector in _basis(self.azimuth, self._zenith_angle)]
         overlaps = [[(ground * vector).sum(axis=1) for vector in own] for ground in self._ground]
         return np.stack([first * jones[0] + second * jones[1] for first, second in overlaps])
@@ -163,7 +133,7 @@ def _direction(azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
 
 
 def _basis(azimuth: np.ndarray, zenith_angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit vectors of growing azimuth and of growing zenith angle, (N, 3) each."""
+    """Return the unit vectors of increasing azimuth and of increasing zenith angle, (N, 3) each."""
     cosine, zeros = np.cos(zenith_angle), np.zeros_like(azimuth)
     along_azimuth = np.column_stack([-np.sin(azimuth), np.cos(azimuth), zeros])
     along_zenith_angle = np.column_stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), -np.sin(zenith_angle)])
@@ -176,7 +146,7 @@ def _splines_of(beam: UVBeam) -> np.ndarray:
     around = np.isclose(len(azimuth) * (azimuth[1] - azimuth[0]), 2 * np.pi) and len(azimuth) % 2 == 0
     if not around or zenith_angle[0] != 0:
         raise InputError("instrument.as_built.beams: the table of the beam must go all around, from the zenith")
-    # Components in azimuth and zenith angle jump at the zenith; along two fixed directions they are smooth there.
+    # Components in azimuth and zenith angle are discontinuous at the zenith; those along fixed directions are smooth.
     return _spline_table(fixed_components(beam.data_array, azimuth))
 
 
@@ -198,7 +168,7 @@ def _turned_table(beam: UVBeam, splines: np.ndarray, misalignment: Misalignment)
 def _spline_table(values: np.ndarray) -> np.ndarray:
     """Return the coefficients of splines, (MARGIN + Nza + 2, Naz + 3, Nvalues) float, of values (..., Nza, Naz).
 
-    Rows go on beyond the zenith on the other side, so that the splines do not end there. Columns go around.
+    Rows continue on the other side of the zenith, so that the splines do not end there. Columns are periodic.
     """
     n_columns = values.shape[-1]
     beyond = np.roll(values, n_columns // 2, axis=-1)[..., MARGIN:0:-1, :]

@@ -13,7 +13,7 @@ from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
 from calstudy.instrument.as_built import AsBuilt
 
-# s.
+# Longest observation, s.
 LONGEST = 86_400.0
 
 
@@ -36,14 +36,14 @@ Location = Annotated[Site | Coordinates, Field(discriminator="kind"), choice("ki
 
 
 class ArrayLayout(Section):
-    """Where antennas are; `site` is where the array stands unless `instrument.location` says otherwise."""
+    """Positions of antennas; `site` is the site of the array unless `instrument.location` is given."""
 
     site: ClassVar[Literal["mwa", "hera"]] = "mwa"
     kind: str
 
 
 class NamedLayout(ArrayLayout):
-    """Antennas of an array that exists, or a part of it."""
+    """Antennas of an existing array, or a part of it."""
 
     sizes: ClassVar[Mapping[str, int]]
     """Number of antennas of each kind."""
@@ -92,8 +92,8 @@ class HeraLayout(NamedLayout):
     """HERA at its own site: antennas 14.6 m apart, flat, as designed (DeBoer et al. 2017; Dillon & Parsons 2016).
 
     `hera-19` and `hera-37` are filled hexagons. `hera-320` is the core, a hexagon in three sectors that are displaced
-    against each other by a third of the unit cell; `hera-350` has the 30 outriggers as well. `hera-128` is the first
-    128 antennas of the core. Antennas of the last three are numbered as HERA numbers them, from the south.
+    relative to each other by a third of the unit cell; `hera-350` has the 30 outriggers as well. `hera-128` is the
+    first 128 antennas of the core. Antennas of the last three have HERA's numbers, from the south.
     """
 
     site: ClassVar[Literal["mwa", "hera"]] = "hera"
@@ -152,7 +152,7 @@ class GolombLayout(ArrayLayout):
 class CsvLayout(ArrayLayout):
     """Positions from a CSV file with columns east_m, north_m, up_m and, optionally, name and number.
 
-    It needs `instrument.location`: such a table does not say where the array is.
+    It requires `instrument.location`, because the file does not contain the position of the array.
     """
 
     kind: Literal["csv"]
@@ -237,15 +237,15 @@ class InstrumentSettings(Section):
 
     @property
     def site(self) -> Site | Coordinates:
-        """Where the array is."""
+        """The site of the array."""
         return Site(kind=self.layout.site) if self.location is None else self.location
 
     def nominal(self) -> InstrumentSettings:
-        """Return the instrument as designed: what calibrators and figures take it for."""
+        """Return the instrument as designed, which calibrators and figures assume."""
         return self.reset("as_built")
 
     def without_beams(self) -> InstrumentSettings:
-        """Return the nominal instrument with the default beam: for what reads antennas, channels and times only."""
+        """Return the nominal instrument with the default beam, for code that reads antennas, channels and times."""
         return self.reset("beam", "antenna_beams", "as_built")
 
     @model_validator(mode="after")

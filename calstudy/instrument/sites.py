@@ -1,4 +1,4 @@
-"""Where arrays are on the Earth."""
+"""Sites of arrays on the Earth."""
 
 from __future__ import annotations
 
@@ -13,15 +13,7 @@ if TYPE_CHECKING:
 
 
 class Place(NamedTuple):
-    """A place on the WGS84 ellipsoid: what a plan can know without astropy.
-
-    Attributes
-    ----------
-    latitude, longitude
-        deg, north and east positive.
-    height
-        Above the ellipsoid, m.
-    """
+    """A place on the WGS84 ellipsoid: latitude and longitude in deg, north and east positive, and height in m."""
 
     latitude: float
     longitude: float
@@ -29,13 +21,13 @@ class Place(NamedTuple):
 
     @property
     def location(self) -> EarthLocation:
-        """The place as astropy has it."""
+        """The place as an astropy `EarthLocation`."""
         from astropy.coordinates import EarthLocation
 
         return EarthLocation.from_geodetic(lon=self.longitude, lat=self.latitude, height=self.height)
 
 
-# Given here because astropy looks up sites online. The MWA's is the array centre in the observatory's metafits files,
+# Listed here because astropy looks up sites online. The MWA's is the array centre in the observatory's metafits files,
 # HERA's that of the project's own database (hera_mc); these and the others are also in pyuvdata's table of telescopes.
 SITES = {
     "mwa": Place(-26.70331941, 116.67081524, 377.827),
@@ -46,13 +38,7 @@ SITES = {
 
 
 def place_of(site: Site | Coordinates) -> Place:
-    """Return a place that an experiment file names or gives by its coordinates.
-
-    Parameters
-    ----------
-    site
-        Name of a known site, or latitude and longitude (deg) and height (m) on the WGS84 ellipsoid.
-    """
+    """Return the place of a known site, or of coordinates in an experiment file."""
     if isinstance(site, Site):
         return SITES[site.kind]
     # The same place, whether its longitude counts to 180 or to 360 degrees.
@@ -61,9 +47,9 @@ def place_of(site: Site | Coordinates) -> Place:
 
 
 def east_north_up(vectors: np.ndarray, place: Place) -> np.ndarray:
-    """Return geocentric vectors (N, 3) by their components to the east, the north and up at a place.
+    """Return the components of geocentric vectors (N, 3) to the east, to the north and up at a place.
 
-    `pyuvdata.utils.ENU_from_ECEF` does the same; importing it takes a second, half the time of a plan.
+    `pyuvdata.utils.ENU_from_ECEF` does the same, but importing it is slow compared with a plan.
     """
     longitude, latitude = np.radians(place.longitude), np.radians(place.latitude)
     up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
@@ -72,7 +58,7 @@ def east_north_up(vectors: np.ndarray, place: Place) -> np.ndarray:
 
 
 def describe(site: Site | Coordinates) -> str:
-    """Return in words where a site is: its name if it has one, latitude, longitude and height."""
+    """Describe a site: its name if it has one, latitude, longitude and height."""
     place = place_of(site)
     name = "" if isinstance(site, Coordinates) else f"{site.kind}, "
     return f"{name}latitude {place.latitude:.4f} deg, longitude {place.longitude:.4f} deg, {place.height:.0f} m"

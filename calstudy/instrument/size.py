@@ -1,4 +1,4 @@
-"""How large the data of an instrument are, from its settings alone: for plans, before anything is made."""
+"""Size of the data of an instrument, from its settings alone."""
 
 from __future__ import annotations
 
@@ -37,23 +37,13 @@ NAMED_LENGTHS = {
 }
 """Longest and mean baseline, m."""
 MEAN_OVER_LONGEST = 0.45
-# Of an optimal ruler, over the square of its marks.
+# Length of an optimal ruler over the square of the number of its marks.
 GOLOMB_LENGTH = 0.55
 
 
 @dataclass(frozen=True)
 class Size:
-    """The dimensions of a data set, and of its array.
-
-    Attributes
-    ----------
-    antennas, times, polarizations
-        Their numbers.
-    channels
-        Centre of the first, width (Hz) and number.
-    longest, mean
-        Longest and mean baseline, m, estimated.
-    """
+    """Dimensions of a data set and of its array; `longest` and `mean` are estimates of baseline lengths, m."""
 
     antennas: int
     times: int
@@ -103,7 +93,7 @@ class Size:
 
 
 def antenna_count(layout: Layout) -> int:
-    """Return how many antennas a layout will have, without making it where that is possible."""
+    """Return the number of antennas of a layout, without making it where that is possible."""
     if isinstance(layout, HexLayout):
         return 3 * layout.side * (layout.side - 1) + 1
     if isinstance(layout, CsvLayout):
@@ -113,7 +103,7 @@ def antenna_count(layout: Layout) -> int:
 
 
 def baseline_lengths(layout: Layout) -> tuple[float, float]:
-    """Return the longest and the mean baseline of a layout, m, about, without making it."""
+    """Estimate the longest and the mean baseline of a layout, m, without making it."""
     if isinstance(layout, HexLayout):
         longest = 2 * (layout.side - 1) * layout.spacing
     elif isinstance(layout, LinearLayout):
@@ -130,9 +120,9 @@ def baseline_lengths(layout: Layout) -> tuple[float, float]:
 
 
 def _extent(path: Path) -> float:
-    """Return the diagonal of the box that holds the antennas of a layout file, m; zero if it is no layout.
+    """Return the diagonal of the bounding box of the antennas of a layout file, m; zero if the file is invalid.
 
-    That it is one is checked when it is read to make the layout.
+    The file is checked when the layout is made.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as table:

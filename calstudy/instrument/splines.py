@@ -1,4 +1,4 @@
-"""Bicubic splines on grids of directions, of many values in each direction."""
+"""Bicubic splines on grids of directions, with many values in each direction."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 def bspline_coefficients(count: int) -> np.ndarray:
     """Return the matrix from equally spaced samples to the coefficients of their cubic spline, (count + 2, count).
 
-    The spline is the one without knots at the second and the last but one sample, in the basis of uniform cubic
-    B-splines; coefficient i belongs to the B-spline centred on sample i - 1.
+    The spline has no knots at the second and the last but one sample, and is in the basis of uniform cubic B-splines;
+    coefficient i belongs to the B-spline centred on sample i - 1.
     """
     conditions = np.zeros((count + 2, count + 2))
     for sample in range(count):
@@ -21,9 +21,9 @@ def bspline_coefficients(count: int) -> np.ndarray:
 
 
 def cells(values: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each value, clamped to an equally spaced grid, its first B-spline, (N,) int, and four weights, (N, 4).
+    """Return the first B-spline, (N,) int, and four weights, (N, 4), of each value, clamped to an equally spaced grid.
 
-    The first B-spline is counted as the coefficients of `bspline_coefficients` are.
+    B-splines are numbered as in `bspline_coefficients`.
     """
     position = np.clip((values - grid[0]) / (grid[1] - grid[0]), 0, len(grid) - 1)
     cell = np.minimum(position.astype(np.intp), len(grid) - 2)
@@ -55,7 +55,7 @@ def spline_fields(
 ) -> None:
     """Fill `fields` (Ndirections, Nvalues) from a table (Nrows + 2, Ncolumns + 2, Nvalues) of coefficients.
 
-    `rows`, `columns` and their weights are those that `cells` returns.
+    `rows`, `columns` and their weights are from `cells`.
     """
     for source in range(len(fields)):
         field = fields[source]

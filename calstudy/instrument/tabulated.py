@@ -34,21 +34,10 @@ DESCRIPTION = (
 def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
     """Make the zenith-pointed full embedded element beam of an MWA tile (Sokolowski et al. 2017).
 
-    To read the file and fit its table takes seconds: the fit is kept for later processes.
-
-    Parameters
-    ----------
-    path
-        Beam file (HDF5), by default the one that `calstudy.instrument.beam_file.find_beam` finds.
-    band
-        Lowest and highest frequency of interest in Hz; the margin that a fit needs is read, too.
-    interpolation
-        In frequency; see `TabulatedBeam`.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or is not an MWA beam file of this band.
+    Reading the file and fitting its table is slow, so the fit is kept for later processes. The default file is that of
+    `calstudy.instrument.beam_file.find_beam`. `band` is the lowest and highest frequency in Hz; the margin that a fit
+    needs is read as well. See `TabulatedBeam` for `interpolation`. Raises InputError if the file is missing or is not
+    an MWA beam file of this band.
     """
     path = find_beam() if path is None else path
     if not path.is_file():
@@ -79,21 +68,10 @@ def _read_mwa(path: Path, band: tuple[float, float]) -> UVBeam:
 
 
 def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> dict[str, Any]:
-    """Reduce a table to what a `TabulatedBeam` needs of it: arrays, strings and numbers, which a file can keep.
+    """Reduce a table on a grid of azimuth and zenith angle to the arrays, strings and numbers of a `TabulatedBeam`.
 
-    Parameters
-    ----------
-    table
-        On a grid of azimuth and zenith angle.
-    band
-        Lowest and highest frequency of interest in Hz.
-    interpolation
-        In frequency; see `TabulatedBeam`.
-
-    Raises
-    ------
-    InputError
-        If the table does not cover the band.
+    They can be stored in a file. `band` is the lowest and highest frequency in Hz. Raises InputError if the table does
+    not cover the band.
     """
     chosen = choose_frequencies(table.freq_array, band, interpolation)
     tabulated = table.freq_array[chosen]
@@ -114,7 +92,7 @@ def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> d
 
 
 class TabulatedBeam:
-    """Jones components on a grid of directions, as continuous functions of frequency.
+    """Jones components on a grid of directions, as continuous functions of frequency, from `fit_table`.
 
     Interpolation "chebyshev" fits one smooth polynomial in frequency to the table, for each direction, feed and
     component. Its power at large delays is at the level of rounding. "cubic", "linear" and "nearest" interpolate from
@@ -123,23 +101,14 @@ class TabulatedBeam:
     The result is divided by its zenith value, for each feed. For these beams the zenith value is the peak. It is a
     smooth function of frequency; the largest tabulated value (the maximum over pixels and feeds) need not be.
 
-    Parameters
-    ----------
-    fitted
-        From `fit_table`.
-
     Attributes
     ----------
-    zenith_angles
-        In radians, shape (Nza,).
-    tabulated_frequencies
-        Those of the band, and those next to its ends, in Hz, shape (Ntab,).
+    zenith_angles : (Nza,) float
+        In radians.
+    tabulated_frequencies : (Ntab,) float
+        Those in the band, and those next to its ends, in Hz.
     fit_error
         Largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`.
-    description
-        From `describe`.
-    interpolation
-        Between the tabulated frequencies in and around the band.
     """
 
     def __init__(self, fitted: Mapping[str, Any]) -> None:
@@ -167,26 +136,19 @@ class TabulatedBeam:
         return zenith_normalized(self.interpolation.evaluate(self._reduced, frequencies))
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
-        """Return the efield beam tabulated at `frequencies` in Hz, shape (Nfreqs,)."""
+        """Return the E-field beam tabulated at `frequencies` in Hz, (Nfreqs,)."""
         return tabulate(self.description, self.jones(frequencies), frequencies)
 
 
 def describe(beam: UVBeam) -> dict[str, Any]:
-    """Return what `tabulate` needs of a beam: its grid, feeds and names."""
+    """Return the grid, feeds and names of a beam, for `tabulate`."""
     return {name: getattr(beam, name) for name in DESCRIPTION}
 
 
 def tabulate(description: Mapping[str, Any], jones: np.ndarray, frequencies: np.ndarray) -> UVBeam:
-    """Return an efield beam on the grid of another.
+    """Return an E-field beam at frequencies in Hz, (Nfreqs,), on the grid of another beam with this description.
 
-    Parameters
-    ----------
-    description
-        Of the other, from `describe`.
-    jones
-        (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, one at the zenith.
-    frequencies
-        In Hz, (Nfreqs,).
+    `jones` is (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, one at the zenith.
     """
     return UVBeam.new(
         **description,
@@ -201,15 +163,7 @@ def tabulate(description: Mapping[str, Any], jones: np.ndarray, frequencies: np.
 def zenith_normalized(values: np.ndarray) -> np.ndarray:
     """Divide by the square root of the zenith power, per feed and frequency.
 
-    Parameters
-    ----------
-    values
-        (Nfreqs, 2 [azimuth, zenith angle], Nfeeds, Nza, Naz), complex.
-
-    Returns
-    -------
-    ndarray
-        (2, Nfeeds, Nfreqs, Nza, Naz).
+    Complex values (Nfreqs, 2 [azimuth, zenith angle], Nfeeds, Nza, Naz) become (2, Nfeeds, Nfreqs, Nza, Naz).
     """
     jones = np.moveaxis(values, 0, 2)
     zenith = np.sqrt((np.abs(jones[..., 0, 0]) ** 2).sum(axis=0))
@@ -217,15 +171,7 @@ def zenith_normalized(values: np.ndarray) -> np.ndarray:
 
 
 class FrequencyInterpolation:
-    """Interpolation between tabulated frequencies: linear in the table.
-
-    Parameters
-    ----------
-    tabulated
-        Frequencies of the table, Hz, (Ntab,).
-    kind
-        "chebyshev", "cubic", "linear" or "nearest"; see `TabulatedBeam`.
-    """
+    """Interpolation, linear in the table, between frequencies in Hz, (Ntab,); see `TabulatedBeam` for its kinds."""
 
     def __init__(self, tabulated: np.ndarray, kind: str) -> None:
         self._tabulated, self._kind = tabulated, kind
@@ -241,7 +187,7 @@ class FrequencyInterpolation:
         return chebyshev.chebvander(scaled, self._order)
 
     def reduce(self, values: np.ndarray) -> np.ndarray:
-        """Return what `evaluate` needs of a table, (Ntab, ...): for "chebyshev", coefficients, (order + 1, ...)."""
+        """Reduce a table (Ntab, ...) for `evaluate`: for "chebyshev" to coefficients, (order + 1, ...)."""
         if self._kind != "chebyshev":
             return values
         return np.tensordot(np.linalg.pinv(self._basis(self._tabulated)), values, axes=1)

@@ -25,7 +25,7 @@ POLARIZATION_NUMBERS = {"xx": -5, "yy": -6}
 
 
 def use_bundled_earth_orientation() -> None:
-    """Prevent astropy from downloading Earth orientation tables. The installed tables cover the simulated date.
+    """Prevent astropy from downloading Earth orientation tables; the installed tables cover the simulated date.
 
     Call it in every process that computes sidereal times or source positions.
     """
@@ -33,30 +33,12 @@ def use_bundled_earth_orientation() -> None:
 
 
 def make_template(settings: InstrumentSettings, autos: bool = False, as_built: bool = False) -> UVData:
-    """Return the metadata of the simulated observation.
+    """Return the metadata of the simulated observation, without data, flag and nsample arrays.
 
     Baselines are (a, b) with a before b in the layout, ordered by a and then b, all of them at every time, time by
     time. The telescope drifts (unprojected phase centre); feed x is the east-west dipole, feed y the north-south one.
-    Fluxes are in Jy with the convention V_xx = ½∫A I, i.e. I = XX + YY.
-
-    Parameters
-    ----------
-    settings
-        The `instrument` section.
-    autos
-        Whether to include autocorrelations.
-    as_built
-        Whether antennas are where `instrument.as_built` has them, and not at their nominal positions.
-
-    Returns
-    -------
-    UVData
-        Metadata only: no data, flag or nsample array.
-
-    Raises
-    ------
-    InputError
-        If the layout's file cannot be used.
+    Fluxes are in Jy with the convention V_xx = ½∫A I, i.e. I = XX + YY. With `as_built` the antennas have the positions
+    of `instrument.as_built`, otherwise the nominal ones. Raises InputError if the layout's file cannot be used.
     """
     keep_compiled_pyuvdata()
     layout = make_array(settings)
@@ -77,17 +59,7 @@ def make_template(settings: InstrumentSettings, autos: bool = False, as_built: b
 
 
 def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndarray) -> UVData:
-    """Return the observation of the template at other times and frequencies, such as interpolation nodes.
-
-    Parameters
-    ----------
-    template
-        From `make_template`.
-    times_jd
-        Times as Julian dates, shape (Ntimes,).
-    frequencies
-        Frequencies in Hz, shape (Nfreqs,).
-    """
+    """Return the observation of the template at other times (Julian dates) and frequencies (Hz)."""
     return _metadata(
         template.telescope.copy(),
         np.column_stack([template.ant_1_array, template.ant_2_array])[: template.Nbls],
@@ -118,7 +90,7 @@ def _lst(jd: float, location: EarthLocation) -> float:
 def _telescope(layout: Layout) -> Telescope:
     centre = np.array([axis.to_value(units.m) for axis in layout.location.geocentric])
     return Telescope.new(
-        # Not "MWA": pyuvdata fills in what it knows of that name, some of it looked up online.
+        # Not "MWA": pyuvdata adds the metadata of that name, and looks up some of it online.
         name=f"calstudy {layout.name}",
         instrument="calstudy",
         location=layout.location,
@@ -140,7 +112,7 @@ def _metadata(
     resolution: tuple[float, float],
     polarizations: np.ndarray,
 ) -> UVData:
-    """Build the UVData; `resolution` is the integration time in s and the channel width in Hz."""
+    """Make the UVData; `resolution` is the integration time in s and the channel width in Hz."""
     use_bundled_earth_orientation()
     integration, width = resolution
     uvd = UVData.new(
@@ -157,6 +129,6 @@ def _metadata(
         vis_units="Jy",
         pol_convention="sum",
     )
-    # Instead of pyuvdata's own, which holds the time of day: same settings, same template.
+    # pyuvdata's own history contains the time of day. Equal settings must give equal templates.
     uvd.history = "calstudy instrument template"
     return uvd

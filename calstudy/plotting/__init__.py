@@ -1,1 +1,1 @@
-"""What figures share: the journal style, panels, axes over baseline length and delay, files."""
+"""Common parts of figures: the journal style, panels, axes of baseline length and delay, and files."""

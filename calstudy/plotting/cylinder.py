@@ -1,4 +1,4 @@
-"""What figures over baseline length and delay have in common: cells, the horizon, axes of metres and nanoseconds."""
+"""Common parts of figures over baseline length and delay: cells, the horizon, axes in metres and nanoseconds."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Cylinder(Protocol):
 
 
 def length_cells(cylinder: Cylinder) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges (M + 1,) in m of contiguous cells, and which of them each bin of lengths fills, (Nb,) int.
+    """Return the edges (M + 1,) in m of contiguous cells, and the cell of each bin of lengths, (Nb,) int.
 
-    Cells between bins that are not adjacent hold no baselines.
+    Cells between bins that are not adjacent contain no baselines.
     """
     edges = np.unique(cylinder.bin_edges)
     return edges, np.searchsorted(edges, cylinder.bin_edges[:, 0])
@@ -63,19 +63,7 @@ def cells(cylinder: Cylinder, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def draw_horizon(axes: Axes, cylinder: Cylinder, buffer: float, colour: str = "black") -> None:
-    """Draw the horizon and, dashed, the delay `buffer` (s) beyond it.
-
-    Parameters
-    ----------
-    axes
-        Of k_perp and k_parallel, h/Mpc.
-    cylinder
-        Gives lengths and delays.
-    buffer
-        Of the dashed line, s.
-    colour
-        Of both lines.
-    """
+    """Draw the horizon and, dashed, the delay `buffer` (s) beyond it, on axes of k_perp and k_parallel in h/Mpc."""
     lengths = cylinder.bin_edges[[0, -1], [0, 1]]
     k_perp = lengths * ratio(cylinder.k_perp, cylinder.baseline_length)
     per_second = ratio(cylinder.k_parallel, cylinder.delay)
@@ -102,17 +90,7 @@ def _scaled_by(factor: float) -> tuple[Callable[[ArrayLike], np.ndarray], Callab
 
 
 def label_axes(axes: Axes, cylinder: Cylinder, max_delay: float | None) -> None:
-    """Set limits and label k_perp below and metres above; delays end at `max_delay` (s), if that is not None.
-
-    Parameters
-    ----------
-    axes
-        Of k_perp and k_parallel, h/Mpc.
-    cylinder
-        Gives lengths and delays.
-    max_delay
-        Upper end, s; all delays if None or larger than those.
-    """
+    """Set limits and label k_perp (h/Mpc) below and metres above; delays end at `max_delay` (s), if it is not None."""
     from matplotlib.ticker import MaxNLocator
 
     metres = ratio(cylinder.baseline_length, cylinder.k_perp)

@@ -1,4 +1,4 @@
-"""One quantity in frequency and in delay, as the calibration figures show it."""
+"""One quantity in frequency and in delay, as in the calibration figures."""
 
 from __future__ import annotations
 
@@ -15,19 +15,10 @@ FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 @dataclass(frozen=True)
 class TwoDomains:
-    """One or more spectra in both domains.
+    """One or more complex spectra, (..., Nfreqs), in both domains.
 
-    Attributes
-    ----------
-    frequency
-        Channel centres, (Nfreqs,), Hz.
-    delay
-        Ascending delays, (Nfreqs,), s.
-    values
-        The spectra, (..., Nfreqs) complex.
-    transform
-        Their Blackman-Harris delay transforms, (..., Nfreqs) complex, in the unit of `values`: a constant spectrum has
-        the transform of its own value at zero delay.
+    `frequency` are the channel centres, (Nfreqs,), Hz, and `delay` is ascending, (Nfreqs,), s. `transform` are
+    Blackman-Harris delay transforms in the unit of `values`: a constant spectrum has its own value at zero delay.
     """
 
     frequency: np.ndarray
@@ -37,17 +28,14 @@ class TwoDomains:
 
     @property
     def real(self) -> np.ndarray:
-        """Real parts of the spectra for a plot against frequency, NaN where they are zero: what is flagged."""
+        """Real parts of the spectra for a plot against frequency, NaN where they are zero, that is flagged."""
         return np.where(self.values == 0, np.nan, self.values.real)
 
 
 def in_two_domains(frequency: np.ndarray, values: np.ndarray) -> TwoDomains:
-    """Transform spectra (..., Nfreqs) on equally spaced channels `frequency` (Nfreqs,) Hz to delay.
+    """Transform spectra (..., Nfreqs) on channels `frequency` (Nfreqs,) Hz to delay.
 
-    Raises
-    ------
-    ValueError
-        If the channels are not equally spaced and ascending or do not match the spectra.
+    Raises ValueError if the channels are not equally spaced and ascending or do not match the spectra.
     """
     values = np.asarray(values)
     width = channel_width(frequency)

@@ -27,17 +27,7 @@ def frequency_and_delay(rows: int = 2) -> tuple[Figure, list[Axes], Axes]:
 
 
 def delay_panel(axes: Axes, delay: np.ndarray, label: str) -> None:
-    """Finish axes of amplitudes against `delay` (Ndelays,) s, logarithmic.
-
-    Parameters
-    ----------
-    axes
-        To finish.
-    delay
-        Ascending, s, (Ndelays,).
-    label
-        Of the amplitudes.
-    """
+    """Set scales and labels of axes of amplitudes against ascending `delay` (Ndelays,) s."""
     axes.set(yscale="log", xlabel=style.DELAY, ylabel=label, xlim=(delay[0] * 1e9, delay[-1] * 1e9))
 
 
@@ -48,17 +38,7 @@ def mark_horizon(axes: Axes, horizon: float) -> None:
 
 
 def name_baseline(axes: Axes, antennas: tuple[int, int], baseline_length: float) -> None:
-    """Write the antennas and the length in m of a baseline into the upper right corner.
-
-    Parameters
-    ----------
-    axes
-        To write on.
-    antennas
-        The two antenna numbers.
-    baseline_length
-        m.
-    """
+    """Write the antenna numbers and the length in m of a baseline into the upper right corner."""
     a, b = antennas
     label = rf"({a}, {b}), $|\mathbf{{b}}| = {baseline_length:.1f}$ m"
     axes.text(0.97, 0.95, label, transform=axes.transAxes, ha="right", va="top", fontsize=style.SMALL_SIZE + 0.5)

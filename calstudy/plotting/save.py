@@ -1,4 +1,4 @@
-"""Figures on disk: picture, vector graphics and the arrays that were drawn, side by side."""
+"""Figures on disk: picture, vector graphics and the arrays that were drawn."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 DOTS_PER_INCH = 200
 RASTER_DOTS_PER_INCH = 600
-"""Resolution of what the vector graphics hold as pixels: the cells of the wedge."""
+"""Resolution of the parts of the vector graphics that are pixels, such as the cells of the wedge."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
@@ -30,8 +30,7 @@ def figure_arrays(data: Any) -> dict[str, np.ndarray]:
     Parameters
     ----------
     data
-        Dataclasses, mappings and sequences of them, nested, with arrays, numbers and strings at the ends; None means
-        absent.
+        Dataclasses, mappings and sequences, nested, that contain arrays, numbers and strings; None means absent.
 
     Returns
     -------
@@ -41,7 +40,7 @@ def figure_arrays(data: Any) -> dict[str, np.ndarray]:
     Raises
     ------
     ValueError
-        If an end is neither an array, a number, a string nor None.
+        If a value is neither an array, a number, a string nor None.
     """
     arrays: dict[str, np.ndarray] = {}
     _collect("", data, arrays)
@@ -74,25 +73,19 @@ def _plain_array(name: str, value: Any) -> np.ndarray:
 
 
 def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Path | str, name: str) -> list[Path]:
-    """Write ``name.npz``, ``name.pdf`` and ``name.png`` (200 dpi) into `directory`.
+    """Write ``name.npz``, ``name.pdf`` and ``name.png`` (200 dpi) into `directory`, and return the three paths.
 
-    Each file appears whole or not at all, replacing an older one. The same figure and arrays give the same bytes: no
-    dates are written.
+    Each file is written completely or not at all, and replaces an older one. The same figure and arrays give the same
+    bytes: no dates are written.
 
     Parameters
     ----------
-    figure
-        What to draw.
     arrays
         Plain arrays (numbers, booleans, strings) by name; see `figure_arrays`.
     directory
-        Made if it does not exist.
+        Created if it does not exist.
     name
-        File name without ending: letters, digits, ``.``, ``_`` and ``-``.
-
-    Returns
-    -------
-    The three paths, in the order above.
+        File name without extension: letters, digits, ``.``, ``_`` and ``-``.
 
     Raises
     ------
@@ -121,7 +114,7 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
 
 @contextmanager
 def _laid_out(figure: Figure) -> Iterator[None]:
-    """Lay a figure out once; matplotlib does so for each file, and draws it once more to do so."""
+    """Lay out a figure once; matplotlib would draw it an additional time for each file."""
     layout = figure.get_layout_engine()
     if layout is None or not figure.axes:
         yield

@@ -1,4 +1,4 @@
-"""The one look of every figure: sizes, colours, fonts, axis labels, and the note that names stand-ins."""
+"""The style of every figure: sizes, colours, fonts, axis labels, and the note on stand-ins."""
 
 from __future__ import annotations
 
@@ -78,10 +78,10 @@ _LOCK = RLock()
 
 @contextmanager
 def journal_style() -> Iterator[None]:
-    """Draw or save with the figures' own settings, whatever the user's; also a decorator.
+    """Draw or save with the settings of this module, regardless of the user's; also a decorator.
 
-    Matplotlib's settings are global to the process: they are as before on leaving, and a lock keeps two threads of a
-    study from drawing at once.
+    Matplotlib's settings are global to the process: they are restored on exit, and a lock keeps two threads of a study
+    from drawing at once.
     """
     import matplotlib.style
 
@@ -90,7 +90,7 @@ def journal_style() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of `width` × `height` inches that no pyplot state knows of."""
+    """Return an empty figure of `width` × `height` inches that is not registered with pyplot."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -110,22 +110,14 @@ def label_one_two_five(axis: Axis) -> None:
 
 
 def note_stand_ins(figure: Figure, stand_ins: Sequence[str]) -> Text | None:
-    """Print what stands in for the paper's input as one small grey line below the axes.
+    """Print the substitutes for the paper's inputs as one small grey line below the axes, and return the text.
 
-    Parameters
-    ----------
-    figure
-        A figure made by `new_figure`.
-    stand_ins
-        One sentence or phrase each, for example ``"synthetic faint sources"``. Nothing is printed if there are none.
-
-    Returns
-    -------
-    The text that was added, or None.
+    Each is a sentence or phrase, such as ``"synthetic faint sources"``. Without any, nothing is printed, and None is
+    returned.
     """
     if not stand_ins:
         return None
     text = "stand-in: " + "; ".join(item.strip().rstrip(".") for item in stand_ins)
-    # Measured for this font: about 28 characters to the inch at this size.
+    # About 28 characters of this font and size are one inch wide.
     lines = textwrap.fill(text, width=int(28 * figure.get_figwidth()))
     return figure.supxlabel(lines, x=0.01, ha="left", fontsize=NOTE_SIZE, color=GREY)

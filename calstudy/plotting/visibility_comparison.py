@@ -1,4 +1,4 @@
-"""One visibility against a model of it, in frequency and delay: what the model and data figures share."""
+"""One visibility and a model of it, in frequency and delay: the common part of the model and data figures."""
 
 from __future__ import annotations
 
@@ -20,16 +20,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class VisibilityComparison:
-    """One baseline at one integration.
+    """One baseline at one integration, with spectra (Nfreqs,) in Jy; `baseline_length` is |b| in m.
 
-    Attributes
-    ----------
-    antennas
-        The two antenna numbers.
-    baseline_length
-        |b| in m.
-    reference, model, residual, noise
-        What is modelled, the model, reference - model, and the thermal noise in the data; spectra (Nfreqs,) in Jy.
+    The residual is reference - model, and the noise is the thermal noise in the data.
     """
 
     antennas: tuple[int, int]
@@ -51,38 +44,17 @@ class Visibilities(NamedTuple):
 def compare_visibilities(
     antennas: tuple[int, int], baseline_length: float, frequency: np.ndarray, visibilities: Visibilities
 ) -> VisibilityComparison:
-    """Compare visibilities on channels `frequency` (Nfreqs,) Hz; the length |b| is in m.
-
-    Parameters
-    ----------
-    antennas
-        The two antenna numbers.
-    baseline_length
-        |b|, m.
-    frequency
-        Channel centres, Hz, (Nfreqs,).
-    visibilities
-        What is modelled, the model, and the noise.
-    """
+    """Compare visibilities on channels `frequency` (Nfreqs,) Hz; the length |b| is in m."""
     reference, model, noise = visibilities
     spectra = (in_two_domains(frequency, values) for values in (reference, model, reference - model, noise))
     return VisibilityComparison(antennas, baseline_length, *spectra)
 
 
 def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str], stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw real parts against frequency (left) and transforms' amplitudes against delay (right).
+    """Draw real parts against frequency (left) and amplitudes of transforms against delay (right).
 
-    The reference is solid, the model dashed, the residual dotted, the noise dash-dotted. Vertical lines are the wedge's
-    edges.
-
-    Parameters
-    ----------
-    comparison
-        What to draw.
-    labels
-        Names of reference and model in the legend.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    The reference is solid, the model dashed, the residual dotted, the noise dash-dotted. Vertical lines are the edges
+    of the wedge. `labels` are the names of reference and model in the legend.
     """
     figure, (values, residuals), delays = frequency_and_delay()
     looks: tuple[tuple[Axes, TwoDomains, str, dict[str, Any]], ...] = (

@@ -1,1 +1,1 @@
-"""Visibilities of skies: the engines that compute them, and what limits their accuracy."""
+"""Simulation of visibilities: the engines, and the approximations that limit their accuracy."""

@@ -1,4 +1,4 @@
-"""Common arguments of matvis and fftvis, and the polarizations in the matrices of feeds that they return."""
+"""Arguments that matvis and fftvis share, and the order of polarizations in the feed matrices that they return."""
 
 from __future__ import annotations
 
@@ -20,29 +20,21 @@ from calstudy.simulate.directions import sky_coordinates
 from calstudy.simulate.interface import BeamSource
 from calstudy.simulate.nodes import integration_times
 
-# Row and column of a matrix of feeds x and y that hold each polarization number.
+# Row and column of each polarization number in a matrix of feeds x and y.
 FEED_PAIRS = {-5: (0, 0), -6: (1, 1), -7: (0, 1), -8: (1, 0)}
 OPTIONAL = ("matvis", "fftvis")
-"""Engines whose packages are not among calstudy's dependencies; the extra `engines` has them."""
+"""Engines whose packages are not dependencies of calstudy; the extra `engines` installs them."""
 
 
 def missing_package(engine: str) -> str | None:
-    """Return that the package of an engine of this name is not installed, or None."""
+    """Return a message if the package of this engine is not installed, or None."""
     if engine in OPTIONAL and find_spec(engine) is None:
         return f"needs the package {engine}, which is not installed: pip install 'calstudy[engines]'"
     return None
 
 
 def refusal(engine: str, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
-    """Return why matvis or fftvis does not support a simulation, or None.
-
-    Parameters
-    ----------
-    engine
-        Its name, for the sentence.
-    sky, beam, template
-        As for `calstudy.simulate.interface.Engine.simulate`.
-    """
+    """Return the reason why matvis or fftvis does not support a simulation, or None if it does."""
     if (missing := missing_package(engine)) is not None:
         return missing
     if is_polarized(sky):
@@ -78,27 +70,27 @@ def common_arguments(sky: SkyModel, template: UVData) -> dict[str, Any]:
 
 
 def baseline_pairs(template: UVData) -> np.ndarray:
-    """Return the antennas of each baseline, (Nbls, 2), as `common_arguments` numbers them."""
+    """Return the antennas of each baseline, (Nbls, 2), in the numbering of `common_arguments`."""
     return _used(template)[1]
 
 
 def beam_arguments(
     beam: BeamSource | AntennaBeams, template: UVData
 ) -> tuple[list[UVBeam | BeamInterface], np.ndarray]:
-    """Return the distinct beams at the template's frequencies, and which each numbered antenna has, (Nants,) int.
+    """Return the distinct beams at the template's frequencies, and the index of the beam of each antenna, (Nants,) int.
 
-    Both libraries sum conj(J_ai) J_bj and name it the visibility of feeds j, i: the right one if antennas a and b have
-    the same beam. The conjugates of the beams make it the visibility of feeds i, j for any beams, so the two axes of
-    feeds must be exchanged in what the libraries return.
+    Both libraries sum conj(J_ai) J_bj and call it the visibility of feeds j, i. That is correct only if antennas a and
+    b have the same beam. With conjugated beams the sum is the visibility of feeds i, j for any beams, so the two feed
+    axes of the result must be exchanged.
     """
     beams, index = split_beams(beam, template)
     return [_conjugated(item.at(template.freq_array)) for item in beams], index[_used(template)[0]]
 
 
 def as_splines(beam: UVBeam | BeamInterface) -> UVBeam | BeamInterface:
-    """Return a tabulated beam that is always interpolated by splines, whatever a caller asks for.
+    """Return the beam; a tabulated one is always interpolated by splines, whichever method a caller requests.
 
-    matvis asks for `scipy.ndimage.map_coordinates`, which differs from pyuvsim's splines by 1e-5 of the rms.
+    matvis requests `scipy.ndimage.map_coordinates`, which differs from pyuvsim's splines by 1e-5 of the rms.
     """
     if not isinstance(beam, UVBeam):
         return beam
@@ -114,7 +106,7 @@ class _SplineBeam(UVBeam):
 
 
 def select_polarizations(matrices: np.ndarray, template: UVData) -> np.ndarray:
-    """Return the template's polarizations, (..., Npols), of matrices of feeds, (..., 2, 2)."""
+    """Return the template's polarizations, (..., Npols), from feed matrices, (..., 2, 2)."""
     rows, columns = np.array([FEED_PAIRS[int(number)] for number in template.polarization_array]).T
     return matrices[..., rows, columns]
 

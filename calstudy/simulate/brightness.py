@@ -1,4 +1,4 @@
-"""Flux density of every component of a sky model at every frequency, for all spectral types and units."""
+"""Flux density of each component of a sky model at each frequency, for all spectral types and units."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def is_polarized(sky: SkyModel) -> bool:
 
 
 def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Return Stokes I as pyuvsim sees it.
+    """Return Stokes I of a sky in Jy, with the same conventions as pyuvsim.
 
     HEALPix pixels count as points that hold the pixel's integral, and brightness temperatures are converted at the
     reference frequency of a spectral-index or flat component, or else at each frequency (Rayleigh-Jeans).
@@ -27,19 +27,20 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | sl
     sky
         Points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type.
     frequencies : (Nfreqs,) float
-        Hz.
+        Frequencies in Hz.
     components
-        Which are wanted.
+        Indices of the components, all by default.
 
     Returns
     -------
     (Nfreqs, Ncomponents) float
-        Jy; a read-only view without a frequency axis in memory if all are the same.
+        Flux densities in Jy. If they are the same at all frequencies, a read-only view that does not repeat them in
+        memory.
 
     Raises
     ------
     InputError
-        If a spectral index is not a number, a `full` sky has not one of the frequencies, or a `subband` sky does not
+        If a spectral index is not a number, a `full` sky lacks one of the frequencies, or a `subband` sky does not
         span them.
     """
     if sky.spectral_type == "subband":
@@ -49,7 +50,7 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | sl
 
 
 def _stokes_values(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice) -> np.ndarray:
-    """Return Stokes I in the sky's own unit, (Nfreqs or 1, Ncomponents)."""
+    """Return Stokes I in the unit of the sky model, (Nfreqs or 1, Ncomponents)."""
     values = sky.stokes[0].value
     if sky.spectral_type == "flat":
         return values[:, components]
@@ -67,7 +68,7 @@ def _stokes_values(sky: SkyModel, frequencies: np.ndarray, components: np.ndarra
 
 
 def _jansky_factor(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice) -> np.ndarray | float:
-    """Return what turns the sky's own unit into Jy, broadcastable to (Nfreqs, Ncomponents)."""
+    """Return the factor from the unit of the sky model to Jy, broadcastable to (Nfreqs, Ncomponents)."""
     solid_angle = nside_to_pixel_area(sky.nside) if sky.component_type == "healpix" else 1 * units.sr / units.sr
     unit = sky.stokes.unit * solid_angle.unit
     if unit.is_equivalent("Jy"):

@@ -1,6 +1,6 @@
-"""Simulation in pieces, their assembly, and the check of the interpolation.
+"""Simulation in chunks, their assembly, and the check of the interpolation.
 
-A chunk is a block of consecutive frequency nodes at all integrations, of the whole sky or of one part of it. Chunks are
+A chunk is a block of consecutive frequency nodes at all integrations, for the whole sky or one part of it. Chunks are
 simulated independently, can be stored, and are added up to the visibilities. Their number changes the result by less
 than the tolerance of the interpolation.
 """
@@ -29,23 +29,15 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PART_NSIDE = 8
-"""Cells of the sky that parts consist of."""
+"""Resolution of the grid whose cells are divided between the parts of the sky."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A piece of a simulation.
+    """One piece of a simulation.
 
-    Attributes
-    ----------
-    axis
-        All frequency nodes of the simulation.
-    nodes
-        Which of them belong to this chunk.
-    part
-        Which part of the sky, and of how many.
-    accuracy
-        Of the interpolation.
+    `axis` has all frequency nodes of the simulation, and `nodes` selects those of this chunk. `part` is the index of
+    the part of the sky, and the number of parts.
     """
 
     axis: Axis
@@ -55,18 +47,18 @@ class Chunk:
 
     @property
     def frequencies(self) -> np.ndarray:
-        """Frequencies of the chunk's nodes, (Nf,), Hz."""
+        """Frequencies of the nodes of the chunk, (Nf,), Hz."""
         return self.axis.nodes[self.nodes]
 
     @property
     def channels(self) -> slice:
-        """The channels that the chunk's nodes are; raises ValueError where nodes are not channels."""
+        """Channels of the chunk; raises ValueError if its frequency nodes are not channels."""
         if not self.axis.at_samples:
             raise ValueError("the chunk's frequency nodes are not channels, the sky must be smooth in frequency for it")
         return self.nodes
 
     def select(self, sky: SkyModel) -> SkyModel | None:
-        """Select the chunk's part of a sky: every n-th cell of a grid, so that parts take equal times; None: none."""
+        """Select the chunk's part of a sky, or None if it is empty; every n-th cell of a grid, for equal times."""
         index, count = self.part
         if count == 1:
             return sky
@@ -78,16 +70,8 @@ class Chunk:
 class InterpolationCheck:
     """Comparison of interpolated with directly simulated visibilities where the error should be largest.
 
-    Attributes
-    ----------
-    max_error
-        Largest absolute difference over the rms of the visibilities.
-    rms_error
-        Rms difference over the rms of the visibilities.
-    times_jd, frequencies
-        Where they were compared: at every combination of these (Julian date; Hz).
-    time_nodes, frequency_nodes
-        How many nodes the simulation has.
+    Both errors are relative to the rms of the visibilities. They are of all combinations of `times_jd` (Julian dates)
+    and `frequencies` (Hz).
     """
 
     max_error: float
@@ -99,20 +83,11 @@ class InterpolationCheck:
 
 
 def plan_chunks(template: UVData, accuracy: Accuracy, count: int) -> list[Chunk]:
-    """Split a simulation into pieces that take about equal times.
+    """Split a simulation into at most `count` chunks that take about equal times.
 
     A sky given channel by channel (the EoR), or seen through a beam that is not smooth in frequency, is split by
-    channels. A smooth sky takes the fewer frequency nodes the wider the band is (`calstudy.simulate.patches`): it is
-    split into parts of the sky, and by frequency only where a chunk would be too large.
-
-    Parameters
-    ----------
-    template
-        The observation.
-    accuracy
-        Of the interpolation.
-    count
-        The largest number of chunks.
+    channels. A smooth sky needs relatively fewer frequency nodes the wider the band is (`calstudy.simulate.patches`),
+    so it is split into parts of the sky, and by frequency only where a chunk would be too large.
     """
     axis = frequency_axis(template, accuracy)
     blocks = min(count, len(axis.nodes))
@@ -130,25 +105,10 @@ def plan_chunks(template: UVData, accuracy: Accuracy, count: int) -> list[Chunk]
 def simulate_chunk(
     engine: Engine, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, chunk: Chunk
 ) -> np.ndarray:
-    """Simulate a chunk at all integrations.
+    """Simulate a chunk in Jy at all integrations and at its frequency nodes, (Ntimes, Nbls, Nf, Npols) complex128.
 
-    Parameters
-    ----------
-    engine
-        Any.
-    sky
-        The whole sky; if it is given channel by channel, at least the chunk's channels.
-    beam
-        Of all antennas, or of each.
-    template
-        The whole observation.
-    chunk
-        From `plan_chunks` of the same template.
-
-    Returns
-    -------
-    (Ntimes, Nbls, Nf, Npols) complex128
-        Visibilities in Jy at all integrations and the chunk's frequency nodes.
+    `template` is the whole observation. `sky` is the whole sky; if it is given channel by channel, it needs only the
+    channels of the chunk.
     """
     frame = subset_template(template, integration_times(template), chunk.frequencies)
     part = chunk.select(sky)
@@ -176,26 +136,7 @@ def simulate_visibilities(
     accuracy: Accuracy,
     count: int = 1,
 ) -> np.ndarray:
-    """Simulate a complete observation in this process; see `plan_chunks`, `simulate_chunk` and `assemble`.
-
-    Parameters
-    ----------
-    engine
-        What computes the visibilities.
-    sky
-        Components of the sky.
-    beam
-        Of all antennas, or of each.
-    template
-        The observation: antennas, baselines, times, channels, polarizations.
-    accuracy, count
-        As for `plan_chunks`.
-
-    Returns
-    -------
-    (Ntimes, Nbls, Nfreqs, Npols) complex128
-        Visibilities in Jy.
-    """
+    """Simulate an observation chunk by chunk in this process, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy."""
     chunks = plan_chunks(template, accuracy, count)
     return assemble(chunks, (simulate_chunk(engine, sky, beam, template, chunk) for chunk in chunks))
 
@@ -208,23 +149,21 @@ def check_interpolation(
     channels: slice = slice(None),
     count: int = 3,
 ) -> InterpolationCheck:
-    """Simulate a few integrations and channels directly and compare.
+    """Compare interpolated visibilities with a direct simulation at a few integrations and channels.
 
     Parameters
     ----------
     simulate
-        Returns the visibilities at a template's integrations and channels, (Ntimes, Nbls, Nfreqs, Npols): an engine's
-        `simulate` with the sky and beam of the simulation.
-    template
-        Of the simulation.
+        Returns the visibilities at the integrations and channels of a template, (Ntimes, Nbls, Nfreqs, Npols): an
+        engine's `simulate` with the sky and beam of the simulation.
     cube : (Ntimes, Nbls, Nfreqs, Npols)
-        Its result at all channels.
+        Interpolated visibilities at all channels.
     chunk
-        Any of its pieces: has the nodes.
+        Any chunk of the simulation, for its nodes.
     channels
-        Channels to choose from: those that the sky has, if it is given channel by channel.
+        Channels to choose from: those of the sky, if it is given channel by channel.
     count
-        How many integrations and how many channels, spread over the observation, each as far from nodes as can be.
+        Number of integrations, and of channels, spread over the observation; each is as far from nodes as possible.
     """
     times, frequencies = integration_times(template), template.freq_array
     nodes = time_axis(template, chunk.accuracy).nodes
@@ -244,7 +183,7 @@ def check_interpolation(
 
 
 def _farthest(samples: np.ndarray, nodes: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:
-    """Return one candidate from each of `count` stretches, where the polynomial with roots at the nodes is largest."""
+    """Return one candidate from each of `count` intervals, where the polynomial with roots at the nodes is largest."""
     offsets = np.abs(samples[candidates][:, None] - nodes) / (np.ptp(samples) or 1.0)
     with np.errstate(divide="ignore"):
         size = np.log(offsets).sum(axis=1)

@@ -1,4 +1,4 @@
-"""One component of the sky through one instrument: from the settings to visibilities, in independent pieces."""
+"""Visibilities of one component of the sky through one instrument, simulated in independent pieces."""
 
 from __future__ import annotations
 
@@ -28,29 +28,15 @@ if TYPE_CHECKING:
 
 SMOOTH_SPECTRA = ("flat", "spectral_index")
 CHECKED = 2
-"""Integrations, and channels, at which interpolated visibilities are compared with directly simulated ones."""
+"""Number of integrations, and of channels, at which interpolated visibilities are compared with direct ones."""
 
 
 class Component:
-    """The instrument as built and one component of the sky; what is costly is made when it is asked for.
+    """Sources or the EoR seen by the instrument as built; expensive parts are made on demand.
 
-    Parameters
-    ----------
-    instrument, simulation
-        Sections of the experiment.
-    sky
-        Settings of the sources or of the EoR.
-    cosmology
-        Name of the cosmology, which turns the EoR's P(k) into brightness.
-    diffuse
-        Settings of the diffuse emission that is added to sources, or None.
-
-    Attributes
-    ----------
-    template
-        The observation with the nominal positions of antennas, as data files have them.
-    as_built
-        The same with the true ones, of which it is simulated.
+    `template` is the observation with the nominal antenna positions, which data files have. `as_built` has the true
+    positions, for which it is simulated. The cosmology converts the P(k) of the EoR to brightness. Diffuse emission is
+    added to sources.
     """
 
     def __init__(
@@ -90,7 +76,7 @@ class Component:
 
     @cached_property
     def accuracy(self) -> Accuracy:
-        """How exactly visibilities are interpolated, and whether beam and sky vary smoothly from channel to channel."""
+        """Tolerance of the interpolation, and whether beam and sky are smooth in frequency."""
         beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
         smooth_beam, nodes = all(model_of(beam).smooth for beam in beams), self.simulation.nodes
         if self.is_eor:
@@ -99,24 +85,21 @@ class Component:
 
     @cached_property
     def chunks(self) -> list[Chunk]:
-        """The pieces of the simulation; there may be fewer than asked for."""
+        """Chunks of the simulation, at most as many as the settings ask for."""
         return plan_chunks(self.as_built, self.accuracy, self.simulation.pieces(self.is_eor))
 
     def sky(self, channels: slice | np.ndarray) -> SkyModel:
-        """Return the sky, of the EoR only the given channels."""
+        """Return the sky; for the EoR only at the given channels."""
         return self._foregrounds if self._field is None else self._field.sky(channels)
 
     def interpolation_error(self, cube: np.ndarray) -> dict[str, Any] | None:
-        """Return how far interpolated visibilities are from directly simulated ones; None if none are interpolated.
+        """Compare interpolated visibilities, (Ntimes, Nbls, Nfreqs, Npols), Jy, with directly simulated ones.
 
-        Parameters
-        ----------
-        cube
-            The visibilities, (Ntimes, Nbls, Nfreqs, Npols), Jy.
+        Return None if nothing is interpolated.
         """
         if not self.accuracy.tolerance:
             return None
-        # Of the EoR, whose channels are independent, only the last block is drawn again.
+        # The channels of the EoR are independent, so only the last ones are drawn again.
         channels = slice(-CHECKED, None) if self.is_eor else slice(None)
         sky = self.sky(np.arange(self.template.Nfreqs)[channels])
         simulate = partial(simulate_with, self.engine, sky, self.beam)

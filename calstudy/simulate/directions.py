@@ -1,4 +1,4 @@
-"""Directions of the components of a sky model against time, which of them rise or set, and which are neighbours."""
+"""Directions of the components of a sky model as a function of time, the horizon, and neighbouring components."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from calstudy.simulate.nodes import (
     interpolation_matrix,
 )
 
-# A direction is a unit vector turning with the Earth: this error is its rounding.
+# A direction is a unit vector that turns with the Earth; this is its rounding error.
 DIRECTION_TOLERANCE = 1e-15
 
 # Celestial frames that are defined by their name alone.
 FRAMES = ("icrs", "galactic")
 
-# A source this near the horizon may rise or set between two of the times looked at (rad).
+# A source this close to the horizon may rise or set between two of the sampled times (rad).
 HORIZON_MARGIN = 1e-6
 
 
@@ -34,15 +34,9 @@ HORIZON_MARGIN = 1e-6
 class SourceTracks:
     """Direction of every component at any time within a span.
 
-    The transformation is astropy's, the one pyuvsim uses, at a few Chebyshev times; directions in between are the
-    interpolating polynomial, equal to rounding.
-
-    Attributes
-    ----------
-    nodes : (n,) float
-        Julian dates (UTC).
-    vectors : (n, 3, Ncomponents) float
-        Unit vectors in east, north, up at these times.
+    The transformation is astropy's, which pyuvsim uses, at a few Chebyshev times. Directions in between are those of
+    the interpolating polynomial, equal to rounding. `nodes` are the times, (n,), Julian dates (UTC), and `vectors` are
+    unit vectors in east, north, up at these times, (n, 3, Ncomponents).
     """
 
     nodes: np.ndarray
@@ -50,17 +44,7 @@ class SourceTracks:
 
     @classmethod
     def of(cls, sky: SkyModel, location: EarthLocation, times_jd: np.ndarray) -> SourceTracks:
-        """Follow the components of a sky.
-
-        Parameters
-        ----------
-        sky
-            Components in any celestial frame; not changed.
-        location
-            Of the array.
-        times_jd : (Ntimes,) float
-            Julian dates (UTC) at which directions will be needed.
-        """
+        """Compute the tracks of the components of a sky, in any celestial frame, for Julian dates (UTC), (Ntimes,)."""
         bandwidth = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.ptp(times_jd) / 2
         count = chebyshev_count(bandwidth, DIRECTION_TOLERANCE)
         distinct = np.unique(times_jd)
@@ -91,13 +75,13 @@ def _is_whole_map(sky: SkyModel) -> bool:
 
 
 def sky_coordinates(sky: SkyModel) -> SkyCoord:
-    """Return where the components are, (Ncomponents,): points, or centres of HEALPix pixels, in the sky's own frame."""
+    """Return the coordinates of points or of the centres of HEALPix pixels, (Ncomponents,), in the sky's own frame."""
     if sky.component_type == "point":
         return sky.skycoord
     return SkyCoord(*sky.get_lon_lat(), frame=sky.hpx_frame)
 
 
-# All channels of the EoR have the same pixels, whose transformation takes as long as a tenth of a piece.
+# All channels of the EoR have the same pixels, whose transformation takes a tenth of the time of a chunk.
 @lru_cache(maxsize=1)
 def _map_vectors(
     nside: int, order: str, frame: str, place: tuple[float, float, float], nodes: tuple[float, ...]
@@ -123,24 +107,11 @@ def _enu(coordinates: SkyCoord, location: EarthLocation, time_jd: float) -> np.n
 
 
 def split_by_horizon(tracks: SourceTracks, times_jd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Separate the components that stay above the horizon from those that rise or set.
+    """Return the indices of components that are above the horizon at all times, and of those that rise or set.
 
-    Between two of the times that are looked at, an angle h apart, the height of a source, a sinusoid of at most unit
-    amplitude, leaves the range of its values there by at most h^2 / 8.
-
-    Parameters
-    ----------
-    tracks
-        Of all components.
-    times_jd : (Ntimes,) float
-        All times that will be simulated or interpolated to.
-
-    Returns
-    -------
-    always_up : (N,) int
-        Indices of the components above the horizon at every time.
-    crossing : (M,) int
-        Of those above it at some times only, or so close to it that they might be.
+    The times are all those that will be simulated or interpolated to. Components so close to the horizon that they
+    might cross it are among the second. The height of a source is a sinusoid of at most unit amplitude. Between two
+    sampled times that are an angle h apart, it exceeds the range of its sampled values by at most h^2 / 8.
     """
     looked_at = np.unique(np.concatenate([tracks.nodes, [times_jd.min(), times_jd.max()]]))
     heights = np.stack([tracks.at(time)[2] for time in looked_at])
@@ -152,7 +123,7 @@ def split_by_horizon(tracks: SourceTracks, times_jd: np.ndarray) -> tuple[np.nda
 
 
 def sky_cells(sky: SkyModel, nside: int) -> np.ndarray:
-    """Return the pixel of a coarse nested HEALPix grid in the sky's own frame that holds each component."""
+    """Return the pixel of each component in a coarse nested HEALPix grid in the frame of the sky."""
     if nside == 0:
         return np.zeros(sky.Ncomponents, dtype=int)
     longitude, latitude = sky.get_lon_lat()

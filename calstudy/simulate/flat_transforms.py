@@ -1,10 +1,10 @@
 """Sums over sources of the visibilities of all baselines of a flat array, by non-uniform Fourier transforms.
 
 Where antennas have no heights, a visibility is V(u) = sum_s w_s exp(2 pi i u.l_s) with the horizontal direction cosines
-l_s, exactly and however large the patch is. FINUFFT (Barnett et al. 2019) computes it at all baselines with a cost that
-grows with sources and baselines separately, not with their product: from about a hundred antennas it takes less time
-than matrix products (`calstudy.simulate.matrix_products`). Baselines on a lattice are modes of one regular grid, which
-is a transform of type 1; others take one of type 3.
+l_s, exactly and for patches of any size. FINUFFT (Barnett et al. 2019) computes it at all baselines with a cost that
+grows with sources and baselines separately, not with their product: for more than about a hundred antennas it takes
+less time than matrix products (`calstudy.simulate.matrix_products`). Baselines on a lattice are modes of one regular
+grid, which is a transform of type 1; others need one of type 3.
 """
 
 from __future__ import annotations
@@ -20,46 +20,30 @@ from calstudy.simulate.matrix_products import angles
 from calstudy.simulate.patterns import Pattern
 
 TOLERANCE = 3e-7
-"""Of the transforms, relative to the root of the sum of squares of the sources."""
+"""Tolerance of the transforms, relative to the root of the sum of squares of the sources."""
 POSITIONS = 1e-8
 """Heights, and distances from a lattice, below which an array is flat or regular (m): a phase of 1e-7 at 500 MHz."""
 NEAREST = 1e-3
-"""Baselines that differ by less are the same when a lattice is looked for, and no lattice is as fine (m)."""
+"""Baselines that differ by less are the same in the search for a lattice, and no lattice is finer than this (m)."""
 OVERSAMPLING = 1.25
 LARGEST_GRID = 4e6
-"""Modes of a lattice; a type 3 transform serves an array whose lattice has more."""
+"""Largest number of modes of a lattice; an array whose lattice has more is computed by transforms of type 3."""
 
 
 @dataclass(frozen=True)
 class FlatArray:
-    """Baselines without heights.
-
-    Attributes
-    ----------
-    delays : (Nbls, 2) float
-        Baselines over the speed of light, s, in east and north.
-    """
+    """Baselines without heights: `delays` are their east and north components over the speed of light, (Nbls, 2), s."""
 
     delays: np.ndarray
 
     @cached_property
     def lattice(self) -> Lattice | None:
-        """The regular grid that the baselines are on."""
+        """The regular grid of the baselines, or None."""
         basis = lattice_basis(self.delays * SPEED_OF_LIGHT)
         return None if basis is None else Lattice.of(self.delays, basis / SPEED_OF_LIGHT)
 
     def seconds(self, frequency: float, sources: float, radius: float) -> float:
-        """Estimate the time of the transform of a patch, without its beam.
-
-        Parameters
-        ----------
-        frequency
-            Hz.
-        sources
-            In the patch.
-        radius
-            Of the patch, rad.
-        """
+        """Estimate the time of the transform of a patch at a frequency (Hz), without its beam; `radius` is in rad."""
         if self.lattice:
             cells, each = OVERSAMPLING**2 * self.lattice.shape[0] * self.lattice.shape[1], 1e-8
         else:
@@ -69,7 +53,7 @@ class FlatArray:
 
 
 def flat_array(delays: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]) -> FlatArray | None:
-    """Return the baselines of antennas, (Nants, 3) in s, or None if these have heights."""
+    """Return the baselines of antennas with the given delays, (Nants, 3) in s, or None if the antennas have heights."""
     if np.ptp(delays[:, 2]) * SPEED_OF_LIGHT > POSITIONS:
         return None
     return FlatArray((delays[pairs[1]] - delays[pairs[0]])[:, :2])
@@ -77,24 +61,14 @@ def flat_array(delays: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]) -> Flat
 
 @dataclass(frozen=True)
 class FlatSums:
-    """A flat array with one beam, whose visibilities are summed over sources.
-
-    Attributes
-    ----------
-    array
-        Its baselines.
-    frequencies : (Nfreqs,) float
-        Hz.
-    pattern
-        The beam at these frequencies.
-    """
+    """Visibilities of a flat array with one beam `pattern` at `frequencies`, (Nfreqs,), Hz, summed over sources."""
 
     array: FlatArray
     frequencies: np.ndarray
     pattern: Pattern
 
     def at(self, vectors: np.ndarray, centre: np.ndarray, flux: np.ndarray) -> np.ndarray:
-        """Sum the visibilities of sources; as `calstudy.simulate.matrix_products.PairSums.at`, to `TOLERANCE`."""
+        """Sum the visibilities of sources to `TOLERANCE`; see `calstudy.simulate.matrix_products.PairSums.at`."""
         shape = (len(self.frequencies), self.pattern.n_feeds, len(self.array.delays))
         sums = np.zeros(shape, dtype=np.complex128)
         if not vectors.shape[1]:
@@ -126,14 +100,8 @@ class FlatSums:
 class Lattice:
     """Baselines as modes of a regular grid.
 
-    Attributes
-    ----------
-    basis : (2, 2) float
-        Rows are the steps of the grid, s.
-    shape
-        Of the grid, whose middle is a baseline of zero.
-    modes : (Nbls,) int
-        Flat index of each baseline in the grid.
+    The rows of `basis` (2, 2) are the steps of the grid, s. The middle of the grid is a baseline of zero. `modes` are
+    the flat indices of the baselines in the grid, (Nbls,).
     """
 
     basis: np.ndarray
@@ -152,17 +120,9 @@ class Lattice:
 
 
 def lattice_basis(vectors: np.ndarray) -> np.ndarray | None:
-    """Find the lattice in a plane that vectors generate.
+    """Find a short basis of the lattice that vectors (N, 2), in m, generate in a plane, in rows, (2, 2).
 
-    Parameters
-    ----------
-    vectors : (N, 2) float
-        m.
-
-    Returns
-    -------
-    (2, 2) float or None
-        A short basis of it, in rows; None if the vectors are on a line, or on no lattice to `POSITIONS`.
+    It is None if the vectors are on a line, or not on a lattice to within `POSITIONS`.
     """
     basis = _two_shortest(vectors)
     while basis is not None:
@@ -173,8 +133,8 @@ def lattice_basis(vectors: np.ndarray) -> np.ndarray | None:
         if not new.any():
             fitted = np.linalg.lstsq(steps, vectors, rcond=None)[0]
             return fitted if np.abs(vectors - steps @ fitted).max() < POSITIONS else None
-        # What is left of a vector is in the lattice as well, and is shorter than the basis: a finer basis, as in
-        # Euclid's algorithm. Vectors on no lattice leave ever shorter ones.
+        # The remainder of a vector is in the lattice as well, and shorter than the basis: a finer basis, as in
+        # Euclid's algorithm. Vectors on no lattice leave ever shorter remainders.
         shortest = left[new][np.argmin(lengths[new])]
         basis = _two_shortest(np.vstack([basis, shortest])) if lengths[new].min() > 10 * NEAREST else None
     return None

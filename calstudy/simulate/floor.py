@@ -1,8 +1,8 @@
 """The delay floor: the power of simulated foregrounds at delays beyond the horizon, where real foregrounds have none.
 
-Its causes are the simulation (a beam that is not smooth in frequency, rounding, interpolation) and the sidelobes of the
-taper. Levels are in amplitude decibel, 10 log10 of a brightness ratio, as in the paper (beam interpolation artefacts at
--45 dB, 21 cm signal at -40 dB).
+It is caused by the simulation (a beam that is not smooth in frequency, rounding, interpolation) and by the sidelobes of
+the taper. Levels are amplitude decibels, 10 log10 of a brightness ratio, as in the paper (beam interpolation artefacts
+at -45 dB, 21 cm signal at -40 dB).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ MAIN_LOBES: dict[Taper, int] = {"blackman-harris": 4, "dolph-chebyshev": 8}
 """Half width of the main lobe of each taper, in units of 1 / bandwidth; the floor is measured beyond it."""
 
 SIDELOBES = 200
-"""Sidelobes of the Dolph-Chebyshev taper below its peak, in dB of power."""
+"""Attenuation of the sidelobes of the Dolph-Chebyshev taper, in dB of power."""
 
 
 def make_window(taper: Taper, n_channels: int) -> np.ndarray:
-    """Return a taper, (n_channels,)."""
+    """Return the taper, (n_channels,)."""
     if taper == "blackman-harris":
         return windows.blackmanharris(n_channels)
     return windows.chebwin(n_channels, SIDELOBES)
@@ -36,20 +36,10 @@ def make_window(taper: Taper, n_channels: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DelayFloor:
-    """Power beyond horizon + buffer relative to the peak, per baseline length.
+    """Power beyond the horizon plus a buffer (s) relative to the peak, in bins of baseline length with edges in m.
 
-    Attributes
-    ----------
-    edges : (Nbins + 1,) float
-        Edges of the bins in baseline length, m.
-    rms_db : (Nbins,) float
-        Rms beyond horizon + buffer over the largest rms at any delay, amplitude dB; NaN for an empty bin.
-    max_db : (Nbins,) float
-        The same for the delay with the largest rms beyond horizon + buffer.
-    buffer
-        Delay added to the horizon, s.
-    taper
-        Name of the taper.
+    `rms_db`, (Nbins,), is the rms beyond horizon + buffer over the largest rms at any delay, in amplitude dB, and NaN
+    for an empty bin. `max_db`, (Nbins,), is the same for the delay with the largest rms beyond horizon + buffer.
     """
 
     edges: np.ndarray
@@ -65,7 +55,7 @@ class DelayFloor:
 
 
 def delay_profile(foregrounds: UVData, taper: Taper) -> tuple[np.ndarray, np.ndarray]:
-    """Return delays in the order of `numpy.fft`, (Nfreqs,), s, and each baseline's mean |V~|^2 there, (Nbls, Nfreqs).
+    """Return delays in the order of `numpy.fft`, (Nfreqs,), s, and the mean |V~|^2 of each baseline, (Nbls, Nfreqs).
 
     The mean is over integrations and polarizations; the transform is a plain sum over equally spaced channels, Jy.
     """
@@ -76,7 +66,7 @@ def delay_profile(foregrounds: UVData, taper: Taper) -> tuple[np.ndarray, np.nda
 
 
 def floor_buffers(foregrounds: UVData) -> dict[Taper, float]:
-    """Return for each taper the delay beyond the horizon at which its main lobe has ended, 100 ns at least, in s.
+    """Return the delay beyond the horizon at which the main lobe of each taper ends, at least 100 ns, in s.
 
     Tapers for which the band leaves no delay beyond that of the longest baseline are left out.
     """
@@ -88,7 +78,7 @@ def floor_buffers(foregrounds: UVData) -> dict[Taper, float]:
 
 
 def length_bins(lengths: np.ndarray, n_bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges (n_bins + 1,) of equal bins from zero to the longest baseline, and each one's bin (Nbls,)."""
+    """Return edges (n_bins + 1,) of equal bins from 0 to the longest baseline, and the bin of each baseline (Nbls,)."""
     edges = np.linspace(0, lengths.max() * (1 + 1e-9), n_bins + 1)
     return edges, np.digitize(lengths, edges) - 1
 
@@ -105,17 +95,15 @@ def delay_floor(
     Parameters
     ----------
     foregrounds
-        Visibilities of foregrounds alone, equally spaced channels.
+        Visibilities of foregrounds alone, with equally spaced channels.
     buffer
-        Delay beyond the horizon at which to start, s. The main lobe of the taper extends to 4 / bandwidth (130 ns for
-        30.72 MHz) for Blackman-Harris, and to 8 / bandwidth (250 ns) for Dolph-Chebyshev.
+        Delay beyond the horizon from which the floor is measured, s. The main lobe of the taper extends to 4 /
+        bandwidth (130 ns for 30.72 MHz) for Blackman-Harris, and to 8 / bandwidth (250 ns) for Dolph-Chebyshev.
     taper
         `blackman-harris` has sidelobes of -46 dB here and gives the floor of a power spectrum; `dolph-chebyshev`
         (-100 dB) gives the floor of the simulation below these sidelobes.
-    n_bins
-        Number of equal bins in baseline length.
     peaks
-        Visibilities whose peaks the levels are relative to, of the same shape; by default `foregrounds` themselves.
+        Visibilities that define the peaks, of the same shape; by default `foregrounds`.
 
     Raises
     ------

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class BeamSource(Protocol):
-    """A beam at any frequencies, such as `calstudy.instrument.beams.make_beam` returns."""
+    """A beam that is available at any frequency, as returned by `calstudy.instrument.beams.make_beam`."""
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
         """Return the E-field beam, tabulated at these frequencies (Hz) or in closed form."""
@@ -32,22 +32,20 @@ class BeamSource(Protocol):
 
 @dataclass(frozen=True)
 class SimulationSize:
-    """How much there is to simulate.
+    """Size of a simulation, from which an engine estimates its cost.
 
     Attributes
     ----------
     sources
-        Components of the sky, above and below the horizon.
+        Number of components of the sky, above and below the horizon.
     slots
-        Combinations of time and frequency nodes.
+        Number of combinations of time and frequency nodes.
     patch_slots
         The same for each patch of neighbouring sources (`calstudy.simulate.patches`).
-    antennas
-        Of the array.
     beams
-        Different ones.
+        Number of distinct beams.
     tolerance
-        Of the interpolation, 0 for none.
+        Tolerance of the interpolation, 0 for none.
     regular
         Whether the antennas are on a flat lattice.
     """
@@ -64,12 +62,12 @@ class SimulationSize:
 class Engine(Plugin, ABC):
     """A simulator: computes visibilities from a sky and beams. Fields of a subclass are its settings.
 
-    Its module is imported when an experiment file is read: import libraries that take long inside the methods.
+    Its module is imported when an experiment file is read: import slow libraries inside the methods.
 
     Attributes
     ----------
     shares_ranks
-        Whether it shares its work between MPI ranks (`calstudy.base.ranks`).
+        Whether it divides its work between MPI ranks (`calstudy.base.ranks`).
     """
 
     registry: ClassVar[Registry[Engine]] = Registry(
@@ -80,14 +78,9 @@ class Engine(Plugin, ABC):
     kind: str = Field("", description="Name of an engine, or a file.py.")
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
-        """Return the reason why this engine does not support a simulation, or None if it does; see `simulate`.
+        """Return the reason why this engine does not support a simulation, or None if it does.
 
-        By default it supports everything.
-
-        Parameters
-        ----------
-        sky, beam, template
-            As for `simulate`.
+        The arguments are those of `simulate`. By default every simulation is supported.
         """
         del sky, beam, template
         return None
@@ -96,7 +89,7 @@ class Engine(Plugin, ABC):
     def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
         """Simulate every time, baseline, frequency and polarization of the template; change none of the arguments.
 
-        Only called with what `refusal` does not refuse.
+        It is called only with arguments that `refusal` accepts.
 
         Parameters
         ----------
@@ -116,22 +109,10 @@ class Engine(Plugin, ABC):
     def interpolate(
         self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
     ) -> np.ndarray:
-        """Simulate as `simulate` does, to a tolerance.
+        """Simulate as `simulate` does, but only to the given accuracy.
 
-        By default sources that stay above the horizon are simulated at time nodes. Sources that rise or set are
-        discontinuous in time, and are simulated at every integration.
-
-        Parameters
-        ----------
-        sky, beam, template
-            As for `simulate`.
-        accuracy
-            Which errors are allowed.
-
-        Returns
-        -------
-        (Ntimes, Nbls, Nfreqs, Npols) complex128
-            Jy.
+        By default sources that stay above the horizon are simulated at time nodes and interpolated. Sources that rise
+        or set are discontinuous in time, and are simulated at every integration.
         """
         from calstudy.instrument.telescope import subset_template
         from calstudy.simulate.directions import SourceTracks, split_by_horizon
@@ -152,7 +133,7 @@ class Engine(Plugin, ABC):
         return cube
 
     def cost(self, size: SimulationSize) -> Cost:
-        """Return what a simulation takes, besides what sky and visibilities do; by default as for matrix products."""
+        """Estimate the cost beyond that of holding sky and visibilities; the default is that of matrix products."""
         return Cost((3e-6 + 3.2e-9 * size.antennas**2) * size.sources * size.slots)
 
 
@@ -163,16 +144,7 @@ def simulate_with(
     template: UVData,
     accuracy: Accuracy = EXACT,
 ) -> np.ndarray:
-    """Return an engine's visibilities, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy, checked.
-
-    Parameters
-    ----------
-    engine
-        Any.
-    sky, beam, template
-        As for `Engine.simulate`.
-    accuracy
-        Errors that are allowed.
+    """Simulate visibilities with an engine and check them, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
 
     Raises
     ------

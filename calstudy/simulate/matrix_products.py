@@ -7,15 +7,15 @@ With C = Re E and S = Im E,
     Z_ab = sum_s w (C_a - S_a) C_b + w (C_a + S_a) S_b = Re V_ab + Im V_ab,
     Re V = (Z + Z^T) / 2,    Im V = (Z - Z^T) / 2,
 
-half the arithmetic of the complex product. Where antennas have different beams, the field of each takes part in its
-factor: V_ab = sum_s sum_c w conj(X_asc) X_bsc with X = E conj(J), components c of J and w = I / 2. That is the same
-product over twice as many terms, however many beams there are. Sine and cosine are evaluated by polynomials in a loop
-the compiler vectorizes, which costs less than the complex multiplications of a recurrence over channels and allows any
+half the arithmetic of the complex product. Where antennas have different beams, each antenna's factor includes its
+field: V_ab = sum_s sum_c w conj(X_asc) X_bsc with X = E conj(J), components c of J and w = I / 2. That is the same
+product over twice as many terms, for any number of beams. Sine and cosine are evaluated by polynomials in a loop that
+the compiler vectorizes. This costs less than the complex multiplications of a recurrence over channels, and allows any
 frequencies.
 
-The sources of one call are neighbours on the sky, and s is relative to a centre: fringes turn by few turns from the
-first to the last frequency. Turns at the first frequency are reduced to fractions in double precision; single precision
-holds what the other frequencies add to 6e-8 of itself.
+The sources of one call are neighbours on the sky, and s is relative to a centre, so fringes turn by few turns from the
+first to the last frequency. Turns at the first frequency are reduced to fractions in double precision; the turns that
+the other frequencies add are held in single precision to a relative 6e-8.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import numpy as np
 
 from calstudy.simulate.patterns import Pattern
 
-# Of the two factors of a block: they then stay in a 2 MB cache.
+# Size of the two factors of a block, which then stay in a 2 MB cache.
 BLOCK_BYTES = 1_200_000
 
 
@@ -45,7 +45,7 @@ TAYLOR: dict[type, tuple[tuple, tuple]] = {np.float64: _taylor(np.float64, 12), 
 
 @dataclass(frozen=True)
 class PairSums:
-    """An array whose visibilities are summed over sources.
+    """Visibilities of all baselines of an array, summed over sources.
 
     Attributes
     ----------
@@ -54,13 +54,13 @@ class PairSums:
     pairs : two arrays (Nbls,) int
         First and second antenna of each baseline.
     frequencies : (Nfreqs,) float
-        Hz, ascending.
+        Frequencies in Hz, ascending.
     patterns
         Distinct beams at these frequencies.
     index : (Nants,) int
-        Which of them each antenna has.
+        Index of the beam of each antenna.
     dtype
-        Of the products: float64 or float32.
+        Precision of the products, float64 or float32.
     """
 
     delays: np.ndarray
@@ -72,31 +72,20 @@ class PairSums:
 
     @cached_property
     def n_feeds(self) -> int:
-        """Polarizations."""
+        """Number of polarizations."""
         return self.patterns[0].n_feeds
 
     @cached_property
     def _block(self) -> int:
-        """Sources of one product. With several beams factors have two components, and the fields are there as well."""
+        """Sources of one product. With several beams factors have two components, and the fields are kept as well."""
         size = 4 if len(self.patterns) == 1 else 16
         return max(64, BLOCK_BYTES // (size * np.dtype(self.dtype).itemsize * len(self.delays)) // 64 * 64)
 
     def at(self, vectors: np.ndarray, centre: np.ndarray, flux: np.ndarray) -> np.ndarray:
-        """Sum the visibilities of sources, with fringes relative to a direction.
+        """Sum the visibilities of sources in Jy, with fringes relative to a direction `centre`, (3,).
 
-        Parameters
-        ----------
-        vectors : (3, N) float
-            Unit vectors towards the sources, above the horizon.
-        centre : (3,) float
-            The direction.
-        flux : (Nfreqs, N) float
-            Jy.
-
-        Returns
-        -------
-        (Nfreqs, Nfeeds, Nbls) complex128
-            Jy.
+        `vectors` are unit vectors towards the sources, above the horizon, (3, N), and `flux` is in Jy, (Nfreqs, N). The
+        sums are complex128, (Nfreqs, Nfeeds, Nbls).
         """
         n_ants = len(self.delays)
         sums = np.zeros((len(self.frequencies), self.n_feeds, n_ants, n_ants))
@@ -125,12 +114,12 @@ class PairSums:
 
     @cached_property
     def _steps(self) -> np.ndarray:
-        """Place of each frequency between the first, 0, and the last, 1."""
+        """Position of each frequency between the first, 0, and the last, 1."""
         offsets = self.frequencies - self.frequencies[0]
         return (offsets / (offsets[-1] or 1.0)).astype(self.dtype)
 
     def _add_products(self, turns: tuple[np.ndarray, np.ndarray], weights: np.ndarray, sums: np.ndarray) -> None:
-        """Add to Z a block of sources with weights (Nfreqs, Nfeeds, N)."""
+        """Add a block of sources with weights (Nfreqs, Nfeeds, N) to Z."""
         n_ants, n_sources = turns[0].shape
         left = np.empty((self.n_feeds * n_ants, 2 * n_sources), dtype=self.dtype)
         right = np.empty((n_ants, 2 * n_sources), dtype=self.dtype)
@@ -139,7 +128,7 @@ class PairSums:
             sums[channel] += (left @ right.T).reshape(self.n_feeds, n_ants, n_ants)
 
     def _fields(self, azimuth: np.ndarray, zenith_angle: np.ndarray) -> np.ndarray:
-        """Return parts of components of the fields of all beams, (Nfreqs, Nfeeds, Nbeams, 4, N)."""
+        """Return real and imaginary parts of both components of J of all beams, (Nfreqs, Nfeeds, Nbeams, 4, N)."""
         shape = (len(self.frequencies), self.n_feeds, len(self.patterns), 4, len(azimuth))
         table: np.ndarray = np.empty(shape, dtype=self.dtype)
         for place, pattern in enumerate(self.patterns):
@@ -149,7 +138,7 @@ class PairSums:
     def _add_field_products(
         self, turns: tuple[np.ndarray, np.ndarray], fields: np.ndarray, flux: np.ndarray, sums: np.ndarray
     ) -> None:
-        """Add to Z a block of sources with fields (Nfreqs, Nfeeds, Nbeams, 4, N) and fluxes (Nfreqs, N)."""
+        """Add a block of sources with fields (Nfreqs, Nfeeds, Nbeams, 4, N) and fluxes (Nfreqs, N) to Z."""
         n_ants, n_sources = turns[0].shape
         fringes: np.ndarray = np.empty((2, n_ants, n_sources), dtype=self.dtype)
         left = np.empty((n_ants, 4 * n_sources), dtype=self.dtype)
@@ -162,7 +151,7 @@ class PairSums:
 
 
 def product_seconds(antennas: int, sources: float) -> float:
-    """Estimate the time of the products in single precision of so many sources at one frequency, without their beam."""
+    """Estimate the time of single-precision products for a number of sources at one frequency, without their beam."""
     return (4.7e-9 * antennas + 5.1e-11 * antennas**2) * sources
 
 
@@ -202,7 +191,7 @@ def _fringes(
 
 @numba.njit(cache=True, nogil=True)
 def _all_fringes(turns: tuple, step: float, taylor: tuple, fringes: np.ndarray) -> None:
-    """Fill `fringes` (2, Nants, N) with the cosines and sines of all antennas with turns, two arrays (Nants, N)."""
+    """Fill `fringes` (2, Nants, N) with cosines and sines of the turns of all antennas, two arrays (Nants, N)."""
     base, slope = turns
     for antenna in range(len(base)):
         _fringes(base[antenna], slope[antenna], step, taylor, fringes[0, antenna], fringes[1, antenna])
@@ -235,7 +224,7 @@ def _factors(
 def _multiply(
     cosine: np.ndarray, sine: np.ndarray, real: np.ndarray, imaginary: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> None:
-    """Fill real and imaginary part of a fringe times the conjugate of a field."""
+    """Fill the real and imaginary parts of a fringe times the conjugate of a field."""
     for source in range(cosine.size):
         low[source] = cosine[source] * real[source] + sine[source] * imaginary[source]
         high[source] = sine[source] * real[source] - cosine[source] * imaginary[source]
@@ -245,7 +234,7 @@ def _multiply(
 def _field_factors(
     fringes: np.ndarray, fields: np.ndarray, index: np.ndarray, flux: np.ndarray, left: np.ndarray, right: np.ndarray
 ) -> None:
-    """Fill right (Nants, 4 N) with C and S of X of both components, left with w (C - S) and w (C + S) of them.
+    """Fill right (Nants, 4 N) with C and S of both components of X, left with w (C - S) and w (C + S) of them.
 
     `fringes` are cosine and sine, (2, Nants, N), and `fields` those of the beams, (Nbeams, 4, N): real and imaginary
     part of one component, then of the other.

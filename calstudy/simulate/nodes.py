@@ -1,9 +1,9 @@
 """Chebyshev nodes: times and frequencies from which visibilities can be interpolated to a tolerance.
 
 Over an observation a visibility is band-limited, in time by its fringe rate and in frequency by its horizon delay. The
-component of a source is a phasor exp(i c x) on the scaled interval x in [-1, 1], whose Chebyshev coefficients 2 J_k(c)
-fall faster than exponentially once k > c. The number of nodes therefore follows from the longest baseline, the span and
-the tolerance. It does not depend on the engine.
+contribution of a source is a phasor exp(i c x) on the scaled interval x in [-1, 1], whose Chebyshev coefficients
+2 J_k(c) decrease faster than exponentially once k > c. The number of nodes therefore follows from the longest baseline,
+the span and the tolerance. It does not depend on the engine.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
 EARTH_ROTATION_RATE = 7.2921158553e-5  # rad / s, sidereal
 SECONDS_PER_DAY = 86400.0
 SINGLE_PRECISION = 1e-5
-"""Smallest tolerance to which products in single precision are exact."""
+"""Smallest tolerance for which products in single precision are accurate enough."""
 CHUNK_BYTES = 4e8
-"""Visibilities of one chunk of a smooth sky, at most, unless there are too few chunks."""
+"""Largest size of the visibilities of one chunk of a smooth sky, unless there are too few chunks."""
 PATCH_SOURCES = 700
-"""Sources of a patch of the sky, at least, on average: about those of one matrix product."""
+"""Smallest mean number of sources in a patch of the sky, about the number in one matrix product."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How exact interpolated visibilities must be, and what is smooth enough to be interpolated.
+    """Accuracy of interpolated visibilities, and the smoothness on which the interpolation depends.
 
     Attributes
     ----------
     tolerance
-        Interpolation error of visibilities, relative to their rms, if all fringes were as fast as the fastest one; 0:
-        nothing is interpolated.
+        Interpolation error of the visibilities, relative to their rms, if all fringes were as fast as the fastest one;
+        with 0 nothing is interpolated.
     beam_extent
-        Length in m by which a baseline is extended for the structure of the beam in fringe rate and delay.
+        Length in m added to each baseline for the structure of the beam in fringe rate and delay.
     smooth_beam, smooth_sky
         Whether the beam, and the fluxes of the sky, vary smoothly with frequency.
     """
@@ -58,14 +58,9 @@ EXACT = Accuracy(tolerance=0.0, beam_extent=0.0)
 
 @dataclass(frozen=True)
 class Axis:
-    """Nodes along time or frequency, and the matrix that interpolates from them.
+    """Nodes along time or frequency, Julian dates (UTC) or Hz, (n,), and the matrix that interpolates from them.
 
-    Attributes
-    ----------
-    nodes : (n,) float
-        Julian dates (UTC), or Hz.
-    matrix : (m, n) float
-        From values at the nodes to values at the m samples of the axis.
+    The matrix, (m, n), is from values at the nodes to values at the m samples of the axis.
     """
 
     nodes: np.ndarray
@@ -73,32 +68,23 @@ class Axis:
 
     @property
     def at_samples(self) -> bool:
-        """Whether the nodes are the samples themselves, so that nothing is interpolated."""
+        """Whether the nodes are the samples, so that nothing is interpolated."""
         return self.matrix.shape[0] == self.matrix.shape[1] and bool((self.matrix == np.eye(len(self.nodes))).all())
 
     def interpolate(self, values: np.ndarray) -> np.ndarray:
         """Interpolate complex values (n, ...) at the nodes to the samples, (m, ...)."""
         if self.at_samples:
             return values
-        # As pairs of real numbers: NumPy would make the matrix complex.
+        # Complex values are taken as pairs of real numbers, because NumPy would make the matrix complex.
         pairs = np.ascontiguousarray(values).view(np.float64).reshape(len(self.nodes), -1)
         return (self.matrix @ pairs).view(np.complex128).reshape(len(self.matrix), *values.shape[1:])
 
 
 def make_axis(samples: np.ndarray, bandwidth: float, tolerance: float) -> Axis:
-    """Choose the nodes from which phasors are interpolated to samples.
+    """Choose the nodes from which phasors are interpolated to ascending samples, (m,).
 
-    Parameters
-    ----------
-    samples : (m,) float
-        Ascending.
-    bandwidth, tolerance
-        As for `chebyshev_count`; a tolerance of 0 makes every sample a node.
-
-    Returns
-    -------
-    Axis
-        One that needs as many nodes as it has samples has its samples as nodes.
+    The tolerance is that of `chebyshev_count`. With a tolerance of 0, or if as many nodes as samples are needed, the
+    nodes are the samples.
     """
     count = chebyshev_count(bandwidth, tolerance) if tolerance else len(samples)
     if count >= len(samples):
@@ -109,19 +95,11 @@ def make_axis(samples: np.ndarray, bandwidth: float, tolerance: float) -> Axis:
 
 @lru_cache(maxsize=256)
 def chebyshev_count(bandwidth: float, tolerance: float) -> int:
-    """Return how many Chebyshev nodes interpolate every phasor of a bandwidth to a tolerance.
+    """Return the number of Chebyshev nodes that interpolate every phasor of a bandwidth to a tolerance.
 
-    Parameters
-    ----------
-    bandwidth
-        Half the phase in radians through which the fastest phasor turns over the interval: c in exp(i c x), |x| <= 1.
-    tolerance
-        Largest error for a phasor of unit amplitude.
-
-    Returns
-    -------
-    int
-        Smallest n with 4 sum_{k >= n} |J_k(c)| < tolerance, a bound of the error of the interpolant on n nodes.
+    It is the smallest n with 4 sum_{k >= n} |J_k(c)| < tolerance, a bound of the error of the interpolant on n nodes
+    for phasors of unit amplitude. The bandwidth c is half the phase in radians through which the fastest phasor exp(i c
+    x) turns over the interval |x| <= 1.
     """
     # Beyond c + 12 c^(1/3) + 40 the Bessel functions are below the smallest double that matters.
     orders = np.arange(int(bandwidth + 12 * np.cbrt(bandwidth) + 40))
@@ -130,33 +108,17 @@ def chebyshev_count(bandwidth: float, tolerance: float) -> int:
 
 
 def chebyshev_nodes(first: float, last: float, count: int) -> np.ndarray:
-    """Return the `count` Chebyshev nodes of the first kind in the interval, (count,), strictly inside it, ascending.
-
-    Parameters
-    ----------
-    first, last
-        Ends of the interval.
-    count
-        Number of nodes.
-    """
+    """Return the Chebyshev nodes of the first kind in an interval, (count,), ascending and strictly inside it."""
     angles = np.pi * (np.arange(count)[::-1] + 0.5) / count
     return first + 0.5 * (last - first) * (1 + np.cos(angles))
 
 
 def interpolation_matrix(nodes: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Return the matrix from values at the nodes to values of their interpolating polynomial at the samples.
+    """Return the matrix (m, n) from values at the nodes to those of their interpolating polynomial at the samples (m,).
 
-    Parameters
-    ----------
-    nodes : (n,) float
-        Distinct abscissae, near Chebyshev nodes for a well-conditioned result. They need not be exact: a Julian date
-        holds a time only to 40 us, so the weights are those of the nodes as they are.
-    samples : (m,) float
-
-    Returns
-    -------
-    (m, n) float
-        Barycentric interpolation of the second kind (Berrut & Trefethen 2004).
+    It is the barycentric interpolation of the second kind (Berrut & Trefethen 2004). The nodes, (n,), are distinct, and
+    near Chebyshev nodes for a well-conditioned result. They need not be exact: a Julian date holds a time only to 40
+    us, so the weights are computed from the rounded nodes.
     """
     centre = nodes[len(nodes) // 2]
     half = np.ptp(np.concatenate([nodes, samples])) / 2 or 1.0
@@ -173,9 +135,9 @@ def interpolation_matrix(nodes: np.ndarray, samples: np.ndarray) -> np.ndarray:
 
 
 def time_axis(template: UVData, accuracy: Accuracy) -> Axis:
-    """Choose the times at which the visibilities of all sources that stay above the horizon are interpolated.
+    """Choose the times at which sources that stay above the horizon are simulated.
 
-    On the longest baselines many sources come near the bound of the error, so that the tolerance is a tenth.
+    On the longest baselines many sources are close to the bound of the error, so a tenth of the tolerance is used.
     """
     times = integration_times(template)
     bandwidth = time_bandwidth(times, template.freq_array.max(), turning_length(template) + accuracy.beam_extent)
@@ -185,14 +147,8 @@ def time_axis(template: UVData, accuracy: Accuracy) -> Axis:
 def frequency_axis(template: UVData, accuracy: Accuracy, radius: float = 1.0) -> Axis:
     """Choose the frequencies at which a sky is simulated: every channel, unless sky and beam are smooth.
 
-    Parameters
-    ----------
-    template
-        The observation.
-    accuracy
-        Errors that are allowed.
-    radius
-        Largest distance of a source from the direction that fringes are relative to, rad; 1 from the zenith.
+    `radius` is the largest distance of a source from the direction to which fringes are relative, rad; it is 1 for the
+    zenith.
     """
     channels = template.freq_array
     smooth = accuracy.smooth_beam and accuracy.smooth_sky
@@ -201,9 +157,9 @@ def frequency_axis(template: UVData, accuracy: Accuracy, radius: float = 1.0) ->
 
 
 def turning_length(template: UVData) -> float:
-    """Return the longest component (m) of a baseline perpendicular to the Earth's axis.
+    """Return the length of the longest component (m) of a baseline perpendicular to the Earth's axis.
 
-    Sources move perpendicular to the axis only, so that it is this component that makes fringes turn.
+    Sources move only perpendicular to the axis, so this component determines how fast fringes turn.
     """
     latitude = template.telescope.location.geodetic.lat.rad
     pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
@@ -211,34 +167,27 @@ def turning_length(template: UVData) -> float:
 
 
 def time_bandwidth(times_jd: np.ndarray, frequency: float, length: float) -> float:
-    """Return half the phase in radians through which the fastest fringe turns from the first to the last time.
+    """Return half the phase in radians through which the fastest fringe turns over a range of Julian dates.
 
-    Parameters
-    ----------
-    times_jd
-        Julian dates.
-    frequency
-        The highest, Hz.
-    length
-        Longest baseline perpendicular to the Earth's axis, m.
+    `frequency` is the highest frequency, Hz, and `length` the longest baseline perpendicular to the Earth's axis, m.
     """
     rotation = EARTH_ROTATION_RATE * SECONDS_PER_DAY * np.ptp(times_jd)
     return float(np.pi * frequency / SPEED_OF_LIGHT * length * rotation)
 
 
 def frequency_bandwidth(frequencies: np.ndarray, length: float) -> float:
-    """Return half the phase in radians through which the delay of a length in m turns from end to end of a band."""
+    """Return half the phase in radians through which the delay of a length in m turns across a band."""
     return float(np.pi * length / SPEED_OF_LIGHT * np.ptp(frequencies))
 
 
 def patch_nside(components: float) -> int:
-    """Return the resolution of the grid whose cells are patches, for a sky of so many components; 0: one patch."""
+    """Return the resolution of the grid whose cells are patches, for a number of components; 0: one patch."""
     cells = components / PATCH_SOURCES
     return int(2 ** np.floor(np.log2(cells / 12) / 2)) if cells >= 12 else 0
 
 
 def frequency_blocks(size: float, chunks: int) -> int:
-    """Return into how many blocks of frequency nodes chunks of a smooth sky are divided, for a size of all in bytes."""
+    """Return the number of blocks of frequency nodes of a smooth sky whose visibilities have a total size in bytes."""
     return min(chunks, int(np.ceil(size / CHUNK_BYTES)))
 
 

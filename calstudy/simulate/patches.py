@@ -1,19 +1,19 @@
-"""Visibilities of sources in patches of the sky, whose fringes turn slowly.
+"""Visibilities of sources in patches of the sky, in which fringes turn slowly.
 
 The sources of one patch of the sky turn together. With the direction s_0(t) of the patch's centre,
 
     V_ab(nu, t) = sum_patches  exp(2 pi i nu x_ab . s_0(t) / c)  W_ab(nu, t),
     W_ab(nu, t) = sum_{s in patch}  w_s(nu, t)  exp(2 pi i nu x_ab . (s(t) - s_0(t)) / c),
 
-and W turns more slowly than V by the radius of the patch in radians, in time as in frequency. It is therefore
-simulated at few Chebyshev nodes and interpolated: in time, and in frequency where sky and beam are smooth. The phase of
-the centre is exact, in double precision.
+and W turns more slowly than V, by a factor of the radius of the patch in radians, in time and in frequency. It is
+therefore simulated at few Chebyshev nodes and interpolated: in time, and in frequency where sky and beam are smooth.
+The phase of the centre is exact, in double precision.
 
 Errors of patches are independent and add in quadrature, so that each may contribute the same variance: a patch in the
 sidelobes, with a hundredth of the signal, needs a hundredth of the relative accuracy.
 
-W is summed by matrix products. Of many antennas without heights, in single precision, it is summed by transforms, for
-which larger patches are better.
+W is summed by matrix products. For many antennas without heights, in single precision, it is summed by non-uniform
+Fourier transforms, for which larger patches are better.
 
 Patches are added up at the time nodes of the whole sky, and interpolated from there to the integrations. Sources that
 rise or set are discontinuous in time: their patches are simulated at every integration.
@@ -54,13 +54,13 @@ from calstudy.simulate.nodes import (
 from calstudy.simulate.patterns import InterpolatedPattern, Pattern, power_pattern
 
 MARGIN = 2
-"""By which transforms must be faster than products: estimates are not exact."""
+"""Factor by which transforms must be faster than products to be used, because the estimates are not exact."""
 PATTERN_SECONDS, TURN_SECONDS = 3e-7, 1.2e-8
-"""Of the beam at a source, and of the phase of a patch's centre for a baseline."""
+"""Time to evaluate the beam at a source, and the phase of a patch's centre for a baseline, s."""
 SINGLE_TURNS = 8.0
 """Turns of a fringe across the band up to which single precision keeps phases to 3e-6 rad."""
 LEAST, LOOSEST = 1e-30, 0.5
-"""Signal of a patch over the rms below which it does not count, and the largest relative error of a patch."""
+"""Smallest signal of a patch over the rms that counts, and the largest relative error of a patch."""
 
 
 def visibilities(
@@ -68,20 +68,9 @@ def visibilities(
 ) -> np.ndarray:
     """Simulate an unpolarized sky, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
 
-    Parameters
-    ----------
-    sky, beam, template
-        As for `calstudy.simulate.interface.Engine.simulate`.
-    accuracy
-        Errors that are allowed; with a tolerance of 0 every source is simulated at every integration and channel.
-    dtype
-        Of the products, float64 or float32; by default single precision if the tolerance allows it.
-
-    Raises
-    ------
-    InputError
-        If a polarization is not xx or yy, or the beam is not of the kind `calstudy.simulate.patterns.power_pattern`
-        takes.
+    With a tolerance of 0 every source is simulated at every integration and channel. `dtype` is the precision of the
+    products, float64 or float32; by default single precision if the tolerance allows it. Raises InputError if a
+    polarization is not xx or yy, or `calstudy.simulate.patterns.power_pattern` does not support the beam.
     """
     array = PatchedArray(beam, template, accuracy)
     dtype = dtype or (np.float32 if accuracy.tolerance >= SINGLE_PRECISION else np.float64)
@@ -100,34 +89,25 @@ def visibilities(
         # Axes: integrations, channels, feeds, baselines.
         cube = common.interpolate(total.swapaxes(0, 1))
         if len(crossing):
-            # They are few, and each takes part in every integration by itself: one patch.
+            # They are few, and simulated at every integration: one patch is enough.
             patches = PatchSum(array, sky, Patches(sky, tracks, crossing, nside=0), dtype)
             patches.add(cube.swapaxes(0, 1), 0, Axis(times, np.eye(len(times))), times)
     return np.ascontiguousarray(cube.transpose(0, 3, 1, 2))
 
 
 class Patches:
-    """Sources in the order of the patches of the sky that they belong to.
-
-    Parameters
-    ----------
-    sky, tracks
-        All components, and their directions.
-    components : (N,) int
-        Which of them are divided into patches.
-    nside
-        Of the grid whose cells are the patches; 0: one patch.
+    """Sources sorted by patch of the sky; the patches are the cells of a grid, or one patch if `nside` is 0.
 
     Attributes
     ----------
     components : (N,) int
-        The same in the order of the patches.
+        The components in the order of the patches.
     tracks
-        Of these, in this order.
+        Tracks of these components, in this order.
     members
-        Where the sources of each patch are in this order.
+        Slice of the components of each patch.
     centres
-        Mean directions of the patches, which like those of sources are fixed points of the sky.
+        Tracks of the mean directions of the patches, which are fixed points of the sky, as sources are.
     radii : (Npatches,) float
         Largest distance of a source from the centre of its patch, rad.
     """
@@ -156,15 +136,7 @@ def polarization_feeds(template: UVData) -> list[str]:
 
 
 class PatchedArray:
-    """The antennas of an observation and their beams, and at which times and frequencies patches are simulated.
-
-    Parameters
-    ----------
-    beam, template
-        As for `calstudy.simulate.interface.Engine.simulate`.
-    accuracy
-        Errors that are allowed.
-    """
+    """The antennas and beams of an observation, and the times and frequencies at which patches are simulated."""
 
     def __init__(self, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy) -> None:
         require_rectangular(template)
@@ -180,7 +152,7 @@ class PatchedArray:
         self._longest = np.linalg.norm(baseline_vectors(template), axis=1).max()
 
     def turns(self, radius: float) -> float:
-        """Return by how many turns fringes within a patch of a radius (rad) differ between the ends of the band."""
+        """Return the change of fringes within a patch of a radius (rad) across the band, in turns."""
         return radius * self._longest * float(np.ptp(self.template.freq_array)) / SPEED_OF_LIGHT
 
     def time_nodes(self, radius: float, tolerance: float, times: np.ndarray) -> Axis:
@@ -189,10 +161,10 @@ class PatchedArray:
         return make_axis(times, time_bandwidth(times, self.template.freq_array.max(), length), tolerance)
 
     def tolerances(self, patches: Patches, sky: SkyModel) -> np.ndarray:
-        """Return the relative error that each patch may have, (Npatches,), so that all contribute the same variance.
+        """Return the allowed relative error of each patch, (Npatches,), so that all contribute the same variance.
 
-        The variance of a patch is the sum of the squares of its sources, at the middle integration and channel through
-        the beam that sees most of each.
+        The variance of a patch is the sum of the squares of its sources, at the middle integration and channel, each
+        through the beam in which it is brightest.
         """
         if not self.accuracy.tolerance:
             return np.zeros(len(patches.members))
@@ -206,16 +178,10 @@ class PatchedArray:
         return np.minimum(self.accuracy.tolerance * rms / np.maximum(signal, LEAST * rms), LOOSEST) if rms else signal
 
     def choose_nside(self, sources: int, times: np.ndarray, dtype: type) -> int:
-        """Choose the grid whose cells are patches: small ones for products, or the best if transforms are faster.
+        """Choose the grid whose cells are patches: small ones for products, or the best one if transforms are faster.
 
-        Parameters
-        ----------
-        sources
-            Components of the whole sky.
-        times : (Nt,) float
-            To which patches are interpolated, Julian dates.
-        dtype
-            Of the products.
+        `times` are the Julian dates to which patches are interpolated, (Nt,), and `dtype` is the precision of the
+        products.
         """
         small = patch_nside(sources)
         if self._flat is None or dtype is np.float64 or not small:
@@ -227,16 +193,9 @@ class PatchedArray:
         return best if MARGIN * seconds[best] < products else small
 
     def sums(self, frequencies: np.ndarray, dtype: type, sources: float, radius: float) -> PairSums | FlatSums:
-        """Return what sums the visibilities of sources at some frequencies in the least time.
+        """Return the summation that is faster for a typical patch, given its number of sources and its radius (rad).
 
-        Parameters
-        ----------
-        frequencies
-            Hz.
-        dtype
-            Of products; transforms have single precision.
-        sources, radius
-            Of a typical patch; rad.
+        `frequencies` are in Hz. `dtype` is the precision of products; transforms have single precision.
         """
         patterns = self._patterns(frequencies)
         if self._flat and dtype is not np.float64:
@@ -246,7 +205,7 @@ class PatchedArray:
         return PairSums(self.delays, self.pairs, frequencies, patterns, self._index, dtype)
 
     def _seconds(self, sources: int, nside: int, times: np.ndarray, flat: FlatArray | None) -> float:
-        """Estimate the time that all patches of a grid take, by transforms of a flat array or by products."""
+        """Estimate the time of all patches of a grid, by transforms of a flat array or by products."""
         patches, radius = 6 * nside**2, 0.7 / nside
         nodes = len(self.time_nodes(radius, self.accuracy.tolerance, times).nodes)
         channels, each = frequency_axis(self.template, self.accuracy, radius).nodes, sources / 2 / patches
@@ -265,19 +224,7 @@ class PatchedArray:
 
 
 class PatchSum:
-    """Simulates patches and adds them up.
-
-    Parameters
-    ----------
-    array
-        The antennas.
-    sky
-        Has the sources.
-    patches
-        Some of them.
-    dtype
-        Of the products.
-    """
+    """Simulates patches and adds them up."""
 
     def __init__(self, array: PatchedArray, sky: SkyModel, patches: Patches, dtype: type) -> None:
         self._array, self._patches = array, patches
@@ -289,18 +236,10 @@ class PatchSum:
         self._flux = stokes_i(sky, self._channels.nodes, patches.components)
 
     def add(self, total: np.ndarray, place: int, axis: Axis, times: np.ndarray) -> None:
-        """Add a patch at all channels and some times.
+        """Add the patch of index `place` to a total (Nfreqs, Nt, Nfeeds, Nbls) at the Julian dates `times`, (Nt,).
 
-        Parameters
-        ----------
-        total : (Nfreqs, Nt, Nfeeds, Nbls) complex128
-            To which it is added.
-        place
-            Which patch.
-        axis
-            Its nodes in time. Where every time is a node nothing is interpolated, and sources may be below the horizon.
-        times : (Nt,) float
-            Of the total.
+        `axis` has the time nodes of the patch. If every time is a node, nothing is interpolated, and sources may be
+        below the horizon.
         """
         if not axis.at_samples:
             self._add(total, place, axis, times)
@@ -332,7 +271,7 @@ class PatchSum:
 def _add_turned(
     total: np.ndarray, inner: np.ndarray, matrix: np.ndarray, fringes: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> None:
-    """Add the interpolation of inner (Nfreqs, Nk, Nfeeds, Nbls) in time, times the fringes of the centre."""
+    """Add inner (Nfreqs, Nk, Nfeeds, Nbls), interpolated in time and multiplied by the fringes of the centre."""
     turn, value = np.empty(first.size, dtype=np.complex128), np.empty(first.size, dtype=np.complex128)
     for channel in range(total.shape[0]):
         for time in range(total.shape[1]):

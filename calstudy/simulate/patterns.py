@@ -17,7 +17,7 @@ AZIMUTH_EXTENSION = 3
 
 
 class Pattern(Protocol):
-    """The response of `n_feeds` feeds of a beam to directions; azimuths are from east through north, in rad."""
+    """Response of `n_feeds` feeds of a beam; azimuths run from east through north, in rad."""
 
     n_feeds: int
 
@@ -33,12 +33,10 @@ def power_pattern(beam: UVBeam | AnalyticBeam, frequencies: np.ndarray, feeds: l
 
     Parameters
     ----------
-    beam
-        E-field beam.
-    frequencies
-        Hz, (Nfreqs,).
+    frequencies : (Nfreqs,) float
+        Frequencies in Hz.
     feeds
-        Such as "x" and "y".
+        Names of the feeds, such as "x" and "y".
 
     Raises
     ------
@@ -59,7 +57,7 @@ def power_pattern(beam: UVBeam | AnalyticBeam, frequencies: np.ndarray, feeds: l
 
 
 def refusal(beam: UVBeam | AnalyticBeam, feeds: list[str]) -> str | None:
-    """Return why `power_pattern` cannot take this beam, or None if it can."""
+    """Return the reason why `power_pattern` does not support a beam, or None if it does."""
     missing = sorted(set(feeds) - set(beam.feed_array))
     if missing:
         return f"the beam has no feed {', '.join(missing)}, only {', '.join(beam.feed_array)}"
@@ -75,7 +73,7 @@ def refusal(beam: UVBeam | AnalyticBeam, feeds: list[str]) -> str | None:
 
 
 class InterpolatedPattern:
-    """A pattern at the nodes of a frequency axis, interpolated by a matrix (Nfreqs, Nnodes) to its channels."""
+    """Pattern at the nodes of a frequency axis, interpolated by a matrix (Nfreqs, Nnodes) to its channels."""
 
     def __init__(self, nodes: Pattern, matrix: np.ndarray) -> None:
         self._nodes, self._matrix, self.n_feeds = nodes, matrix, nodes.n_feeds
@@ -114,11 +112,11 @@ class AnalyticPattern:
 
 
 class SplinePattern:
-    """Power pattern of a tabulated beam whose E-field is interpolated by bicubic splines, as pyuvsim does it.
+    """Power pattern of a tabulated beam whose E-field is interpolated by bicubic splines, as in pyuvsim.
 
     The splines are those of `scipy.interpolate.RectBivariateSpline` on the grid that `UVBeam.interp` extends in
-    azimuth ("not a knot" at the ends), for real and imaginary part of each component; only the basis is another
-    (uniform B-splines), so that one set of sixteen weights serves all frequencies, components and feeds of a source.
+    azimuth ("not a knot" at the ends), for the real and imaginary parts of each component. Only the basis differs: with
+    uniform B-splines one set of sixteen weights serves all frequencies, components and feeds of a source.
     """
 
     def __init__(self, beam: UVBeam, feeds: list[str]) -> None:
@@ -131,7 +129,7 @@ class SplinePattern:
         n_axes, n_feeds, n_freqs = data.shape[:3]
         self.n_feeds = n_feeds
         along_za, along_az = (bspline_coefficients(len(axis)) for axis in (self._zenith_angle, self._azimuth))
-        # Innermost parts of components, then frequencies: what one source needs lies together.
+        # The parts of components are innermost, then frequencies: the values for one source are contiguous.
         self._table = np.empty((len(along_za), len(along_az), n_feeds, n_freqs, 2 * n_axes))
         for feed, freq, axis in np.ndindex(n_feeds, n_freqs, n_axes):
             coefficients = along_za @ data[axis, feed, freq] @ along_az.T

@@ -16,7 +16,7 @@ ENGINES = Engine.registry
 
 
 class Nodes(Section):
-    """Simulate at Chebyshev nodes and interpolate, or at every integration and channel."""
+    """Simulate at Chebyshev nodes and interpolate, or simulate every integration and channel."""
 
     enabled: bool = Field(True, description="false: simulate every integration and channel.")
     tolerance: float = Field(
@@ -40,11 +40,11 @@ class Nodes(Section):
     )
 
     def for_eor(self, smooth_beam: bool) -> Accuracy:
-        """Return the accuracy of the EoR, whose channels are independent."""
+        """Return the accuracy for the EoR, whose channels are independent."""
         return self._accuracy(self.eor_tolerance, smooth_beam, smooth_sky=False)
 
     def for_foregrounds(self, smooth_beam: bool, smooth_sky: bool) -> Accuracy:
-        """Return the accuracy of the foregrounds; arguments: what is smooth in frequency."""
+        """Return the accuracy for the foregrounds; the arguments say whether beam and sky are smooth in frequency."""
         return self._accuracy(self.tolerance, smooth_beam, smooth_sky)
 
     def _accuracy(self, tolerance: float, smooth_beam: bool, smooth_sky: bool) -> Accuracy:
@@ -52,7 +52,7 @@ class Nodes(Section):
 
 
 class SimulationSettings(Section):
-    """How the visibilities are computed."""
+    """Settings of the simulation of the visibilities."""
 
     engine: Annotated[SerializeAsAny[Engine], ENGINES.field("auto")] = Field(
         default_factory=lambda: ENGINES.make("auto"),
@@ -68,7 +68,7 @@ class SimulationSettings(Section):
     )
 
     def pieces(self, eor: bool) -> int:
-        """Return the largest number of pieces of the EoR, or of the foregrounds, which take a quarter of its time."""
+        """Return the maximum number of chunks of the EoR, or of the foregrounds, which take a quarter of its time."""
         return self.chunks if eor else max(1, self.chunks // 4)
 
     @model_validator(mode="before")

@@ -1,1 +1,1 @@
-"""Skies: foreground sources from catalogues or source counts, and fields of the 21 cm signal."""
+"""The sky: foreground sources from catalogues or source counts, diffuse emission, and the 21 cm signal."""

@@ -32,18 +32,9 @@ GLEAM_COLUMNS = {
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Point sources with power-law spectra, S(ν) = flux (ν / 200 MHz)^spectral_index.
+    """Point sources with power-law spectra, S(ν) = flux (ν / 200 MHz)^spectral_index; all arrays are (Nsources,).
 
-    Attributes
-    ----------
-    names
-        Shape (Nsources,).
-    right_ascension, declination
-        ICRS, in radians, shape (Nsources,).
-    flux
-        Stokes I at 200 MHz in Jy, shape (Nsources,).
-    spectral_index
-        Shape (Nsources,).
+    Positions are ICRS in radians, and fluxes are Stokes I at 200 MHz in Jy.
     """
 
     names: np.ndarray
@@ -69,10 +60,7 @@ class Catalogue:
 def brightest(flux: np.ndarray, settings: PointSources) -> np.ndarray:
     """Return the indices of the sources above the flux limit, brightest first, at most `count` of them.
 
-    Raises
-    ------
-    InputError
-        If no source is above the limit.
+    Raises InputError if no source is above the limit.
     """
     order = np.argsort(-flux, kind="stable")
     order = order[flux[order] >= settings.flux_limit][: settings.count]
@@ -84,7 +72,7 @@ def brightest(flux: np.ndarray, settings: PointSources) -> np.ndarray:
 
 
 def concatenate(*catalogues: Catalogue) -> Catalogue:
-    """Return the sources of several catalogues as one."""
+    """Join several catalogues."""
     fields = ("names", "right_ascension", "declination", "flux", "spectral_index")
     return Catalogue(*(np.concatenate([getattr(part, field) for part in catalogues]) for field in fields))
 
@@ -93,12 +81,8 @@ def read_gleam_table(path: Path) -> Catalogue:
     """Read a table with the columns of the GLEAM catalogue (VOTable or FITS).
 
     Fluxes are the integrated ones of the wide-band image (170 to 231 MHz, effectively 200 MHz). Sources without a
-    fitted spectral index get the mean one, -0.8; sources without a flux are left out.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, cannot be read or lacks a column.
+    fitted spectral index get the mean one, -0.8; sources without a flux are left out. Raises InputError if the file is
+    missing, cannot be read or lacks a column.
     """
     if not path.is_file():
         raise InputError(f"sky.foregrounds.path: there is no file {path}")
@@ -131,14 +115,9 @@ def read_gleam_table(path: Path) -> Catalogue:
 
 
 def with_errors(sky: SkyModel, errors: CatalogueErrors) -> SkyModel:
-    """Return point sources with errors of flux and position, drawn for one source after the other.
+    """Return a copy of point sources, brightest first, with random errors of flux, position and spectral index.
 
-    Parameters
-    ----------
-    sky
-        Points, brightest first; not changed.
-    errors
-        The `errors` block of a catalogue.
+    Errors are drawn source by source.
     """
     flux, offset, index = (np.random.default_rng(stream) for stream in np.random.SeedSequence(errors.seed).spawn(3))
     found = sky.copy()

@@ -25,27 +25,16 @@ def differential_counts(flux: np.ndarray) -> np.ndarray:
 
 
 def expected_sources(faint: float, bright: float = BRIGHTEST) -> float:
-    """Return how many sources between two fluxes at 200 MHz, in Jy, the whole sky has on average."""
+    """Return the expected number of sources on the whole sky between two fluxes at 200 MHz, in Jy."""
     edges = np.geomspace(faint, max(bright, faint), 500)
     return float(FULL_SKY * np.trapezoid(differential_counts(edges), edges))
 
 
 def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray, np.random.Generator]]:
-    """Draw the fluxes of an all-sky population, in bins of flux.
+    """Draw the fluxes in Jy of an all-sky population between two fluxes at 200 MHz, in bins of flux.
 
-    Every bin has its own random stream, so that the bright sources do not depend on the faint limit.
-
-    Parameters
-    ----------
-    faint, bright
-        Range of fluxes at 200 MHz, in Jy.
-    seed
-        Seed of the population.
-
-    Returns
-    -------
-    list of tuple
-        For each bin the fluxes in Jy, and the random generator for other properties of its sources.
+    Each bin also has the random generator for other properties of its sources. Every bin has its own random stream, so
+    that the bright sources do not depend on the faint limit.
     """
     lowest, highest = (int(np.floor(np.log10(flux) * BINS_PER_DECADE)) for flux in (faint, bright))
     population = []
@@ -53,7 +42,7 @@ def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray
         edges = 10.0 ** np.linspace(number / BINS_PER_DECADE, (number + 1) / BINS_PER_DECADE, POINTS_PER_BIN + 1)
         steps = np.diff(edges) * (differential_counts(edges[:-1]) + differential_counts(edges[1:])) / 2
         cumulative = np.concatenate([[0.0], np.cumsum(steps)]) * FULL_SKY
-        # A spawn key must not be negative; bins below 1 Jy are.
+        # A spawn key must not be negative, but the numbers of bins below 1 Jy are.
         generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number + 1000,)))
         drawn = generator.uniform(0, cumulative[-1], generator.poisson(cumulative[-1]))
         population.append((np.interp(drawn, cumulative, edges), generator))
@@ -61,19 +50,10 @@ def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray
 
 
 def draw_population(faint: float, bright: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw an all-sky, isotropic population of sources between two flux limits.
+    """Draw an all-sky, isotropic population of sources between two fluxes at 200 MHz in Jy.
 
-    Parameters
-    ----------
-    faint, bright
-        Range of fluxes at 200 MHz, in Jy; the counts are measured from 0.81 mJy to 61 Jy at this frequency.
-    seed
-        Seed of positions and fluxes.
-
-    Returns
-    -------
-    tuple of ndarray
-        Right ascension and declination in radians, flux at 200 MHz in Jy, each of shape (Nsources,).
+    Return right ascension and declination in radians and flux at 200 MHz in Jy, (Nsources,) each. The counts are
+    measured from 0.81 mJy to 61 Jy at this frequency.
     """
     parts = []
     for flux, generator in draw_fluxes(faint, bright, seed):

@@ -15,19 +15,10 @@ from calstudy.sky.settings import CsvColumns
 
 
 def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
-    """Return the sources of a CSV file with a header line.
+    """Read point sources from a CSV file with a header line; rows without a position or flux density are left out.
 
-    Parameters
-    ----------
-    path
-        The file. Rows without a position or flux density are left out.
-    columns
-        Names of the columns: right ascension and declination (ICRS, degrees), flux density (Jy), spectral index.
-
-    Raises
-    ------
-    ValueError
-        If a column is missing or not numeric, or a selected source has no spectral index.
+    The columns are right ascension and declination (ICRS, degrees), flux density (Jy) and spectral index. Raises
+    ValueError if a column is missing or not numeric, or a selected source has no spectral index.
     """
     table = Table.read(path, format="ascii.csv")
     wanted = {key: getattr(columns, key) for key in ("right_ascension", "declination", "flux", "spectral_index")}

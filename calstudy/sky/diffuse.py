@@ -1,4 +1,4 @@
-"""Diffuse Galactic emission: a HEALPix map of brightness temperature, as points that hold the flux of their pixels."""
+"""Diffuse Galactic emission: a HEALPix map of brightness temperature, as points with the flux of its pixels."""
 
 from __future__ import annotations
 
@@ -30,10 +30,7 @@ FINEST_NSIDE = 256
 def brightness_temperature(settings: section.HaslamMap | section.SyntheticDiffuse) -> np.ndarray:
     """Return the brightness temperature of all pixels at the map's frequency, K, (Npixels,), RING order, ICRS.
 
-    Raises
-    ------
-    InputError
-        If the installed mwa_pb is without its copy of the Haslam map.
+    Raises InputError if the installed mwa_pb lacks its copy of the Haslam map.
     """
     if isinstance(settings, section.HaslamMap):
         return healpy.ud_grade(_haslam(Path(str(HASLAM_FILE))), settings.nside)
@@ -50,7 +47,7 @@ def _haslam(path: Path) -> np.ndarray:
         )
     with fits.open(path) as file:
         grid = HASLAM_UNIT * np.asarray(file[0].data[0], float) - MICROWAVE_BACKGROUND
-    # Right ascension falls with the column, from 180 to -180 degrees, both of which are there.
+    # Right ascension decreases with the column, from 180 to -180 degrees, both included.
     offset = HASLAM_STEP * np.arange(grid.shape[1]) - np.pi
     declination = HASLAM_STEP * np.arange(grid.shape[0]) - np.pi / 2
     spline = RectBivariateSpline(declination, offset, grid)
@@ -84,17 +81,7 @@ def make_diffuse(settings: section.HaslamMap | section.SyntheticDiffuse) -> SkyM
     """Return the map as points at the centres of its pixels, with the flux of the pixels and power-law spectra.
 
     In the Rayleigh-Jeans limit a pixel of T kelvin and solid angle Ω has S = 2 k T ν² Ω / c², so that T ∝ ν^β is
-    S ∝ ν^(β + 2).
-
-    Parameters
-    ----------
-    settings
-        A map of the `sky.diffuse` section.
-
-    Raises
-    ------
-    InputError
-        If the map is not there.
+    S ∝ ν^(β + 2). Errors are those of `brightness_temperature`.
     """
     temperature = brightness_temperature(settings)
     frequency = reference_frequency(settings)
@@ -123,27 +110,16 @@ def reference_frequency(settings: section.HaslamMap | section.SyntheticDiffuse) 
 
 
 def describe(settings: section.HaslamMap | section.SyntheticDiffuse) -> str:
-    """Return in a few words what the map is."""
+    """Describe the map in one phrase."""
     name = "the Haslam map" if isinstance(settings, section.HaslamMap) else "a synthetic map"
     return f"diffuse emission: {name} at nside {settings.nside}, T proportional to nu^{settings.spectral_index:g}"
 
 
 def add_skies(points: SkyModel, diffuse: SkyModel, frequencies: np.ndarray) -> SkyModel:
-    """Return a catalogue of points and a diffuse map as one sky.
+    """Return a catalogue of points and a diffuse map from `make_diffuse` as one sky.
 
-    Parameters
-    ----------
-    points
-        Of any spectral type.
-    diffuse
-        From `make_diffuse`.
-    frequencies
-        All channels in Hz, (Nfreqs,): a catalogue whose spectra are neither flat nor power laws is given at these.
-
-    Returns
-    -------
-    SkyModel
-        Points with power-law spectra, or else given channel by channel.
+    The spectra are power laws if those of the catalogue are flat or power laws. Otherwise the sky is given at all
+    channels in Hz, (Nfreqs,).
     """
     if points.spectral_type in ("flat", "spectral_index"):
         spectra = {
@@ -174,7 +150,7 @@ def _spectral_index(points: SkyModel) -> np.ndarray:
 
 
 def _reference_frequency(points: SkyModel) -> units.Quantity:
-    """Return the reference frequencies of a catalogue; of a flat spectrum any one will do."""
+    """Return the reference frequencies of a catalogue; those of flat spectra are arbitrary."""
     if points.reference_frequency is None:
         return np.full(points.Ncomponents, HASLAM_FREQUENCY) * units.Hz
     return points.reference_frequency

@@ -34,17 +34,10 @@ class EorField:
 
     Parameters
     ----------
-    settings
-        The `sky.eor` section.
-    frequencies
-        All channel centres of the study in Hz, equally spaced, shape (Nfreqs,).
+    frequencies : (Nfreqs,) float
+        All channel centres of the study in Hz, at least two, increasing and equally spaced; ValueError otherwise.
     cosmology
         Converts P(k) to brightness; the power spectrum estimator must use the same cosmology.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two channels, or they are not equally spaced.
     """
 
     def __init__(self, settings: Eor, frequencies: np.ndarray, cosmology: FLRW = Planck15) -> None:
@@ -58,23 +51,18 @@ class EorField:
 
     @property
     def n_pixels(self) -> int:
-        """Pixels of the whole sky."""
+        """Number of pixels of the whole sky."""
         return 12 * self.settings.nside**2
 
     @property
     def voxel_volume(self) -> np.ndarray:
-        """Comoving volume of a pixel and channel in Mpc³, shape (Nfreqs,)."""
+        """Comoving volume of a pixel and channel in Mpc³, (Nfreqs,)."""
         return 4 * np.pi / self.n_pixels * self.distance**2 * self.depth
 
     def maps(self, channels: slice | np.ndarray) -> np.ndarray:
-        """Return brightness temperatures in K, float64, shape (Nchannels, Npixels), RING order, ICRS.
+        """Return brightness temperatures of some channels in K, (Nchannels, Npixels), RING order, ICRS.
 
         The map of a channel does not depend on which other channels are requested.
-
-        Parameters
-        ----------
-        channels
-            Which of the study's channels.
         """
         chosen = np.arange(len(self.frequencies))[channels]
         draw = self._white if self.settings.spectrum == "flat" else self._correlated
@@ -84,7 +72,7 @@ class EorField:
         return maps
 
     def sky(self, channels: slice | np.ndarray) -> SkyModel:
-        """Return `maps` as a HEALPix SkyModel in K, one frequency per chosen channel."""
+        """Return `maps` as a HEALPix SkyModel in K, with one frequency per channel."""
         maps = self.maps(channels)
         stokes = np.zeros((4, *maps.shape))
         stokes[0] = maps
@@ -98,7 +86,7 @@ class EorField:
             freq_array=self.frequencies[channels] * units.Hz,
             stokes=units.Quantity(stokes, units.K, copy=False),
             history=f"calstudy EoR, {self.settings.spectrum} power spectrum, seed {self.settings.seed}",
-            # Fluctuations about the mean are negative half of the time, which the check would warn of.
+            # Fluctuations about the mean are negative half of the time, and the check would warn about that.
             run_check_acceptability=False,
         )
 
@@ -115,8 +103,8 @@ class EorField:
     def _harmonics(self) -> np.ndarray:
         """a_lm of all channels in healpy's order, complex64 (0.9 GB at nside 256 x 384 channels).
 
-        One stream of random numbers and one covariance matrix per ℓ, for all channels at once: what correlates
-        channels cannot be drawn by channels.
+        They are drawn for all channels at once, with one stream of random numbers and one covariance matrix per ℓ,
+        because channels that are correlated cannot be drawn separately.
         """
         lmax, n_channels = 3 * self.settings.nside - 1, len(self.frequencies)
         harmonics = np.empty((n_channels, healpy.Alm.getsize(lmax)), dtype=np.complex64)
@@ -133,7 +121,7 @@ class EorField:
         return harmonics
 
     def channel_covariance(self, ell: int) -> np.ndarray:
-        """Return C_ℓ(ν, ν') in K² sr, shape (Nfreqs, Nfreqs), for a power-law spectrum.
+        """Return C_ℓ(ν, ν') of a power-law spectrum in K² sr, (Nfreqs, Nfreqs).
 
         In the flat-sky limit, with the line of sight in units of channels (κ = k_∥ Δr(ν), |κ| < π),
 
@@ -150,15 +138,14 @@ class EorField:
     def covariance_roots(self, lmax: int) -> CubicSpline:
         """Return triangular L(log(ℓ + ½)) with L Lᵀ = C_ℓ to 3e-5 of its largest element.
 
-        It is computed at some ℓ and interpolated between them, in a quarter of the time of computing all.
-
-        The triangular root with a positive diagonal is unique, so that it is as smooth in ℓ as the covariance is.
+        It is computed at some ℓ and interpolated between them, in a quarter of the time of computing all. The
+        triangular root with a positive diagonal is unique, and therefore as smooth in ℓ as the covariance.
         """
         nodes = np.linspace(np.log(0.5), np.log(lmax + 0.5), ROOT_NODES)
         return CubicSpline(nodes, [_triangular_root(self._spectral_factor(np.exp(node) - 0.5)) for node in nodes])
 
     def _spectral_factor(self, ell: float) -> np.ndarray:
-        """F of shape (Nfreqs, 2 Nnodes) with C_ℓ = F Fᵀ: a cosine and a sine wave per quadrature node."""
+        """Return F, (Nfreqs, 2 Nnodes), with C_ℓ = F Fᵀ: a cosine and a sine wave per quadrature node."""
         phase, weight = _phase_quadrature(len(self.frequencies))
         wavenumber = np.hypot(phase / self.depth[:, None], (ell + 0.5) / self.distance[:, None])
         power = self.settings.amplitude * (wavenumber / self.settings.pivot_k) ** self.settings.index
@@ -170,14 +157,9 @@ class EorField:
 def comoving_geometry(
     frequencies: np.ndarray, width: float, cosmology: FLRW = Planck15
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the comoving distance to 21 cm channels and their depth, in Mpc without h, each of shape (Nfreqs,).
+    """Return the comoving distance to 21 cm channels and their depth, in Mpc without h, (Nfreqs,) each.
 
-    Parameters
-    ----------
-    frequencies
-        Channel centres in Hz, shape (Nfreqs,).
-    width
-        Channel width in Hz.
+    `frequencies` are the channel centres and `width` is the channel width, in Hz.
     """
     redshift = HYDROGEN_LINE / frequencies - 1
     distance = cosmology.comoving_transverse_distance(redshift).to_value("Mpc")
@@ -186,9 +168,9 @@ def comoving_geometry(
 
 
 def _triangular_root(factor: np.ndarray) -> np.ndarray:
-    """Return the lower triangular L, diagonal not negative, with L Lᵀ = F Fᵀ.
+    """Return the lower triangular L with non-negative diagonal and L Lᵀ = F Fᵀ.
 
-    By QR, not Cholesky of the product: steep spectra span more than the 16 digits that the product would keep.
+    QR is used, not Cholesky of the product: steep spectra span more than the 16 digits that the product would keep.
     """
     upper = np.asarray(np.linalg.qr(factor.T, mode="r"))
     return upper.T * np.where(np.diag(upper) < 0, -1.0, 1.0)

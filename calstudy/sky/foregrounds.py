@@ -27,7 +27,7 @@ LOG = logging.getLogger(__name__)
 
 # G4Jy (White et al. 2020) is complete above about this flux at 200 MHz, south of +30° and away from the Galactic plane.
 COMPLETE_FLUX = 4.0
-# With any higher flux limit the same sources are drawn, so that G4Jy components replace the same ones.
+# For any higher flux limit the same sources are drawn, so that G4Jy components replace the same ones.
 FAINTEST_DRAWN = 2.0
 # Spawn key of the random numbers of spectral indices; bins of flux have others.
 INDEX_STREAM = 0
@@ -40,14 +40,9 @@ NOTHING = Catalogue(np.array(["none"]), np.zeros(1), np.array([-np.pi / 2]), np.
 
 @dataclass(frozen=True)
 class Foregrounds:
-    """The foreground sky.
+    """The foreground sky as points, brightest first, and a note, or None if it is the paper's GLEAM catalogue.
 
-    Attributes
-    ----------
-    sky
-        Point components, brightest first. Without foregrounds a single one of 0 Jy, because sky models cannot be empty.
-    stand_in
-        A sentence if the sky is not the paper's GLEAM catalogue, otherwise None.
+    Without foregrounds the sky is a single source of 0 Jy, because sky models cannot be empty.
     """
 
     sky: SkyModel
@@ -57,21 +52,9 @@ class Foregrounds:
 def make_foregrounds(
     settings: section.Foregrounds, frequencies: np.ndarray, diffuse: section.Diffuse | None = None
 ) -> Foregrounds:
-    """Return the point sources that the `sky.foregrounds` section asks for, and diffuse emission as further points.
+    """Return point sources and diffuse emission, as further points, for channels in Hz, (Nfreqs,).
 
-    Parameters
-    ----------
-    settings
-        Any kind of foregrounds section.
-    frequencies
-        All channels in Hz, shape (Nfreqs,).
-    diffuse
-        The `sky.diffuse` section; None for no diffuse emission.
-
-    Raises
-    ------
-    InputError
-        If a catalogue or a map is missing or cannot be used.
+    Raises InputError if a catalogue or a map is missing or cannot be used.
     """
     points = _points(settings, frequencies)
     if diffuse is None or isinstance(diffuse, section.NoDiffuse):
@@ -120,12 +103,12 @@ def _gleam(settings: section.GleamSources) -> Foregrounds:
 
 
 def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
-    """G4Jy components and, where G4Jy is not complete, synthetic sources drawn from source counts.
+    """Combine G4Jy components with synthetic sources drawn from source counts where G4Jy is not complete.
 
     All G4Jy components are used. Synthetic sources cover the whole sky below 4 Jy (at 200 MHz), and all fluxes north
     of +30° and within 10° of the Galactic plane, where G4Jy has no sources. G4Jy is selected at 151 MHz and so
     extends below 4 Jy at 200 MHz: there each G4Jy component replaces the synthetic source with the nearest flux, so
-    that the counts stay as measured. As in GLEAM itself, the brightest few radio sources (Cygnus A, Cassiopeia
+    that the counts remain as measured. As in GLEAM itself, the brightest few radio sources (Cygnus A, Cassiopeia
     A, Centaurus A, ...) and the Galaxy are missing.
     """
     both, n_components = _components(min(settings.flux_limit, FAINTEST_DRAWN), settings.seed, settings.index_scatter)
@@ -139,10 +122,10 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
     return Foregrounds(to_sky_model(both.select(chosen), settings), stand_in)
 
 
-# Every piece of a simulation needs them, and making them takes longer than a small piece.
+# Every chunk of a simulation needs them, and making them takes longer than a small chunk.
 @lru_cache(maxsize=1)
 def _components(faintest: float, seed: int, index_scatter: float) -> tuple[Catalogue, int]:
-    """Return G4Jy components and then synthetic sources, down to a flux in Jy, and the number of the former."""
+    """Return G4Jy components followed by synthetic sources, down to a flux in Jy, and the number of G4Jy components."""
     real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))
     synthetic = _population(faintest, seed, index_scatter)
     covered = _in_g4jy_area(synthetic)
@@ -164,7 +147,7 @@ def _population(faintest: float, seed: int, index_scatter: float) -> Catalogue:
 
 
 def in_complete_area(directions: SkyCoord) -> np.ndarray:
-    """Return which directions, (N,), are where G4Jy is complete: south of +30° and 10° from the Galactic plane."""
+    """Return whether each direction, (N,), is where G4Jy is complete: south of +30° and 10° from the Galactic plane."""
     latitude = np.abs(directions.galactic.b.rad)
     return (directions.icrs.dec.rad < COMPLETE_DECLINATION) & (latitude >= COMPLETE_LATITUDE)
 
@@ -192,7 +175,7 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
     flux = at_centre.stokes[0, 0].to_value("Jy")
     flux = np.where(np.isfinite(flux), flux, -np.inf)
     if settings.spectrum == "flat":
-        # One flux for all channels: what the catalogue says of the middle of the band.
+        # All channels have the flux of the catalogue at the middle of the band.
         sky = SkyModel(
             name=sky.name,
             skycoord=sky.skycoord,
@@ -228,7 +211,7 @@ def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregr
 
 
 def _at_frequency(sky: SkyModel, frequency: float) -> SkyModel:
-    """Return the catalogue at one frequency in Hz, or at the tabulated one next to it if it has no others."""
+    """Return the catalogue at one frequency in Hz, or at the nearest tabulated one if it is given by channel."""
     if sky.spectral_type == "flat":
         return sky
     if sky.spectral_type == "full":
@@ -245,7 +228,7 @@ def _has_frequencies(sky: SkyModel, frequencies: np.ndarray) -> bool:
 
 
 def _require_idl(path: Path) -> None:
-    """Raise ValueError unless a file begins as IDL save files do; scipy raises a bare Exception for others."""
+    """Raise ValueError unless a file starts as IDL save files do; scipy raises a bare Exception for others."""
     with path.open("rb") as stream:
         if stream.read(2) != b"SR":
             raise ValueError("not an IDL save file")

@@ -27,23 +27,12 @@ def default_path() -> Path:
 
 
 def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
-    """Download the GLEAM extragalactic catalogue from VizieR, or verify an existing copy.
+    """Download the GLEAM extragalactic catalogue from VizieR, or verify an existing copy, and return its path.
 
     VizieR generates the table for every request and publishes no hash of it. The first download is accepted if it has
     the required columns and the published number of sources, 307,455. Its SHA-256 is then saved next to it, and
-    compared in all later uses.
-
-    Parameters
-    ----------
-    directory
-        Where to put it, `default_directory` by default; made if need be.
-    progress
-        Whether to show a progress bar.
-
-    Raises
-    ------
-    InputError
-        If the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
+    checked at every later use. The directory is by default `default_directory`, and is created if necessary. Raises
+    InputError if the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
     """
     directory = default_directory() if directory is None else directory
     path = directory / FILE
@@ -74,5 +63,5 @@ def verify(path: Path) -> None:
 
 
 def hash_file(path: Path) -> Path:
-    """Return the path of the file with the SHA-256 of a downloaded catalogue, next to it."""
+    """Return the path of the file next to a downloaded catalogue that holds its SHA-256."""
     return path.with_name(path.name + ".sha256")

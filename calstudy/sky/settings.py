@@ -12,13 +12,14 @@ from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDe
 
 VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
 BRIGHTEST_SOURCE = 197.0
-"""Jy at 200 MHz, rounded down: of the G4Jy components. A higher limit keeps nothing."""
+"""Flux density of the brightest G4Jy component, Jy at 200 MHz, rounded down; a higher flux limit keeps no sources."""
 
 
 class CatalogueErrors(Section):
-    """How the sources differ from those of the catalogue: a catalogue with errors, for a calibrator to assume.
+    """Errors of the sources of a catalogue, for a calibrator to assume.
 
-    Which sources are kept is decided before. The errors of a source do not depend on how many fainter ones are kept.
+    Sources are selected before the errors are applied. The errors of a source do not depend on how many fainter ones
+    are kept.
     """
 
     flux_scale: float = Field(1.0, gt=0, description="All fluxes are multiplied by this.")
@@ -37,7 +38,7 @@ class CatalogueErrors(Section):
 
 
 class PointSources(Section):
-    """Fields that all catalogues of point sources have."""
+    """Fields of all catalogues of point sources."""
 
     flux_limit: FluxDensity = Field(0.05, ge=0, le=1e5, description="Keep sources brighter than this.")
     spectrum: Literal["flat", "catalogue"] = Field(
@@ -154,7 +155,7 @@ Foregrounds = Annotated[
 
 
 class DiffuseMap(Section):
-    """Fields that all maps of diffuse emission have."""
+    """Fields of all maps of diffuse emission."""
 
     spectral_index: float = Field(
         -2.55,

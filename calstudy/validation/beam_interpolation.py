@@ -31,16 +31,9 @@ INTERPOLATION_COLOURS = {
 class BeamInterpolation:
     """Differences between Jones components, relative to the zenith, over directions, feeds and components.
 
-    Attributes
-    ----------
-    tabulated : (Ntab,) float
-        Tabulated frequencies within the band, Hz.
-    fit_rms, fit_max : (Ntab,) float
-        Rms and largest difference of the smooth fit from the table.
-    channels : (Nfreqs,) float
-        Channels, Hz.
-    others : dict
-        By interpolation, the rms difference of the other interpolations from the smooth fit, (Nfreqs,).
+    `fit_rms` and `fit_max` are differences of the smooth fit from the table at the `tabulated` frequencies within the
+    band, (Ntab,), Hz. `others` are rms differences of the other interpolations from the fit at `channels`, (Nfreqs,),
+    Hz.
     """
 
     tabulated: np.ndarray
@@ -59,19 +52,9 @@ def require_tabulated(beam: Plugin) -> None:
 
 
 def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> BeamInterpolation:
-    """Compare the smooth fit of a beam with its table, and the other interpolations with the smooth found.
+    """Compare the smooth fit of a beam with its table, and other interpolations with the fit at every `step`th channel.
 
-    Parameters
-    ----------
-    instrument
-        Beam and channels.
-    step
-        Only every so many channels are looked at.
-
-    Raises
-    ------
-    InputError
-        If the beam is not tabulated.
+    Raises InputError if the beam is not tabulated.
     """
     require_tabulated(instrument.beam)
     beams = {name: interpolated(instrument.beam, instrument.channels, name) for name in INTERPOLATIONS}
@@ -91,17 +74,7 @@ def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> Bea
 
 
 def interpolated(beam: Plugin, channels: Channels, interpolation: str) -> GriddedBeam:
-    """Return a tabulated beam with another interpolation between its frequencies.
-
-    Parameters
-    ----------
-    beam
-        Section of a tabulated beam.
-    channels
-        Over which it is read and fitted.
-    interpolation
-        One of `INTERPOLATIONS`.
-    """
+    """Return a tabulated beam, fitted over the channels, with one of `INTERPOLATIONS` between its frequencies."""
     found = make_beam(beam.model_copy(update={"interpolation": interpolation}), channels)
     assert isinstance(found, GriddedBeam)
     return found

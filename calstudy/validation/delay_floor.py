@@ -39,16 +39,9 @@ LINES = {"dolph-chebyshev": "-", "blackman-harris": ":"}
 class InterpolationFloor:
     """Delay spectra and floors of foregrounds simulated with one interpolation of the beam.
 
-    Attributes
-    ----------
-    delay : (Ndelays,) float
-        Non-negative delays, s.
-    spectrum : (Ndelays,) float
-        Rms over the shortest third of the baselines, relative to its largest, Dolph-Chebyshev taper.
-    horizon
-        Longest horizon delay of these baselines, s.
-    floors
-        By taper.
+    `spectrum` is the rms over the shortest third of the baselines, relative to its largest value, with the
+    Dolph-Chebyshev taper, at `delay` >= 0, (Ndelays,), s. `horizon` is the longest horizon delay of these baselines, s.
+    `floors` are by taper.
     """
 
     delay: np.ndarray
@@ -62,19 +55,9 @@ def compare_floors(
 ) -> dict[str, InterpolationFloor]:
     """Simulate the foregrounds of an experiment at its middle integration, once with every interpolation.
 
-    Every channel is simulated, so that nothing but the beam is interpolated.
-
-    Parameters
-    ----------
-    experiment
-        Its instrument, foregrounds and engine are used.
-    announce
-        Called with the name of each interpolation before its simulation.
-
-    Raises
-    ------
-    InputError
-        If the beam is not tabulated, or a catalogue or beam file is missing.
+    Every channel is simulated, so that only the beam is interpolated. `announce` is called with the name of each
+    interpolation before its simulation. Raises InputError if the beam is not tabulated, or a catalogue or beam file is
+    missing.
     """
     instrument = experiment.instrument
     require_tabulated(instrument.beam)
@@ -121,14 +104,7 @@ def draw_delay_floors(
 ) -> Figure:
     """Draw delay spectra of short baselines (left) and the floor beyond the horizon against baseline length (right).
 
-    Parameters
-    ----------
-    floors
-        By interpolation.
-    eor_level
-        Level of the EoR that is marked, amplitude dB, or None.
-    stand_ins
-        Printed below.
+    `eor_level` is marked, in amplitude dB, if it is not None.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2, sharey=True)

@@ -1,4 +1,4 @@
-"""Foregrounds made by one engine against the same foregrounds made by another, in full."""
+"""Comparison of the foregrounds that two engines simulate."""
 
 from __future__ import annotations
 
@@ -29,20 +29,9 @@ SHORT_AND_LONG = (style.BLUE, style.RED)
 class GroupAgreement:
     """The difference of two simulations on the baselines of a range of lengths, relative to the rms of these.
 
-    Attributes
-    ----------
-    shortest, longest
-        Range of lengths, m.
-    baselines
-        How many there are.
-    rms_jy
-        Rms of the visibilities, Jy.
-    largest, rms
-        Largest and rms difference, over `rms_jy`.
-    delay
-        Delays >= 0, (Ndelays,), s.
-    spectrum, difference
-        Rms of the delay spectra of the visibilities and of the difference, over the largest of `spectrum`, (Ndelays,).
+    Lengths are in m and `rms_jy` is in Jy. `largest` and `rms` are differences over `rms_jy`. `spectrum` and
+    `difference` are the rms of the delay spectra of the visibilities and of their difference, over the largest of
+    `spectrum`, at delays >= 0 in s, (Ndelays,) each.
     """
 
     shortest: float
@@ -58,20 +47,12 @@ class GroupAgreement:
 
 @dataclass(frozen=True)
 class EngineAgreement:
-    """How far two simulations of the same foregrounds agree.
+    """Agreement of two simulations of the same foregrounds.
 
-    Attributes
-    ----------
-    groups
-        Ranges of baseline length that hold baselines, ascending.
-    largest, rms
-        Largest and rms difference of all visibilities over their rms.
-    worst_slot
-        Largest difference of any integration and channel over the rms of that integration and channel.
-    taper
-        Of the delay spectra.
-    floors, differences
-        By taper: the delay floor of the visibilities, and the same of the difference, relative to the same peaks.
+    `groups` are ranges of baseline length that contain baselines, ascending. `largest` and `rms` are differences of all
+    visibilities over their rms. `worst_slot` is the largest difference of any integration and channel over the rms of
+    that integration and channel. `floors` and `differences` are delay floors of the visibilities and of the difference,
+    by taper, relative to the same peaks.
     """
 
     groups: tuple[GroupAgreement, ...]
@@ -102,19 +83,10 @@ class EngineAgreement:
 
 
 def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreement:
-    """Compare two simulations of the same sky, beam and observation.
+    """Compare two simulations of the same sky, beam and observation, in Jy on equally spaced channels.
 
-    Parameters
-    ----------
-    foregrounds, reference
-        Visibilities in Jy, equally spaced channels, the same observation. Not mutated.
-
-    Raises
-    ------
-    InputError
-        If the band leaves no delays beyond the horizon of the longest baseline.
-    ValueError
-        If the observations differ.
+    Raises InputError if the band leaves no delays beyond the horizon of the longest baseline, and ValueError if the
+    observations differ.
     """
     for name in ("baseline_array", "time_array", "freq_array", "polarization_array"):
         if not np.array_equal(getattr(foregrounds, name), getattr(reference, name)):
@@ -179,18 +151,8 @@ def draw_engine_agreement(
 ) -> Figure:
     """Draw delay spectra of short and long baselines (left) and relative differences against baseline length (right).
 
-    Parameters
-    ----------
-    agreement
-        Of the two simulations.
-    names
-        Of the engine and of the reference.
-    allowed
-        Sum of the node tolerances of both, relative to the rms.
-    eor_level
-        Level of the EoR that is marked, amplitude dB, or None.
-    stand_ins
-        Printed below.
+    `names` are those of the engine and of the reference, and `allowed` is the sum of the node tolerances of both,
+    relative to the rms. `eor_level` is marked, in amplitude dB, if it is not None.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 3.1)
     left, right = figure.subplots(1, 2)

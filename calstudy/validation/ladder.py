@@ -1,4 +1,4 @@
-"""Run the validation ladder: make what its steps need, measure, judge, and keep every result with its manifest."""
+"""Run the validation ladder: make the products of its steps, measure, judge, and save all results with manifests."""
 
 from __future__ import annotations
 
@@ -40,26 +40,11 @@ class LadderRun:
 
 
 def run_ladder(steps: Sequence[Step], store: Path, folder: Path, workers: int, console: Console) -> LadderRun:
-    """Measure steps of the ladder and judge them, reusing every product that is in the store.
+    """Measure steps of the ladder, all of one scale, and judge them, reusing every product in the store.
 
-    Parameters
-    ----------
-    steps
-        From `calstudy.validation.steps.load_ladder`, all of one scale.
-    store
-        Folder of products.
-    folder
-        For the tables, and a folder per step: its measurement, figures and manifest. Those of a failed step are kept
-        under ``failed/`` as well, by step and key, and never overwritten by a later run.
-    workers
-        Worker processes.
-    console
-        Where progress is written.
-
-    Raises
-    ------
-    InputError
-        If the store or the folder cannot be written. A step whose products cannot be made fails, with the reason.
+    `folder` receives the tables, and a folder per step with its measurement, figures and manifest. Those of a failed
+    step are also kept under ``failed/``, by step and key, and never overwritten by a later run. Raises InputError if
+    the store or the folder cannot be written. A step whose products cannot be made fails, with the reason.
     """
     products = Store(store)
     products.prepare()
@@ -87,7 +72,7 @@ def run_ladder(steps: Sequence[Step], store: Path, folder: Path, workers: int, c
 
 
 def _make(tasks: Mapping[str, Task], store: Store, workers: Workers, console: Console) -> tuple[Made, dict[str, str]]:
-    """Make all measurements together; if one cannot be made, one by one, so that it alone is lost."""
+    """Make all measurements together; if one fails, make them one by one, so that only that one is lost."""
     try:
         return make(list(tasks.values()), store, workers, console), {}
     except InputError as error:

@@ -8,14 +8,9 @@ from calstudy.verdicts.statement import Finding
 
 
 def clustered_mean(values: np.ndarray, weights: np.ndarray | None = None) -> Finding:
-    """Return the mean over (Nunits, Nmodes) and its standard error, each unit's modes being one sample.
+    """Return the mean over (Nunits, Nmodes) and its standard error, with the modes of each unit as one sample.
 
-    Parameters
-    ----------
-    values
-        NaN where a mode is left out.
-    weights
-        Of each unit, (Nunits,); equal by default.
+    Modes that are NaN are left out. `weights` are those of the units, (Nunits,); equal by default.
     """
     used = np.isfinite(values)
     scale = np.ones(len(values)) if weights is None else np.asarray(weights, float)

@@ -1,7 +1,7 @@
-"""What a step of the validation ladder measures: the interface, what it is given, and what it returns.
+"""Measurements of the steps of the validation ladder: the interface, its inputs, and its findings.
 
 A measurement is a `Measurement`: its fields are the parameters of the step's file. The built-in ones are the modules of
-`calstudy.validation.measurements`, named as their files; a step may name a file of one's own instead.
+`calstudy.validation.measurements`, named as their files; a step may name a user's file instead.
 """
 
 from __future__ import annotations
@@ -43,15 +43,7 @@ MEASUREMENTS: Registry[Measurement] = Registry(
 
 @dataclass(frozen=True)
 class Findings:
-    """What a measurement found.
-
-    Attributes
-    ----------
-    values
-        Numbers with their uncertainties, by the names that the criteria of the step know them under.
-    remarks
-        Sentences that belong to the numbers.
-    """
+    """Numbers with their uncertainties, by the names in the criteria of the step, and remarks on them."""
 
     values: Mapping[str, Finding]
     remarks: tuple[str, ...] = ()
@@ -59,7 +51,7 @@ class Findings:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a measurement is made on.
+    """The inputs of a measurement.
 
     Attributes
     ----------
@@ -98,7 +90,7 @@ class Inputs:
         return self.experiments[experiment]["instrument"]
 
     def levels(self, experiment: str) -> Levels:
-        """Return how the components of an experiment are scaled."""
+        """Return the levels of the components of an experiment."""
         return Levels(**read_json(self.folder(experiment, "levels") / LEVELS))
 
     def corruption(self, experiment: str) -> CorruptionSettings:
@@ -110,7 +102,7 @@ class Inputs:
         return self.experiments[experiment]["sky"].eor
 
     def input_power(self, experiment: str, k: np.ndarray) -> np.ndarray:
-        """Return the P(k) that was put in, scaled as the data were, mK^2 h^-3 Mpc^3, at `k` in h/Mpc."""
+        """Return the input P(k), scaled as the data are, mK^2 h^-3 Mpc^3, at `k` in h/Mpc."""
         power = input_power(self.eor(experiment), k, self.power(experiment).cosmology)
         return self.levels(experiment).eor_factor ** 2 * power
 
@@ -137,21 +129,21 @@ class Inputs:
 
 
 def required(task: Task | None, what: str) -> Task:
-    """Return a task that a measurement cannot do without; raises InputError if the experiment has none."""
+    """Return a task, or raise InputError if the experiment does not have it."""
     if task is None:
         raise InputError(f"the measurement needs {what}, which the experiment does not have")
     return task
 
 
 class Measurement(Plugin):
-    """The base of all measurements; fields of subclasses are the parameters that a step may give.
+    """Base class of all measurements; fields of subclasses are the parameters that a step may give.
 
     Attributes
     ----------
     version
-        Raised when the results change.
+        Increased when the results change.
     sections
-        The sections of the experiments that are read; what only their products depend on need not be named.
+        The sections of the experiments that are read. Sections that affect only the products need not be named.
     """
 
     registry: ClassVar = MEASUREMENTS
@@ -161,10 +153,10 @@ class Measurement(Plugin):
     kind: str
 
     def products(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the products of one experiment that are read, by names of the measurement's own."""
+        """Return the products of one experiment that the measurement reads, by names of its own."""
         del graph
         return {}
 
     @abstractmethod
     def measure(self, inputs: Inputs) -> Findings:
-        """Measure, and write figures and tables to ``inputs.output`` if there are any."""
+        """Measure, and write figures and tables, if any, to ``inputs.output``."""

@@ -1,4 +1,4 @@
-"""The outcomes of the steps of the validation ladder, and the tables that hold them."""
+"""The outcomes of the steps of the validation ladder, and the tables that contain them."""
 
 from __future__ import annotations
 
@@ -19,17 +19,7 @@ JSON, MARKDOWN = "validation.json", "validation.md"
 
 @dataclass(frozen=True)
 class Outcome:
-    """One step, evaluated.
-
-    Attributes
-    ----------
-    step
-        Which.
-    verdicts
-        On its criteria.
-    remarks
-        What its measurement says besides numbers.
-    """
+    """One step, the verdicts on its criteria, and the remarks of its measurement."""
 
     step: Step
     verdicts: tuple[Verdict, ...]
@@ -42,15 +32,7 @@ class Outcome:
 
 
 def judge(step: Step, measurement: Mapping[str, Any]) -> Outcome:
-    """Hold what was measured against the criteria of a step.
-
-    Parameters
-    ----------
-    step
-        Has the criteria.
-    measurement
-        Content of the `validate` product's measurement.json. A number that is missing or not finite fails.
-    """
+    """Compare the content of measurement.json with the criteria; a number that is missing or not finite fails."""
     verdicts = []
     for name, criterion in step.criteria.items():
         found = measurement["findings"].get(name)
@@ -69,7 +51,7 @@ def failed(step: Step, reason: str) -> Outcome:
 
 
 def _fail(verdict: Verdict) -> Verdict:
-    """Return a verdict as a failure: a step that gives no number does not pass."""
+    """Return a verdict as a failure: a step without a number does not pass."""
     return replace(verdict, verdict="FAIL")
 
 
@@ -91,33 +73,14 @@ def _title(scale: str) -> str:
 
 
 def show(outcomes: Sequence[Outcome], scale: str, console: Console) -> None:
-    """Print the outcomes as a table.
-
-    Parameters
-    ----------
-    outcomes
-        Of the steps.
-    scale
-        At which they were taken.
-    console
-        Where it is written.
-    """
+    """Print the outcomes as a table."""
     show_verdicts(_verdicts(outcomes), _title(scale), console, "step", tally(outcomes))
 
 
 def write_tables(outcomes: Sequence[Outcome], scale: str, folder: Path, notes: Sequence[str] = ()) -> None:
-    """Write validation.json and validation.md into a folder.
+    """Write validation.json and validation.md into an existing folder.
 
-    Parameters
-    ----------
-    outcomes
-        In the order of the steps.
-    scale
-        "full" or "small".
-    folder
-        Must exist.
-    notes
-        What stands in for the paper's own ingredients.
+    `outcomes` are in the order of the steps, and `notes` name the substitutes for the paper's inputs.
     """
     steps = [
         {

@@ -1,4 +1,4 @@
-"""The product of a step of the validation ladder: what its measurement finds on the products of its experiments."""
+"""The product of a step of the validation ladder: findings of its measurement on the products of its experiments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FINDINGS = "measurement.json"
 
 
 def measurement_task(step: Step) -> Task:
-    """Return the task that measures a step; raises InputError if its experiments lack something."""
+    """Return the task that measures a step; raises InputError if its experiments lack a product."""
     measurement = step.measurement
     graphs = {name: Graph(experiment) for name, experiment in step.experiments.items()}
     settings = {
@@ -45,12 +45,9 @@ def _products(step: Step, graph: Graph) -> Mapping[str, Task]:
 
 
 def measure(job: Job) -> Mapping[str, Any]:
-    """Write the findings of a measurement to measurement.json, beside its figures and tables.
+    """Write the findings of a measurement to measurement.json, with its figures and tables.
 
-    Raises
-    ------
-    InputError
-        If a measurement of a user's own fails, or returns something else.
+    Raises InputError if a user's own measurement fails, or does not return Findings.
     """
     measurement = job.settings["measurement"]
     with guarded(measurement):

@@ -1,4 +1,4 @@
-"""What a simulation looks like: the wedge of F alone, P(k) of S alone against its input, delay spectra of baselines."""
+"""Overview of a simulation: the wedge of F alone, P(k) of S alone over its input, and delay spectra of baselines."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 LENGTHS = (0.0, 0.5, 1.0)
-"""The baselines looked at, as quantiles of length: shortest, median, longest."""
+"""The baselines that are shown, as quantiles of length: shortest, median, longest."""
 MAX_DELAY = 2e-6
 
 
@@ -41,16 +41,7 @@ MAX_DELAY = 2e-6
 class BaselineDelays:
     """Rms over integrations of one baseline's delay transforms, first polarization, Jy Hz.
 
-    Attributes
-    ----------
-    antennas
-        The two antenna numbers.
-    length
-        |b| in m.
-    delay
-        Ascending, (Ndelays,), s.
-    foregrounds, eor
-        Of F, and of S scaled to the level that the experiment puts on the data, (Ndelays,) each.
+    `delay` is ascending, in s, and `length` is |b| in m. S is scaled to the level that the experiment adds to the data.
     """
 
     antennas: tuple[int, int]
@@ -64,18 +55,10 @@ class BaselineDelays:
 class SimulatedComponents:
     """The simulated components of an experiment, each alone.
 
-    Attributes
-    ----------
-    wedge
-        Of F.
-    eor
-        P(k) of S as simulated, over all modes, with its sample variance.
-    expected : (Nk,) float
-        The P(k) that S was drawn from, at the centres of the bins, mK^2 h^-3 Mpc^3.
-    baselines
-        A short, a middle and a long one.
-    buffer
-        Delay beyond the horizon at which the experiment's window starts, s.
+    `wedge` is the cylindrical spectrum of F, and `eor` is P(k) of S as simulated, over all modes, with its sample
+    variance. `expected`, (Nk,), is the P(k) from which S was drawn, at the centres of the bins, mK^2 h^-3 Mpc^3.
+    `baselines` are a short, a median and a long one. `buffer` is the delay beyond the horizon at which the experiment's
+    window starts, s.
     """
 
     wedge: CylindricalSpectrum
@@ -87,7 +70,7 @@ class SimulatedComponents:
     def ratio(self, low: float, high: float) -> tuple[float, float]:
         """Return measured over expected power and its standard deviation, over bins with low < k <= high (h/Mpc).
 
-        Bins weigh by their independent modes, for the sample variance is the only error.
+        Bins are weighted by their independent modes, because the sample variance is the only error.
         """
         modes = self.eor.sample_modes
         chosen = (modes > 0) & (self.eor.k > low) & (self.eor.k <= high)
@@ -99,14 +82,9 @@ class SimulatedComponents:
 
 
 def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment) -> SimulatedComponents:
-    """Measure what can be judged by eye of the simulated components.
+    """Measure the spectra that are drawn, of F and S as simulated, Jy.
 
-    Parameters
-    ----------
-    foregrounds, eor
-        F and S as simulated, Jy. Not mutated.
-    experiment
-        That they belong to: its beam, power section and levels are used.
+    The beam, power section and levels are those of the experiment.
     """
     settings = experiment.power
     levels = set_levels(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption)
@@ -151,15 +129,7 @@ def _baselines(foregrounds: UVData, eor: UVData, factor: float, taper: str) -> t
 
 @style.journal_style()
 def draw_components(components: SimulatedComponents, stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw the wedge of F and P(k) of S above, and delay spectra of a short, a middle and a long baseline below.
-
-    Parameters
-    ----------
-    components
-        What was measured.
-    stand_ins
-        Printed below.
-    """
+    """Draw the wedge of F and P(k) of S above, and delay spectra of a short, a median and a long baseline below."""
     figure = style.new_figure(style.TWO_COLUMNS, 5.2)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.25, 1)).ravel()
     wedge, spherical = above.subplots(1, 2)

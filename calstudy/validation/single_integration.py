@@ -1,6 +1,6 @@
-"""One integration to calibrate, put together from products: foregrounds, gains, and the level of the noise.
+"""One integration to calibrate, assembled from products: foregrounds, gains, and the level of the noise.
 
-TensorFlow is imported inside functions, for the steps of the ladder are read without.
+TensorFlow is imported inside functions, because the steps of the ladder are read without it.
 """
 
 from __future__ import annotations
@@ -36,20 +36,10 @@ def first_integrations(uvd: UVData, count: int = 1) -> UVData:
 
 @dataclass(frozen=True)
 class SingleIntegration:
-    """One integration of one polarization, and what it consists of.
+    """One integration of one polarization, and its parts.
 
-    Attributes
-    ----------
-    foregrounds
-        As simulated.
-    structure, numbers
-        Of the fit, and the antenna numbers its indices stand for.
-    settings
-        Of the calibration.
-    noise_std
-        Of the complex noise of one sample, Jy.
-    true_gains
-        Of this integration, (Nants, Nfreqs), in the order of the fit's antennas.
+    `numbers` are the antenna numbers of the indices in `structure`. `noise_std` is the standard deviation of the
+    complex noise of one sample, Jy. `true_gains` are (Nants, Nfreqs), in the order of the fit's antennas.
     """
 
     foregrounds: UVData
@@ -98,7 +88,7 @@ class SingleIntegration:
 
     @property
     def modelled(self) -> np.ndarray:
-        """The foregrounds' projection on the basis of the fit, (Nbls, Nfreqs): foregrounds that it holds exactly."""
+        """The projection of the foregrounds on the basis of the fit, (Nbls, Nfreqs), which can be fitted exactly."""
         cube = to_cube(self.foregrounds)[0, :, :, 0]
         projected = np.empty_like(cube)
         for bucket in self.structure.basis.buckets:
@@ -114,7 +104,7 @@ class SingleIntegration:
         return gain_products(gains, self.structure.antennas)
 
     def uvcal(self, gains: np.ndarray) -> UVCal:
-        """Return gains, (Nants, Nfreqs), as a set of solutions to start from."""
+        """Return gains, (Nants, Nfreqs), as initial gains for a fit."""
         telescope = self.foregrounds.telescope
         values = np.ones((telescope.Nants, gains.shape[1], 1, 1), complex)
         values[np.searchsorted(telescope.antenna_numbers, self.numbers), :, 0, 0] = gains
@@ -127,18 +117,10 @@ class SingleIntegration:
         start: np.ndarray | None = None,
         sky_model: bool = True,
     ) -> CalibrationResult:
-        """Calibrate visibilities, (Nbls, Nfreqs), with the foregrounds as sky model, which fixes the scale.
+        """Calibrate visibilities, (Nbls, Nfreqs), Jy, with the foregrounds as sky model, which fixes the scale.
 
-        Parameters
-        ----------
-        visibilities
-            Data, Jy.
-        settings
-            By default those of the experiment.
-        start
-            Gains to start from, complex, (Nants, Nfreqs); None for what the settings say.
-        sky_model
-            Whether there is one.
+        `settings` are by default those of the experiment. The fit starts from the complex gains `start`, (Nants,
+        Nfreqs), or according to the settings.
         """
         gains = None if start is None else self.uvcal(start)
         sky = self.foregrounds if sky_model else None
@@ -151,7 +133,7 @@ class SingleIntegration:
 
 
 class SingleIntegrationMeasurement(Measurement):
-    """The base of measurements on the first integration of the step's one experiment."""
+    """Base class of measurements on the first integration of the step's single experiment."""
 
     sections: ClassVar = ("calibration",)
 
@@ -159,7 +141,7 @@ class SingleIntegrationMeasurement(Measurement):
     channels: int | None = Field(None, ge=1, description="How many are used, the first ones; null: all.")
 
     def products(self, graph: Graph) -> Mapping[str, Task]:
-        """Return foregrounds, gains and levels."""
+        """Return the tasks of foregrounds, gains and levels."""
         return {
             "foregrounds": required(simulation.foregrounds(graph), "foregrounds"),
             "gains": corruption.gains(graph),
@@ -167,5 +149,5 @@ class SingleIntegrationMeasurement(Measurement):
         }
 
     def integration(self, inputs: Inputs) -> SingleIntegration:
-        """Return the first integration of the experiment, of the first antennas and channels."""
+        """Return the first integration of the experiment, with the first antennas and channels."""
         return SingleIntegration.of(inputs, inputs.only).first(self.antennas, self.channels)

@@ -1,4 +1,4 @@
-"""Differential source counts of a foreground sky, against published ones."""
+"""Differential source counts of a foreground sky, compared with published counts."""
 
 from __future__ import annotations
 
@@ -26,16 +26,8 @@ TOLERANCE = 0.05
 class SourceCounts:
     """Differential counts at 200 MHz south of +30 degrees and more than 10 degrees from the Galactic plane.
 
-    Attributes
-    ----------
-    edges : (Nbins + 1,) float
-        Flux densities that bound the bins, Jy.
-    number : (Nbins,) int
-        Sources in each bin.
-    expected : (Nbins,) float
-        What Franzen et al. (2019) have there.
-    area
-        Sky that was counted, sr.
+    `edges` (Nbins + 1,) are flux densities in Jy, and `area` is in sr. `expected` is the number of sources in each bin
+    (Nbins,) according to Franzen et al. (2019).
     """
 
     edges: np.ndarray
@@ -65,16 +57,9 @@ class SourceCounts:
 
 
 def count_sources(sky: SkyModel, faint: float = 0.1, bright: float = 4.0) -> SourceCounts:
-    """Count the sources of a sky between two flux densities (Jy at 200 MHz), in equal steps of its logarithm.
+    """Count the point sources between two flux densities (Jy at 200 MHz), in bins of equal logarithmic width.
 
-    Flat spectra count with the flux density they have.
-
-    Parameters
-    ----------
-    sky
-        Point sources.
-    faint, bright
-        Ends, Jy at 200 MHz.
+    Flat spectra are counted at their constant flux density.
     """
     if sky.spectral_type != "flat":
         sky = sky.at_frequencies(np.array([FREQUENCY]) * units.Hz, inplace=False, run_check=False)

@@ -25,7 +25,7 @@ SCALES = ("full", "small")
 
 
 class Must(Section):
-    """What a measured number must be: one of the four."""
+    """The condition on a measured number: one of the four."""
 
     at_most: float | None = None
     at_least: float | None = None
@@ -54,7 +54,7 @@ class Must(Section):
 
 
 class StepCriterion(Section):
-    """One number that decides about a step."""
+    """One number that decides whether a step passes."""
 
     measures: str = Field(description="Name of the finding of the step's measurement.")
     quantity: str = Field(description="What that is, in words.")
@@ -64,7 +64,7 @@ class StepCriterion(Section):
     why: str = Field(description="Why this threshold.")
 
     def condition(self, scale: str) -> Threshold:
-        """Return what the number must be at a scale."""
+        """Return the condition on the number at a scale."""
         return (self.small if scale == "small" and self.small is not None else self.must).threshold
 
 
@@ -101,18 +101,8 @@ class StepFile(Section):
 class Step:
     """One step at one scale, its measurement and experiments validated.
 
-    Attributes
-    ----------
-    name, title, proves
-        As in the file.
-    measurement
-        With its parameters.
-    experiments
-        By the names they have in the step.
-    criteria
-        By the findings that they are about.
-    scale
-        "full" or "small".
+    `experiments` are by their names in the step, and `criteria` by the names of the findings that they judge. `scale`
+    is "full" or "small".
     """
 
     name: str
@@ -125,23 +115,11 @@ class Step:
 
 
 def load_step(path: Path, scale: str = "full", overrides: Sequence[str] = ()) -> Step:
-    """Read one step of the ladder.
+    """Read one step of the ladder from its YAML file.
 
-    Parameters
-    ----------
-    path
-        The YAML file.
-    scale
-        "full", or "small" for the experiments and parameters under `small`.
-    overrides
-        ``path=value`` texts, applied to every experiment last of all.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read.
-    ExperimentError
-        If fields of the step or of an experiment are unknown, missing, or hold values that are not allowed.
+    Scale "small" selects the experiments and parameters under `small`. `overrides` are ``path=value`` texts, applied to
+    every experiment after all other changes. Raises InputError if a file cannot be read, and ExperimentError if fields
+    of the step or of an experiment are unknown, missing, or have values that are not allowed.
     """
     data = read_mapping(path)
     try:
@@ -192,21 +170,9 @@ def _load_experiment(name: str, item: StepExperiment, base: Path, small: bool, o
 def load_ladder(
     names: Sequence[str] = (), scale: str = "full", overrides: Sequence[str] = (), folder: Path = LADDER
 ) -> list[Step]:
-    """Read the steps with these names, or all, in the order of their numbers.
+    """Read the steps with these names from a folder, or all of them, in the order of their numbers; see `load_step`.
 
-    Parameters
-    ----------
-    names
-        Of steps; all if there are none.
-    scale, overrides
-        As for `load_step`.
-    folder
-        Of the files of the steps.
-
-    Raises
-    ------
-    InputError
-        As `load_step`, and if the folder holds no steps, or none of a given name.
+    Raises InputError as `load_step`, and if the folder contains no steps, or none of a given name.
     """
     if scale not in SCALES:
         raise InputError(f"--scale {scale}: not a scale of the ladder (allowed: {', '.join(SCALES)})")

@@ -15,7 +15,7 @@ class AiryBeam(BeamModel):
     diameter: Length = Field(4.0, gt=0)
 
     def make(self, channels: Channels) -> Beam:
-        """Return the beam; it holds at any frequency."""
+        """Return the beam, which is valid at any frequency."""
         from pyuvdata import analytic_beam
 
         from calstudy.instrument.beams import ExactBeam

@@ -14,7 +14,7 @@ from calstudy.instrument.settings import Channels
 class FileBeam(BeamModel):
     """A beam from a beamfits file, on a grid of azimuth and zenith angle or on HEALPix.
 
-    It should be an E-field: of a power beam the field is taken to be its root, along the direction of the feed.
+    It should be an E-field: the field of a power beam is taken to be its square root, along the direction of the feed.
     """
 
     path: Path = Field(strict=False)
@@ -26,14 +26,14 @@ class FileBeam(BeamModel):
         return self.interpolation == "chebyshev"
 
     def require_usable(self, channels: Channels) -> None:
-        """Read the file, and look whether its frequencies enclose the channels."""
+        """Read the file, and check that its frequencies enclose the channels."""
         from calstudy.instrument.beam_frequencies import choose_frequencies
         from calstudy.instrument.beam_grid import read_beamfits
 
         choose_frequencies(read_beamfits(self.path).freq_array, channels.band, self.interpolation)
 
     def make(self, channels: Channels) -> Beam:
-        """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
+        """Read and fit the table over a band slightly wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beam_grid import read_beamfits
         from calstudy.instrument.beams import GriddedBeam
         from calstudy.instrument.tabulated import TabulatedBeam, fit_table

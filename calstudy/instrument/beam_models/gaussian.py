@@ -17,13 +17,13 @@ class GaussianBeam(BeamModel):
     reference_frequency: Frequency = Field(182.0e6, gt=0, description="Frequency at which the width is `fwhm_deg`.")
 
     def make(self, channels: Channels) -> Beam:
-        """Return the beam; it holds at any frequency."""
+        """Return the beam, which is valid at any frequency."""
         from pyuvdata import analytic_beam
 
         from calstudy.instrument.beams import ExactBeam
 
         del channels
-        # Half power at half the FWHM; the efield's sigma, for pyuvdata widens a power sigma again at every copy.
+        # Half power at half the FWHM. The sigma is that of the E-field: pyuvdata widens a power sigma at every copy.
         gaussian = analytic_beam.GaussianBeam(
             sigma=np.deg2rad(self.fwhm_deg) / 2 / np.sqrt(np.log(2)),
             sigma_type="efield",

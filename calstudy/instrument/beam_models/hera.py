@@ -13,7 +13,7 @@ FILES = {
     "fagnoni": ("hera_pspec", "hera_pspec/data/HERA_NF_efield.beamfits"),
     "nic-cst": ("pyuvsim", "pyuvsim/data/HERA_NicCST.beamfits"),
 }
-"""Distribution and file in it of each model."""
+"""Distribution of each model, and the file in it."""
 
 
 class HeraBeam(BeamModel):
@@ -21,8 +21,8 @@ class HeraBeam(BeamModel):
 
     `fagnoni` is tabulated every 4 MHz from 100 to 200 MHz, on HEALPix of nside 32 (in the package hera_pspec).
     `nic-cst` is tabulated every 15 MHz from 100 to 145 MHz, on a grid of one degree (in pyuvsim). Between these
-    frequencies either is a smooth fit; it cannot have the structure in delay that reflections in the dish make beyond
-    some 100 ns.
+    frequencies both are smooth fits, without the structure that reflections in the dish cause at delays beyond some
+    100 ns.
     """
 
     model: Literal["fagnoni", "nic-cst"] = "fagnoni"
@@ -39,14 +39,14 @@ class HeraBeam(BeamModel):
         return Path(str(distribution(distribution_name).locate_file(path)))
 
     def require_usable(self, channels: Channels) -> None:
-        """Read the file, and look whether its frequencies enclose the channels."""
+        """Read the file, and check that its frequencies enclose the channels."""
         from calstudy.instrument.beam_frequencies import choose_frequencies
         from calstudy.instrument.beam_grid import read_beamfits
 
         choose_frequencies(read_beamfits(self._file).freq_array, channels.band, self.interpolation)
 
     def make(self, channels: Channels) -> Beam:
-        """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
+        """Read and fit the table over a band slightly wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beam_grid import read_beamfits
         from calstudy.instrument.beams import GriddedBeam
         from calstudy.instrument.tabulated import TabulatedBeam, fit_table

@@ -10,7 +10,7 @@ class MwaAnalyticBeam(BeamModel):
     """An ideal 4 x 4 MWA tile: array factor of short dipoles over a ground screen, pointed at zenith."""
 
     def make(self, channels: Channels) -> Beam:
-        """Return the beam; it holds at any frequency."""
+        """Return the beam, which is valid at any frequency."""
         from calstudy.instrument.beams import ExactBeam, MwaTile
 
         del channels

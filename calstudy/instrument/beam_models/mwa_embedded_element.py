@@ -32,13 +32,13 @@ class MwaEmbeddedBeam(BeamModel):
         return self.interpolation == "chebyshev"
 
     def require_usable(self, channels: Channels) -> None:
-        """Look whether the frequencies of the file enclose the channels; the rest of it is not read."""
+        """Check that the frequencies of the file enclose the channels, without reading the rest of it."""
         from calstudy.instrument.beam_frequencies import choose_frequencies, mwa_frequencies
 
         choose_frequencies(mwa_frequencies(self.path), channels.band, self.interpolation)
 
     def make(self, channels: Channels) -> Beam:
-        """Read and fit the table over a band a bit wider than the channels'; it refuses frequencies outside."""
+        """Read and fit the table over a band slightly wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beams import GriddedBeam
         from calstudy.instrument.tabulated import mwa_embedded_element
 

@@ -10,7 +10,7 @@ class DipoleBeam(BeamModel):
     """A short dipole."""
 
     def make(self, channels: Channels) -> Beam:
-        """Return the beam; it holds at any frequency."""
+        """Return the beam, which is valid at any frequency."""
         from pyuvdata.analytic_beam import ShortDipoleBeam
 
         from calstudy.instrument.beams import ExactBeam

@@ -34,18 +34,12 @@ class FastestEngine(Engine):
     )
 
     def engines(self) -> list[Engine]:
-        """Return the engines that are tried, fastest first."""
+        """Return the engines in the order in which they are tried, fastest first."""
         precise = {} if self.precision == "auto" else {"precision": self.precision}
         return [DenseEngine(**precise), MatvisEngine(**precise), FftvisEngine(**precise), PyuvsimEngine()]
 
     def choose(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> Engine:
-        """Return the engine that will be used; raises InputError with the reasons of all engines if there is none.
-
-        Parameters
-        ----------
-        sky, beam, template
-            As for `simulate`.
-        """
+        """Return the fastest engine that supports a simulation, or raise InputError with the reasons of all engines."""
         reasons = []
         for engine in self.engines():
             reason = engine.refusal(sky, beam, template)
@@ -71,9 +65,9 @@ class FastestEngine(Engine):
     def interpolate(
         self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
     ) -> np.ndarray:
-        """Return the visibilities of that engine to a tolerance; see `Engine.interpolate`."""
+        """Return the visibilities of the fastest engine to a tolerance; see `Engine.interpolate`."""
         return self.choose(sky, beam, template).interpolate(sky, beam, template, accuracy)
 
     def cost(self, size: SimulationSize) -> Cost:
-        """Return the cost of the first engine, which handles the skies and beams of experiment files."""
+        """Return the cost of the first engine, which supports all skies and beams of experiment files."""
         return self.engines()[0].cost(size)

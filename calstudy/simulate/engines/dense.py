@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class DenseEngine(Engine):
     """Matrix products over patches of sources; unpolarized sky, xx and yy, any three-dimensional array.
 
-    With several beams the products take three times as long as with one, and each beam is evaluated. Of many antennas
+    With several beams the products take three times as long as with one, and each beam is evaluated. For many antennas
     without heights, single precision is computed by Fourier transforms.
     """
 
@@ -63,14 +63,14 @@ class DenseEngine(Engine):
         return visibilities(sky, beam, template, accuracy, dtype)
 
     def cost(self, size: SimulationSize) -> Cost:
-        """Return what a simulation takes; see `Engine.cost`."""
+        """Estimate the cost of a simulation; see `Engine.cost`."""
         single = self.precision == "single" or (self.precision == "auto" and size.tolerance >= SINGLE_PRECISION)
-        # Between two processors of 46 and 32 GFLOP/s in these products.
+        # The mean of two processors that compute these products at 46 and 32 GFLOP/s.
         products = (0.6 if single else 1.0) * (1.2e-9 * size.antennas + 1.05e-10 * size.antennas**2)
-        # Fields of several beams: products over both components, with one more factor to make.
+        # With several beams, products are over both components, and one more factor is computed.
         each = 2e-8 + products if size.beams == 1 else 3.5e-8 * size.beams + 3 * products
         seconds = 1.1 * size.sources / 2 * size.patch_slots * each
         if single and size.regular and size.beams == 1:
-            # Transforms, of larger patches.
+            # Fourier transforms use larger patches.
             seconds = min(seconds, 1.5e-7 * size.sources * size.slots)
         return Cost(seconds + 1.5e-6 * size.sources)

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 # fftvis treats an array flatter than this (m) as flat: at 200 MHz, a phase of 4e-12.
 FLATNESS = 1e-12
-# Numbers of xy and yx are below that of yy.
+# The polarization numbers of xy and yx are below that of yy.
 CROSS_HANDS = -6
 
 
 class FftvisEngine(Engine):
-    """fftvis with both feeds, and beams interpolated as pyuvsim does."""
+    """fftvis with both feeds, and beams interpolated in the same way as in pyuvsim."""
 
     precision: Literal["single", "double"] = Field(
         "double",
@@ -50,7 +50,7 @@ class FftvisEngine(Engine):
 
         require_rectangular(template)
         beams, index = arguments.beam_arguments(beam, template)
-        # One process and thread, for the caller shares out the work.
+        # One process and thread, because the caller distributes the work.
         visibilities = simulate_vis(
             **arguments.common_arguments(sky, template),
             fluxes=np.ascontiguousarray(stokes_i(sky, template.freq_array).T),
@@ -69,5 +69,5 @@ class FftvisEngine(Engine):
         return arguments.select_polarizations(visibilities.transpose(1, 4, 0, 3, 2), template).astype(np.complex128)
 
     def cost(self, size: SimulationSize) -> Cost:
-        """Return what a simulation takes; see `Engine.cost`."""
+        """Estimate the cost of a simulation; see `Engine.cost`."""
         return Cost(1.8e-5 * size.sources * size.slots)

@@ -22,7 +22,7 @@ BLOCK_MEMORY = 500_000_000
 
 
 class MatvisEngine(Engine):
-    """matvis on the processor, both feeds, with beams interpolated as pyuvsim does."""
+    """matvis on the CPU, both feeds, with beams interpolated in the same way as in pyuvsim."""
 
     precision: Literal["single", "double"] = Field(
         "double",

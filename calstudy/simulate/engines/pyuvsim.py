@@ -1,4 +1,4 @@
-"""pyuvsim: the paper's simulator, and the reference for the other engines.
+"""pyuvsim: the simulator of the paper, and the reference for the other engines.
 
 In a run that was started with ``mpiexec`` every rank computes its share of the visibilities; see
 `calstudy.base.ranks`.
@@ -60,7 +60,7 @@ class PyuvsimEngine(Engine):
         return cube.reshape(template.Ntimes, template.Nbls, template.Nfreqs, -1)[..., columns]
 
     def cost(self, size: SimulationSize) -> Cost:
-        """Return what a simulation takes in one process; see `Engine.cost`."""
+        """Estimate the cost of a simulation in one process; see `Engine.cost`."""
         return Cost(2.8e-8 * size.sources * size.slots * size.antennas**2 / 2)
 
 
@@ -69,9 +69,8 @@ def _visibilities(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a rank's share: indices of sample and channel, (N, 2), and visibilities, (N, Nproducts) complex128.
 
-    Antenna i of the telescope has the beam ``beams[index[i]]``.
-
-    `pyuvsim.run_uvdata_uvsim` prints, and installs an excepthook; this is its loop, and gives the same bits.
+    Antenna i of the telescope has the beam ``beams[index[i]]``. `pyuvsim.run_uvdata_uvsim` prints and installs an
+    excepthook; this is its loop, and gives the same bits.
     """
     from pyuvdata import BeamInterface
     from pyuvsim import BeamList
@@ -107,7 +106,7 @@ def _catalog(sky: SkyModel, frequencies: np.ndarray) -> SkyModelData:
     from astropy import units
     from pyuvsim.simsetup import SkyModelData
 
-    # The steps pyuvsim takes at the start of a parallel run, on a copy, for they are in place.
+    # These are pyuvsim's steps at the start of a parallel run. They are in place, so a copy is made.
     sky = sky.copy()
     without_frequency = sky.spectral_type == "flat" and sky.reference_frequency is None and sky.freq_array is None
     if sky.spectral_type not in ("flat", "full") or (sky.component_type == "healpix" and without_frequency):
@@ -118,6 +117,6 @@ def _catalog(sky: SkyModel, frequencies: np.ndarray) -> SkyModelData:
 
 
 def _share(tasks: range, rank: int, count: int) -> range:
-    """Return a rank's share: a contiguous piece, so that few ranks work on one time and evaluate its beam."""
+    """Return the share of a rank: a contiguous range, so that few ranks work on one time and evaluate its beam."""
     edges = np.linspace(0, len(tasks), count + 1).astype(int).tolist()
     return tasks[edges[rank] : edges[rank + 1]]

@@ -1,1 +1,1 @@
-"""What the steps of the validation ladder measure: one module each, with its parameters, what it reads, and how."""
+"""The measurements of the steps of the validation ladder, one in each module."""

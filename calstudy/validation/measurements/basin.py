@@ -1,8 +1,9 @@
-"""Step 2.2: how far away the solver finds the minimum from, and whether its status says when it does not.
+"""Step 2.2: the distance from which the solver finds the minimum, and whether its status is right if it does not.
 
 The true gains are g = (1 + sigma (n + i n')) exp(2 pi i (nu - nu_0) tau), n and n' normal in every channel and tau of
-each antenna uniform between 0 and the largest delay. Fits start from unity, and from what other `initial_gains` find.
-A fit has arrived where the misfit V - g_a g_b* F is not above that of a fit to the same data that starts at the truth.
+each antenna uniform between 0 and the largest delay. Fits start from unity, and from the results of other
+`initial_gains`. A fit has arrived if the misfit V - g_a g_b* F is not above that of a fit to the same data that starts
+at the true gains.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ if TYPE_CHECKING:
     from calstudy.calibrate.records import CalibrationResult
 
 ARRIVED = 1.1
-"""A fit has arrived if its misfit is below this times that of a fit from the truth."""
+"""A fit has arrived if its misfit is below this times that of a fit from the true gains."""
 LONG_CABLES = 0.4
-"""Gain errors per channel up to which a start that fits delays must bring cables of any length within reach."""
+"""Gain errors per channel up to which a start that fits delays must succeed for cables of any length."""
 COLUMNS = ("start", "gain error", "largest delay [s]", "status", "steps", "misfit over floor", "message")
 COLOURS = "cividis"
 LARGEST = 10.0
@@ -44,7 +45,7 @@ LARGEST = 10.0
 
 
 class Start(Section):
-    """Where fits start."""
+    """The start of the fits."""
 
     initial_gains: InitialGains = UnityStart()
     sky_model: bool = Field(True, description="Whether the fit has the foregrounds as its sky model.")
@@ -52,20 +53,11 @@ class Start(Section):
 
 @dataclass(frozen=True)
 class Basin:
-    """How fits ended, by where they started and what the true gains were.
+    """Results of the fits, by start and true gains.
 
-    Attributes
-    ----------
-    starts
-        Names of the starts, (Ns,).
-    gain_errors, delays
-        Standard deviation per channel (Ne,), and largest cable delay in s (Nd,), ascending.
-    misfit
-        rms of V - g_a g_b* F over that of a fit that starts at the truth, (Ns, Ne, Nd).
-    converged
-        Whether the status said so, (Ns, Ne, Nd).
-    arrived
-        A fit with a misfit below this has found the minimum.
+    `gain_errors` are standard deviations per channel (Ne,), and `delays` are the largest cable delays in s (Nd,), both
+    ascending. `misfit`, (Ns, Ne, Nd), is the rms of V - g_a g_b* F over that of a fit that starts at the true gains,
+    and `converged`, (Ns, Ne, Nd), is the status. A fit with a misfit below `arrived` has found the minimum.
     """
 
     starts: tuple[str, ...]
@@ -81,7 +73,7 @@ def _unity() -> dict[str, Start]:
 
 
 class BasinOfConvergence(SingleIntegrationMeasurement):
-    """How far from the truth a fit may start, and how often its status is false."""
+    """The distance from the true gains at which a fit may start, and the number of false statuses."""
 
     version: ClassVar[int] = 2
 
@@ -178,7 +170,7 @@ def _remarks(basin: Basin) -> tuple[str, ...]:
 
 @style.journal_style()
 def draw_basin(basin: Basin) -> Figure:
-    """Draw the misfit of each fit as colour and number, and what its status said as a symbol; one panel per start."""
+    """Draw the misfit of each fit as colour and number, and its status as a symbol, with one panel per start."""
     figure = style.new_figure(style.ONE_COLUMN if len(basin.starts) == 1 else style.TWO_COLUMNS, 3.0)
     panels = figure.subplots(1, len(basin.starts), sharey=True, squeeze=False)[0]
     for axes, name, misfit, converged in zip(panels, basin.starts, basin.misfit, basin.converged, strict=True):

@@ -1,6 +1,6 @@
-r"""Step 2.1: directions of gains and foregrounds that the data cannot see.
+"""Step 2.1: directions of gains and foregrounds to which the data are insensitive.
 
-Any of these exchanges leaves g_a g_b* F_ab, and so the likelihood, as it is:
+Each of these exchanges leaves g_a g_b* F_ab, and so the likelihood, unchanged:
 
 - *phase*: g_a -> g_a exp(i phi(nu)), any phase in every channel, the same for all antennas;
 - *scale*: g_a -> g_a sqrt(s), F -> F / s;
@@ -12,8 +12,8 @@ Two statements are measured, on noisy data:
 - at the true gains: the misfit V - g_a g_b* F with the best F of the basis is the same after the exchange (*exact*).
   For the smooth exchange the true foregrounds are those of a narrower basis, without the buffer;
 - the fit: started from gains moved along the direction, it ends at the same residual (*fitted*). Phase and scale are
-  fixed on purpose, so that R = V / (g_a g_b*) - F itself must be the same. Tilt and smooth exchanges are not, and R
-  carries their factor; there V - g_a g_b* F, R times the gains it was divided by, must be the same.
+  fixed by convention, so that R = V / (g_a g_b*) - F itself must be the same. Tilt and smooth exchanges are not fixed,
+  and R contains their factor; there V - g_a g_b* F, R times the gains by which it was divided, must be the same.
 
 Differences are rms over the rms of the data.
 """
@@ -34,7 +34,7 @@ from calstudy.validation.single_integration import SingleIntegration, SingleInte
 from calstudy.verdicts.criterion import Finding
 
 SMALLEST_TOLERANCE = 1e-13
-"""Tolerance of the solver: residuals are to agree to 1e-6 of the data, far below the noise."""
+"""Tolerance of the solver: residuals should agree to 1e-6 of the data, far below the noise."""
 SMOOTH_DELAY = 10e-9
 """Largest delay of a smooth exchange, s: inside the buffer of the basis."""
 
@@ -77,19 +77,7 @@ class Degeneracies(SingleIntegrationMeasurement):
 def residual(
     integration: SingleIntegration, kind: str, result: CalibrationResult, visibilities: np.ndarray
 ) -> np.ndarray:
-    """Return what an exchange must not change of a fit: R if its gauge is fixed, else V - g_a g_b* F.
-
-    Parameters
-    ----------
-    integration
-        What was calibrated.
-    kind
-        Of the exchange.
-    result
-        Of the calibration.
-    visibilities
-        Data, Jy, (Nbls, Nfreqs).
-    """
+    """Return the residual that an exchange must not change: R if its gauge is fixed, else V - g_a g_b* F."""
     if kind in ("phase", "scale"):
         return to_cube(result.residual)[0, :, :, 0]
     return integration.misfit(result, visibilities)
@@ -107,18 +95,9 @@ def narrow_model(integration: SingleIntegration) -> np.ndarray:
 
 
 def best_misfit(integration: SingleIntegration, visibilities: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Return V - g_a g_b* F with the F of the basis that fits best, (Nbls, Nfreqs).
+    """Return V - g_a g_b* F with the best-fitting F of the basis, (Nbls, Nfreqs), for gains (Nants, Nfreqs).
 
-    By plain least squares baseline by baseline, which shares nothing with the solvers.
-
-    Parameters
-    ----------
-    integration
-        Gives the basis.
-    visibilities
-        Data, Jy, (Nbls, Nfreqs).
-    gains
-        Complex, (Nants, Nfreqs).
+    It is solved by linear least squares for each baseline, independently of the solvers.
     """
     products = integration.products(gains)
     misfit = np.empty_like(visibilities)
@@ -145,7 +124,7 @@ def _tilt(integration: SingleIntegration, rng: np.random.Generator) -> np.ndarra
     telescope = integration.foregrounds.telescope
     rows = np.searchsorted(telescope.antenna_numbers, integration.numbers)
     east_north = telescope.get_enu_antpos()[rows, :2]
-    # Up to a turn across 100 m.
+    # At most one turn across 100 m.
     slope = rng.uniform(-1, 1, 2) * 2 * np.pi / 100
     return np.exp(1j * np.tile((east_north @ slope)[:, None], (1, integration.structure.n_frequencies)))
 
@@ -164,4 +143,4 @@ EXCHANGES: dict[str, Callable[[SingleIntegration, np.random.Generator], np.ndarr
     "tilt": _tilt,
     "smooth": _smooth,
 }
-"""Factors on the gains, (Nants, Nfreqs), drawn at random."""
+"""Random factors on the gains, (Nants, Nfreqs)."""

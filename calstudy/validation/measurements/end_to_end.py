@@ -1,9 +1,9 @@
-"""Step 4.0: whether the EoR is recovered bin by bin, from the sky to the power spectrum.
+"""Step 4.0: recovery of the EoR in each bin, from the sky to the power spectrum.
 
-Pulls (P^R - P^S) / sigma outside wedge and buffer, with two readings of sigma: the paper's error bar sigma_N + sigma_S,
-and the error of the difference, from which the sample variance that P^R and P^S share is gone
-(`calstudy.power.spectra.SphericalSpectrum.difference_error`). The second is the harder. P^R / P^S is told as it is, and
-without the flux scale s of the fit, by whose square P^R is divided.
+Pulls (P^R - P^S) / sigma outside wedge and buffer are computed with two definitions of sigma: the paper's error bar
+sigma_N + sigma_S, and the error of the difference, without the sample variance that P^R and P^S share
+(`calstudy.power.spectra.SphericalSpectrum.difference_error`). The second is the more severe. P^R / P^S is reported as
+it is, and without the flux scale s of the fit, by whose square P^R is divided.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from calstudy.verdicts.criterion import Finding
 
 SIGMAS = 2
 EXPECTED = 0.954
-"""Part of a normal distribution within two sigma."""
+"""Fraction of a normal distribution within two sigma."""
 
 
 class EndToEnd(Measurement):
-    """Of every experiment, the part of the bins with a pull within two sigma, for both readings."""
+    """The fraction of the bins of every experiment with a pull within two sigma, for both definitions of sigma."""
 
     k_min: Wavenumber = Field(0.0, description="Bins below are left out.")
 
@@ -37,7 +37,7 @@ class EndToEnd(Measurement):
         return {"spectra": spectra.spectra(graph), **({} if transfer is None else {"transfer": transfer})}
 
     def measure(self, inputs: Inputs) -> Findings:
-        """Compare the residual's spectrum with the EoR's."""
+        """Compare the spectrum of the residual with that of the EoR."""
         values, remarks = {}, []
         for name in inputs.experiments:
             residual, signal = (inputs.spherical(name, variant) for variant in ("residual", "eor"))

@@ -1,7 +1,7 @@
-r"""Step -1: simulation engines against pyuvsim, and against a closed form.
+"""Step -1: simulation engines compared with pyuvsim, and with a closed form.
 
 The closed form: one source of flux I at s, seen by dishes of power beam A, gives V_ab = A(s) I exp(2 pi i b.s / lambda)
-/ 2. With a Gaussian beam A is known, and s is that of astropy's own transformation to the horizon.
+/ 2. With a Gaussian beam A is known, and s is given by astropy's own transformation to the horizon.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ CANDIDATES = (
 FLUX = 3.0
 BEAM = GaussianBeam(kind="gaussian")
 OFFSETS = ((0.0, 0.0), (6.0, 20.0), (15.0, 200.0), (40.0, 310.0))
-"""Where the single source is: degrees from the zenith, azimuth in degrees (north through east)."""
+"""Directions of the single source: degrees from the zenith, azimuth in degrees (north through east)."""
 
 
 class Engines(Measurement):
@@ -59,7 +59,7 @@ class Engines(Measurement):
     times: int = Field(ge=1, description="Integrations, spread over the paper's.")
 
     def measure(self, inputs: Inputs) -> Findings:
-        """Run all engines on the same work, and on single sources."""
+        """Run all engines on the same simulation, and on single sources."""
         del inputs
         compared = [item for item in CANDIDATES if item[0] in self.engines]
         errors, closed = self.errors(compared), {item: closed_form_error(*item) for item in compared}
@@ -96,7 +96,7 @@ def _spread(length: int, count: int) -> np.ndarray:
 
 
 def closed_form_error(engine: str, precision: str) -> float:
-    """Return the largest difference of an engine's visibilities of single sources from A(s) I exp(2 pi i b.s) / 2."""
+    """Return the largest relative difference of visibilities of single sources from the closed form."""
     settings = InstrumentSettings.model_validate(
         {
             "layout": {"kind": "mwa-compact-minredundant", "count": 4},
@@ -133,7 +133,7 @@ def _closed_form(template: UVData, zenith_angle: float, azimuth: float) -> np.nd
         [np.sin(zenith_angle) * np.sin(azimuth), np.sin(zenith_angle) * np.cos(azimuth), np.cos(zenith_angle)]
     )
     turns = (baseline_vectors(template) @ direction)[:, None] * template.freq_array / speed_of_light
-    # The width of the power beam goes with the wavelength.
+    # The width of the power beam is proportional to the wavelength.
     width = np.radians(BEAM.fwhm_deg) * BEAM.reference_frequency / template.freq_array
     power = np.exp(-4 * np.log(2) * (zenith_angle / width) ** 2)
     return power * FLUX / 2 * np.exp(2j * np.pi * turns)

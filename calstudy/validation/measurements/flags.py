@@ -1,11 +1,11 @@
-"""Step 2.3: flagged samples: they must not matter, and those that are left must be calibrated without bias.
+"""Step 2.3: flagged samples must have no influence, and the others must be calibrated without bias.
 
-*influence*: the data are calibrated twice, with other values under the flags; the largest difference of any gain, model
-or residual is to be exactly zero.
+*influence*: the data are calibrated twice, with different values under the flags; the largest difference of any gain,
+model or residual must be exactly zero.
 
-*bias*: foregrounds and noise are calibrated for two realizations of the noise. What both residuals share is no
-noise: the mean of Re R_even* R_odd over unflagged samples, in units of its standard error (each baseline one sample),
-is what gain errors leave of the foregrounds.
+*bias*: foregrounds and noise are calibrated for two realizations of the noise. The part that both residuals share is
+not noise: the mean of Re R_even* R_odd over unflagged samples, in units of its standard error (each baseline one
+sample), is the residual of the foregrounds due to gain errors.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Flags(Measurement):
     integrations: int = Field(1, ge=1, description="How many are calibrated, the first ones.")
 
     def products(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the foregrounds, and them with gains and noise, both realizations."""
+        """Return the foregrounds alone, and with gains and noise in both realizations."""
         variant = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
         data = {parity: corruption.data(graph, variant, parity) for parity in PARITIES}
         return {"foregrounds": required(simulation.foregrounds(graph), "foregrounds"), **data}
@@ -84,17 +84,7 @@ def patterns(data: UVData) -> dict[str, np.ndarray]:
 
 
 def flagged(data: UVData, flags: np.ndarray, value: complex | None = None) -> UVData:
-    """Return a copy of data with these flags, and with `value` under them if it is given.
-
-    Parameters
-    ----------
-    data
-        Not changed.
-    flags
-        Bool, (Ntimes, Nbls, Nfreqs), added to those of the data.
-    value
-        Jy; None to keep the visibilities.
-    """
+    """Return a copy of data with additional flags, (Ntimes, Nbls, Nfreqs), and `value` (Jy) under them if given."""
     changed = data.copy()
     flag_cube(changed)[flags] = True
     if value is not None:

@@ -1,15 +1,15 @@
-r"""Step 0.1: a flat P(k) alone, through the beam, the simulation and the estimator.
+"""Step 0.1: a flat P(k) alone, through the beam, the simulation and the estimator.
 
-For a Gaussian sky each mode's power |V~(tau)|^2 is exponentially distributed about P: a window function does nothing to
-the mean of a flat spectrum, and no cut is made. Experiments (skies of other seeds, other arrays) are pooled.
+For a Gaussian sky each mode's power |V~(tau)|^2 is exponentially distributed about P. A window function does not change
+the mean of a flat spectrum, and no modes are cut. Experiments (skies of other seeds, other arrays) are pooled.
 
 - *normalization*: mean of P^ / P over all modes; its error from the scatter of baselines, each one sample.
 - *exponential*: Kolmogorov-Smirnov p-value of the modes about their own mean, by Monte Carlo with that mean fitted. Of
   correlated modes one is kept: delays further apart than the taper's correlation, baselines further apart than the
   beam's.
 - *imaginary*: the estimate of two *different* baselines of a redundant group is complex; mean of Im over mean of Re,
-  each pair in one order only, for the two orders are conjugates when there is no noise. Crossed with itself a baseline
-  has no imaginary part.
+  each pair in one order only, because the two orders are conjugates when there is no noise. A baseline crossed with
+  itself has no imaginary part.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ UNCORRELATED = 0.02
 DRAWS = 499
 LARGEST_SAMPLE = 20_000
 PAIRS = "pspec.h5"
-"""The spectra of all pairs of baselines, which the estimator of hera_pspec leaves with its product."""
+"""File with the spectra of all pairs of baselines, which the estimator of hera_pspec stores with its product."""
 
 
 class FlatSignal(Measurement):
@@ -53,7 +53,7 @@ class FlatSignal(Measurement):
         return {"eor": spectra.variant_power(graph, "eor", eor), "levels": corruption.levels(graph)}
 
     def measure(self, inputs: Inputs) -> Findings:
-        """Compare the modes of all experiments with what was put in."""
+        """Compare the modes of all experiments with the input."""
         normalizations, independent = [], []
         for name in inputs.experiments:
             if name == self.redundant:
@@ -79,7 +79,7 @@ class FlatSignal(Measurement):
 
 
 def thinned(power: np.ndarray, modes: DelaySpectra) -> np.ndarray:
-    """Return the powers (Nu, Nd) of modes of which no two correlate, flattened."""
+    """Return the powers of modes (Nu, Nd) of which no two are correlated, flattened."""
     correlation = mode_correlation(modes.taper, modes.delay.size)
     step = int(np.argmax(correlation < UNCORRELATED))
     # See `calstudy.power.errors`: powers of two baselines correlate by the square of the beam's own transform.

@@ -1,7 +1,7 @@
-r"""Step 1.0: foregrounds and EoR with perfect gains: outside the wedge there is the EoR alone.
+"""Step 1.0: foregrounds and EoR with perfect gains: outside the wedge there is only the EoR.
 
 Outside means |tau| > |b|/c + buffer, and beyond the taper's main lobe if that is wider. With foregrounds of power P^F
-there, P^{F+S} - P^S = P^F + 2 Re <F* S>: a floor, and a cross term without mean that scatters by sqrt(2 P^F P^S / N).
+there, P^{F+S} - P^S = P^F + 2 Re <F* S>: a floor, and a cross term of zero mean that scatters by sqrt(2 P^F P^S / N).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from calstudy.validation.measurement import Findings, Inputs, Measurement
 from calstudy.verdicts.criterion import Finding
 
 MAIN_LOBE = MAIN_LOBES["blackman-harris"]
-"""Half width of the main lobe of the widest taper that the estimator has, in units of 1 / bandwidth."""
+"""Half width of the main lobe of the estimator's widest taper, in units of 1 / bandwidth."""
 
 
 class Foregrounds(Measurement):
-    """P^{F+S} / P^S - 1 over all modes outside the wedge, the floor P^F / P^S, and what is beyond it."""
+    """P^{F+S} / P^S - 1 over all modes outside the wedge, the floor P^F / P^S, and the excess over it."""
 
     sections: ClassVar = ("power",)
 
@@ -46,7 +46,7 @@ class Foregrounds(Measurement):
         }
 
     def measure(self, inputs: Inputs) -> Findings:
-        """Compare the three spectra outside the wedge, all modes together and band by band."""
+        """Compare the three spectra outside the wedge, for all modes together and in bands."""
         name = inputs.only
         signal, floor, both = (inputs.delay_spectra(name, product) for product in ("eor", "foregrounds", "both"))
         outside = beyond_wedge(signal, inputs.power(name).wedge_buffer)
@@ -78,7 +78,7 @@ def beyond_wedge(signal: DelaySpectra, buffer: float) -> np.ndarray:
 
 
 def _over_signal(power: np.ndarray, signal: DelaySpectra, used: np.ndarray) -> Finding:
-    """Return the mean of `power` over the mean of the signal's over the modes used."""
+    """Return the mean of `power` over that of the signal, over the modes used."""
     level = float(signal.power.real[used].mean())
     found = clustered_mean(np.where(used, power, np.nan))
     return Finding(found.value / level, found.uncertainty / level)

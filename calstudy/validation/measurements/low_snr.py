@@ -19,14 +19,14 @@ from calstudy.verdicts.criterion import Finding
 SUPPRESSION = 100
 NOISE_SIGMAS = 2
 WIDTH = 2
-"""The reflections are looked for within this many standard deviations of their mean delay."""
+"""Reflections are searched for within this many standard deviations of their mean delay."""
 
 
 class LowSnr(Measurement):
-    """What is left of the artefact at the reflections' delays, outside the wedge.
+    """The remaining artefact at the reflections' delays, outside the wedge.
 
     With means over those bins, weighted by their inverse noise variance, *left* is |P^R| over the larger of P^V / 100
-    and 2 sigma of the noise: one or less is suppression by 100, or down to noise.
+    and 2 sigma of the noise: one or less is suppression by 100, or to the noise.
     """
 
     sections: ClassVar = ("corruption",)

@@ -1,15 +1,16 @@
-r"""Step 0.0: noise alone, whose power is known from its standard deviation.
+"""Step 0.0: noise alone, whose power follows from its standard deviation.
 
 For white noise of standard deviation sigma (Jy, complex) per integration, N_t integrations averaged, and a taper T, the
 noise power of one baseline is
 
     P_N = dnu sum_nu T^2 s^2 / sum_nu T^2 (Omega_pp / Omega_p^2) / (X^2 Y),   s = sigma / sqrt(N_t) in mK,
 
-which is the familiar X^2 Y Omega_eff T^2 dnu; X and Y are taken at the band's own channels. Even times odd have
-independent noise, so that Re and Im of their product have mean zero and standard deviation P_N / sqrt(2).
+which is the familiar X^2 Y Omega_eff T^2 dnu; X and Y are evaluated at the channels of the band. Even and odd
+data have independent noise, so that Re and Im of their product have mean zero and standard deviation
+P_N / sqrt(2).
 
-Baselines have independent noise. Means and mean squares of a baseline's delays are the samples, from whose scatter
-come the sampling errors: correlations between delays, and the products' long tails, are in it.
+Baselines have independent noise. Means and mean squares over a baseline's delays are the samples, from whose scatter
+the sampling errors are computed: these include correlations between delays and the long tails of the products.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from calstudy.verdicts.criterion import Finding
 
 
 class Noise(Measurement):
-    """The scatter of the estimates over the theory's, and the means of Re and Im in units of P_N."""
+    """The scatter of the estimates over that of theory, and the means of Re and Im in units of P_N."""
 
     sections: ClassVar = ("instrument", "power")
 
@@ -63,17 +64,7 @@ class Noise(Measurement):
 
 
 def noise_power(instrument: InstrumentSettings, power: PowerSettings, levels: Levels) -> float:
-    """Return P_N of one baseline in mK2 h-3 Mpc3, as in the module's text.
-
-    Parameters
-    ----------
-    instrument
-        Its channels, times, first polarization and beam.
-    power
-        Taper and cosmology.
-    levels
-        Gives sigma.
-    """
+    """Return P_N of one baseline and the first polarization in mK2 h-3 Mpc3; see the module."""
     channels = instrument.channels
     frequencies = channels.first + channels.width * np.arange(channels.count)
     omega_p, omega_pp = make_beam(instrument.beam, channels).solid_angles(frequencies, instrument.polarizations[0])

@@ -1,8 +1,8 @@
 """Step 2.0: noiseless data whose foregrounds lie in the basis: the product of gains and model must equal the data.
 
 The foregrounds are the simulated ones projected on the fit's basis, so that a perfect fit exists. In single precision
-the data are rounded to complex64, as stored data are, and the solver is the experiment's own; in double precision they
-are not, and the solver has the precision double as well, and goes on until its residual is rounding.
+the data are rounded to complex64, as stored data are, and the solver is that of the experiment. In double precision the
+data are not rounded, and the solver also has double precision and continues until its residual is at rounding.
 """
 
 from __future__ import annotations

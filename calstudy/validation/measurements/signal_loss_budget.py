@@ -1,20 +1,20 @@
-r"""Step 4.1: the signal-loss budget: what each stage takes from the EoR, per band of k.
+"""Step 4.1: the signal-loss budget: the part of the EoR that each stage removes, per band of k.
 
-The spectrum of the EoR alone is followed through the chain, each entry in units of what was put in:
+The spectrum of the EoR alone is followed through the chain, with each entry in units of the input:
 
 - *sky*: P_in - P of the middle integration by itself, without taper: this sky is a sample;
-- *averaging*: all integrations averaged as they are: fringes wash out;
-- *fringe-stop*: what stopping the fringes first gives back;
+- *averaging*: all integrations averaged without fringe stopping: fringes wash out;
+- *fringe-stop*: the gain from stopping the fringes first;
 - *taper*: the window instead of none;
-- *calibration*: what the fit absorbs: in place of the EoR, T s^2 of it, the response D of the residual
-  (`calstudy.power.transfer`) free of the flux scale s;
-- *flux-scale*: what the flux scale of the fit takes: T in place of T s^2;
+- *calibration*: absorption by the fit: the EoR is replaced by T s^2 of it, the response D of the residual
+  (`calstudy.power.transfer`) without the flux scale s;
+- *flux-scale*: the effect of the flux scale of the fit: T in place of T s^2;
 - *mask*: modes outside the wedge in place of all modes of the band;
-- *left*: what the residual holds when there is no EoR, noise and foregrounds, which is no signal but in P^R (negative).
+- *left*: the residual without EoR, noise and foregrounds, which is in P^R but is no signal (negative).
 
-The end-to-end loss is measured apart from these: P_in - P^R, from the residual of the whole chain. The sum must agree
-with it; the difference is the cross term of the EoR's response and what is left, whose mean is zero, and whose error
-comes from leaving out antennas (`calstudy.power.clusters`).
+The end-to-end loss is measured separately: P_in - P^R, from the residual of the whole chain. The sum must agree
+with it. The difference is the cross term of the EoR's response and the residual without EoR. Its mean is zero, and its
+error comes from leaving out antennas (`calstudy.power.clusters`).
 """
 
 from __future__ import annotations
@@ -47,18 +47,10 @@ STAGES = ("sky", "averaging", "fringe-stop", "taper", "calibration", "flux-scale
 
 @dataclass(frozen=True)
 class Band:
-    """The budget of one band of k, in units of P_in.
+    """The budget of one band of k (h/Mpc), in units of P_in.
 
-    Attributes
-    ----------
-    low, high
-        h/Mpc.
-    losses
-        What each of `STAGES` takes.
-    total
-        Their sum.
-    measured
-        1 - P^R / P_in, and the error of its difference from the sum.
+    `losses` are those of the `STAGES`, and `total` is their sum. `measured` is 1 - P^R / P_in, with the error of its
+    difference from the sum.
     """
 
     low: float
@@ -74,7 +66,7 @@ class Band:
 
 
 class SignalLossBudget(Measurement):
-    """The largest pull of any band of k, of every experiment."""
+    """The largest pull of any band of k, for every experiment."""
 
     sections: ClassVar = ("instrument", "power", "sky")
 
@@ -93,7 +85,7 @@ class SignalLossBudget(Measurement):
         }
 
     def measure(self, inputs: Inputs) -> Findings:
-        """Write the budgets to signal_loss_budget.csv."""
+        """Compute the budgets and write them to signal_loss_budget.csv."""
         values, remarks, rows = {}, [], []
         for name in inputs.experiments:
             bands = budget(inputs, name)
@@ -124,7 +116,7 @@ def budget(inputs: Inputs, name: str) -> list[Band]:
     settings = inputs.power(name)
     followed = [*_before_calibration(inputs, name), inputs.delay_spectra(name, "eor")]
     response, residual, left = (inputs.delay_spectra(name, product) for product in ("response", "residual", "left"))
-    # Of a flux scale that is not known, the share is told as loss.
+    # Without a known flux scale, its share is reported as loss of the calibration.
     scale = inputs.flux_scale(name) or 1.0
     outside = outside_wedge(response, settings.wedge_buffer)
     k = np.hypot(response.k_perp[:, None], response.k_parallel)
@@ -154,7 +146,7 @@ def budget(inputs: Inputs, name: str) -> list[Band]:
 
 
 def _mean(modes: DelaySpectra, used: np.ndarray, minus: Sequence[DelaySpectra] = ()) -> Finding:
-    """Return the mean power of the modes that are used, each once per pair, and its error by leaving out antennas."""
+    """Return the mean power of the chosen modes, each once per pair, and its error by leaving out antennas."""
     bins = np.where(used, 0, -1)
     clusters = Clusters.of(modes, bins, np.broadcast_to(np.arange(len(bins))[:, None], bins.shape), 1)
     power = clusters.powers(modes)

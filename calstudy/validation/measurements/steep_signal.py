@@ -1,11 +1,11 @@
-r"""Step 0.2: a steep P(k), which the taper's window mixes.
+"""Step 0.2: a steep P(k), which the taper's window mixes.
 
 A delay spectrum at tau estimates the mean of P over k_par, weighted with the window |T~(tau - tau')|^2 of the taper T:
 
     E P^(tau) = sum_tau' |T~(tau - tau')|^2 P(sqrt(k_perp^2 + k_par(tau')^2)) / sum_tau' |T~|^2,
 
-over the delays that the channels hold (the simulated sky has no others). The spread of k_perp by the beam is left out:
-beyond 0.3 h/Mpc it changes k in second order. Only baselines within the resolution of the map enter.
+over the delays that the channels represent (the simulated sky has no others). The spread of k_perp by the beam is
+neglected: beyond 0.3 h/Mpc it changes k only in second order. Only baselines within the resolution of the map are used.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from calstudy.verdicts.criterion import Finding
 FINE = 8
 """Points of the integral over delays per delay of the spectrum."""
 MARGIN = 60
-"""Multipoles by which the beam spreads a baseline's."""
+"""Multipoles by which the beam spreads those of a baseline."""
 BANDS = (0.3, 0.5, 1.0, np.inf)
 
 
 class SteepSignal(Measurement):
-    """The mean of P^ over its expectation beyond a wavenumber, all modes together and band by band."""
+    """The mean of P^ over its expectation beyond a wavenumber, for all modes together and in bands."""
 
     sections: ClassVar = ("power", "sky")
 
@@ -71,7 +71,7 @@ class SteepSignal(Measurement):
 
 
 def windowed(power: Callable[[np.ndarray], np.ndarray], modes: DelaySpectra) -> np.ndarray:
-    """Return the expected estimates of `power` (a function of k in h/Mpc), (Nu, Nd), as in the module's text."""
+    """Return the expected estimates of `power` (a function of k in h/Mpc), (Nu, Nd); see the module."""
     count = modes.delay.size
     # Columns run through the delays in the order of the spectrum, each divided into FINE.
     offsets = (np.arange(FINE) - (FINE - 1) / 2) / FINE
@@ -81,7 +81,7 @@ def windowed(power: Callable[[np.ndarray], np.ndarray], modes: DelaySpectra) -> 
     expected = np.zeros((len(modes.k_perp), count))
     for column, offset in enumerate(offsets):
         values = power(np.hypot(modes.k_perp[:, None], k_parallel[:, column]))
-        # A wave between two delays reaches the delay m of the transform with this weight.
+        # A wave between two delays contributes to delay m of the transform with this weight.
         waves = make_taper(modes.taper, count) * np.exp(2j * np.pi * offset * np.arange(count) / count)
         weights = np.abs(np.fft.fft(waves)) ** 2
         expected += np.fft.ifft(np.fft.fft(values, axis=1) * np.fft.fft(weights), axis=1).real / weights.sum()
