@@ -116,7 +116,7 @@ def with_errors(
 
 
 def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pairs of units that share signal, in both orders and with themselves, and their correlation."""
+    """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
     rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / constants.c.value) ** 2
     reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
     tree = cKDTree(spectra.vectors)
