@@ -15,7 +15,7 @@ from calstudy.base.units import Delay
 class _Shape(Section, ABC):
     @abstractmethod
     def components(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return functions of frequency (Hz), float64, (Nfreqs, Ncomponents); their summed squares have the band mean 1."""
+        """Return functions of frequency (Hz), float64, (Nfreqs, Ncomponents); their squares sum to a band mean of 1."""
 
 
 class Polynomial(_Shape):

@@ -36,7 +36,7 @@ class Given:
 
 
 def pieces_folder(output: Path, paths: Sequence[Path], content: Mapping[str, Any]) -> Path:
-    """Return the folder of the pieces, which depends on the settings (`content`, JSON types) and the state of the files."""
+    """Return the folder of the pieces, another one for other settings (`content`, JSON types) or changed files."""
     files = [[str(path.resolve()), path.stat().st_mtime_ns, path.stat().st_size] for path in paths]
     return output / f".unfinished-{digest_json({'version': __version__, 'files': files, **content})[:12]}"
 
