@@ -91,7 +91,7 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
 
 
 def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, colour: str) -> None:
-    """Draw one transfer function as points with 95 % bars at the centres of its bins, without bins that have no modes."""
+    """Draw one transfer function as points with 95 % bars at the centres of its bins, except empty ones."""
     known = np.isfinite(part.transfer)
     axes.errorbar(
         part.k[known],
