@@ -1,4 +1,4 @@
-"""How gains change during a run: factors exp(u + i v) of each antenna, with u and v processes in time.
+"""Changes of gains during a run: factors exp(u + i v) of each antenna, with u and v processes in time.
 
 u is the change of ln|g|, that is, the relative change of the amplitude while it is small, and v that of the phase.
 """
@@ -43,7 +43,7 @@ Channels = Annotated[
 
 
 class _Drift(Section, ABC):
-    """What all drifts have: two independent processes, of amplitude and phase, for every antenna and polarization."""
+    """Base of all drifts: independent processes of amplitude and phase for every antenna and polarization."""
 
     amplitude: float = Field(
         0.01,
@@ -63,14 +63,9 @@ class _Drift(Section, ABC):
     seed: int = Field(50, ge=0, description="Together with the seed of the effect.")
 
     def factors(self, observation: Observation, effect_seed: int) -> np.ndarray:
-        """Return what the gains are multiplied by, complex128, shape (Nants, Nfreqs or 1, Ntimes, Npols).
+        """Return the factors of the gains, complex128, shape (Nants, Nfreqs or 1, Ntimes, Npols).
 
-        Parameters
-        ----------
-        observation
-            Antennas, channels, times and polarizations.
-        effect_seed
-            Seed of the effect that drifts. Drifts of two effects are independent if either seed differs.
+        Drifts of two effects are independent if their seeds or the seeds of the effects differ.
         """
         # A list of seeds gives another stream than any single number does.
         random = np.random.default_rng([self.seed, effect_seed])
@@ -91,14 +86,8 @@ class _Drift(Section, ABC):
     def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return independent processes of unit amplitude, float64, (*shape, Ntimes).
 
-        Parameters
-        ----------
-        shape
-            Of the processes: (2, Nants, Nfreqs or Ncomponents or 1, Npols).
-        seconds
-            Of each integration after the first, (Ntimes,).
-        random
-            Where random numbers come from.
+        `shape` is (2, Nants, Nfreqs or Ncomponents or 1, Npols); `seconds`, (Ntimes,), is the time since the first
+        integration.
         """
 
 

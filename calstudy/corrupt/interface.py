@@ -1,4 +1,4 @@
-"""What an effect on the data is: it draws its truth, saved as a product of its own, and applies it to visibilities."""
+"""The interface of effects on the data: an effect draws its truth, which is saved, and applies it to visibilities."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ Truth = Mapping[str, np.ndarray]
 
 
 class Effect(Plugin, ABC):
-    """Something that happens to the data between the sky and the calibration.
+    """An effect on the data between the sky and the calibration.
 
     Fields of a subclass are its settings. One that draws random numbers declares ``seed: int``.
 
     Attributes
     ----------
     uses_positions
-        Whether anything depends on where antennas are. Its observation then has them where they are as built.
+        True if anything depends on the positions of antennas. The observation then has the positions as built.
 
     Notes
     -----
-    The `Observation` that `draw` and `apply` are given is without data: antennas, baselines, channels, times and
+    The `Observation` that `draw` and `apply` receive has no data: only antennas, baselines, channels, times and
     polarizations.
     """
 
@@ -47,39 +47,29 @@ class Effect(Plugin, ABC):
     kind: str = Field("", description="Name of an effect, or a file.py.")
 
     def refusal(self, size: Size) -> str | None:
-        """Return in one sentence why the effect cannot happen to data of this size, or None if it can.
+        """Return in one sentence why the effect cannot be applied to data of this size, or None if it can.
 
-        Asked by plans, before there are data. A sentence about a setting starts with its path and a colon, such as
-        ``count: must be ...``.
-
-        Parameters
-        ----------
-        size
-            Of the data.
+        Plans ask before there are data. A sentence about a setting starts with its path and a colon, such as ``count:
+        must be ...``.
         """
         del size
         return None
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
-        """Return what the effect draws or reads for this observation, as arrays of numbers by name; by default nothing.
+        """Return the truth that the effect draws or reads, as arrays of numbers by name; by default none.
 
-        Parameters
-        ----------
-        observation
-            See the notes of the class.
-        random
-            ``numpy.random.default_rng(seed)``.
+        `random` is ``numpy.random.default_rng(seed)``.
         """
         del observation, random
         return {}
 
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
-        """Return the visibilities after the effect, complex, of the same shape; by default as they are.
+        """Return the visibilities after the effect, complex, of the same shape; by default unchanged.
 
         Parameters
         ----------
         visibilities
-            Before it, complex128 in Jy, (Ntimes, Nbls, Nfreqs, Npols). May be changed in place.
+            Before the effect, complex128 in Jy, (Ntimes, Nbls, Nfreqs, Npols). May be changed in place.
         observation
             See the notes of the class.
         truth
@@ -89,31 +79,17 @@ class Effect(Plugin, ABC):
         return visibilities
 
     def flags(self, observation: Observation, truth: Truth) -> np.ndarray | None:
-        """Return which samples the effect flags, bool, of a shape that broadcasts with the visibilities; None: none.
-
-        Parameters
-        ----------
-        observation
-            See the notes of the class.
-        truth
-            From `draw`.
-        """
+        """Return the flagged samples, bool, of a shape that broadcasts with the visibilities, or None for none."""
         del observation, truth
         return None
 
     @property
     def can_flag(self) -> bool:
-        """Whether the effect has flags of its own."""
+        """True if the effect defines flags."""
         return type(self).flags is not Effect.flags
 
     def cost(self, size: Size) -> Cost:
-        """Return what `apply` takes besides a pass over the data; by default nothing.
-
-        Parameters
-        ----------
-        size
-            Of the data.
-        """
+        """Return the cost of `apply` besides a pass over the data; by default nothing."""
         del size
         return Cost(0.0, memory=0.0)
 
@@ -139,10 +115,7 @@ class GainEffect(Effect):
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return the gains, drift included, complex128, (Nants, Nfreqs, 1 or Ntimes, Npols), by the name "gains".
 
-        Raises
-        ------
-        InputError
-            If they are not an array of the right shape, or are zero or not finite somewhere.
+        Raise InputError if they are not an array of the right shape, or are zero or not finite somewhere.
         """
         gains = np.asarray(self.gains(observation, random))
         sizes = observation.n_antennas, observation.n_channels, observation.n_times, observation.n_polarizations
@@ -170,15 +143,7 @@ class GainEffect(Effect):
 
 
 def require_usable(effects: Sequence[Effect], size: Size) -> None:
-    """Raise InputError, with the effect's own sentence, if one of `corruption.effects` refuses data of a size.
-
-    Parameters
-    ----------
-    effects
-        All of them, in their order.
-    size
-        Of the data.
-    """
+    """Raise InputError, with the effect's own sentence, if one of `corruption.effects` refuses data of a size."""
     for place, effect in enumerate(effects):
         with guarded(effect):
             reason = effect.refusal(size)
@@ -192,10 +157,7 @@ def require_usable(effects: Sequence[Effect], size: Size) -> None:
 def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray]:
     """Return the truth of an effect for an observation, checked; the same settings and observation give the same bits.
 
-    Raises
-    ------
-    InputError
-        If the effect refuses, fails, or returns anything but arrays of numbers by name.
+    Raise InputError if the effect refuses, fails, or returns anything but arrays of numbers by name.
     """
     random = np.random.default_rng(getattr(effect, "seed", 0))
     with guarded(effect):
@@ -215,21 +177,8 @@ def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray
 def apply_effect(effect: Effect, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
     """Return visibilities after an effect, complex128, (Ntimes, Nbls, Nfreqs, Npols), checked.
 
-    Parameters
-    ----------
-    effect
-        Which.
-    visibilities
-        Before it, complex128 in Jy, (Ntimes, Nbls, Nfreqs, Npols). May be changed in place.
-    observation
-        See the notes of `Effect`.
-    truth
-        What the effect drew.
-
-    Raises
-    ------
-    InputError
-        If the effect refuses, fails, or returns visibilities of another shape or that are not finite.
+    The visibilities, complex128 in Jy, may be changed in place. Raise InputError if the effect refuses, fails, or
+    returns visibilities of another shape or that are not finite.
     """
     shape = visibilities.shape
     with guarded(effect):
@@ -244,21 +193,9 @@ def apply_effect(effect: Effect, visibilities: np.ndarray, observation: Observat
 
 
 def draw_flags(effect: Effect, observation: Observation, truth: Truth) -> np.ndarray | None:
-    """Return what an effect flags, bool, of a shape that broadcasts with the visibilities, checked; None for nothing.
+    """Return the flags of an effect, bool, of a shape that broadcasts with the visibilities, checked; None for none.
 
-    Parameters
-    ----------
-    effect
-        Which.
-    observation
-        See the notes of `Effect`.
-    truth
-        What the effect drew.
-
-    Raises
-    ------
-    InputError
-        If the effect fails, or returns flags of another type or shape.
+    Raise InputError if the effect fails, or returns flags of another type or shape.
     """
     with guarded(effect):
         flags = effect.flags(observation, truth)

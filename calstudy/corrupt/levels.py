@@ -1,4 +1,4 @@
-"""How strong the components of a measurement are, relative to one another."""
+"""Levels of the components of a measurement relative to one another."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Levels:
     foreground_rms, eor_rms
         rms of the visibilities as simulated, over baselines other than autocorrelations, times and channels.
     eor_factor
-        What the EoR visibilities are multiplied by.
+        Factor of the EoR visibilities.
     noise_std
         Standard deviation of the complex noise per baseline, channel, integration and realization; its rms over
         channels where they differ.
@@ -42,7 +42,7 @@ class Levels:
         return self.noise_std if self.noise_spectrum is None else np.array(self.noise_spectrum)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the amplitudes as plain JSON types, without those that there are not."""
+        """Return the amplitudes as plain JSON types, without absent ones."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -56,22 +56,12 @@ def set_levels(
 ) -> Levels:
     """Scale the EoR to `eor_level` below the foregrounds and the noise to its reference.
 
-    The paper's decibels are of brightness: -40 dB is a ratio of rms visibilities of 1e-4, so that the residuals'
-    -45 dB are -90 dB in the power spectrum. So rms of scaled EoR / rms of foregrounds = 10^(level / 10).
+    The paper's decibels are of brightness: -40 dB is a ratio of rms visibilities of 1e-4, so that the residuals' -45 dB
+    are -90 dB in the power spectrum. So rms of scaled EoR / rms of foregrounds = 10^(level / 10).
 
-    Parameters
-    ----------
-    foreground_rms, eor_rms
-        Of the simulated visibilities, Jy.
-    settings
-        Level of the EoR and factor of the noise.
-    radiometer
-        Standard deviation of radiometer noise, Jy, (Nfreqs, Npols) (`calstudy.corrupt.noise.radiometer_std`).
-
-    Raises
-    ------
-    InputError
-        If a component that must be scaled, or scaled to, is zero.
+    The rms of the simulated visibilities and the standard deviation of radiometer noise, (Nfreqs, Npols)
+    (`calstudy.corrupt.noise.radiometer_std`), are in Jy. Raise InputError if a component that must be scaled, or scaled
+    to, is zero.
     """
     if eor_rms <= 0:
         raise InputError("sky.eor: its visibilities are all zero")

@@ -19,12 +19,7 @@ AUTOCORRELATIONS = 1
 def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np.ndarray:
     """Return the standard deviation of the complex noise, V_aa / sqrt(width integration nights), Jy, (Nfreqs, Npols).
 
-    Parameters
-    ----------
-    noise
-        Temperatures, effective area and nights.
-    instrument
-        Its channels, integrations and polarizations, and the beam where it gives the effective area.
+    The beam of the instrument gives the effective area where the noise settings do not.
     """
     from calstudy.instrument.beams import make_beam
 
@@ -41,17 +36,10 @@ def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np
 
 
 def thermal_noise(shape: tuple[int, ...], std: float | np.ndarray, seed: int) -> np.ndarray:
-    """Draw circular complex Gaussian noise with E|n|^2 = std^2, independent in every sample.
+    """Draw circular complex Gaussian noise with E|n|^2 = std^2, independent in every sample, complex128.
 
-    Parameters
-    ----------
-    shape
-        Of the returned complex128 array.
-    std
-        Standard deviation of the complex samples, a number or an array that broadcasts with the shape; each of the
-        real and imaginary parts has std / sqrt(2).
-    seed
-        Same seed and shape, same noise.
+    `std` is a number or an array that broadcasts with the shape; the real and the imaginary part have std / sqrt(2)
+    each. The same seed and shape give the same noise.
     """
     rng = np.random.default_rng(seed)
     noise = np.empty(shape, dtype=np.complex128)
@@ -65,18 +53,9 @@ def autocorrelations(shape: tuple[int, ...], std: float | np.ndarray, samples: f
     """Draw autocorrelations of antennas whose cross-correlations have noise, before any gains, float64, Jy.
 
     By the radiometer equation noise of E|n|^2 = std^2 comes from autocorrelations of std sqrt(samples), sky and
-    receiver together, whose own noise has the standard deviation std.
-
-    Parameters
-    ----------
-    shape
-        Of the returned array.
-    std
-        Standard deviation of the complex noise of cross-correlations, a number or an array that broadcasts.
-    samples
-        Channel width times the time that is averaged.
-    seed
-        Same seed and shape, same autocorrelations; independent of `thermal_noise` of this seed.
+    receiver together, whose own noise has the standard deviation std. `std` is a number or an array that broadcasts;
+    `samples` is the channel width times the averaged time. The same seed and shape give the same autocorrelations,
+    independent of `thermal_noise` of this seed.
     """
     rng = np.random.default_rng([seed, AUTOCORRELATIONS])
     return np.asarray(std * (np.sqrt(samples) + rng.standard_normal(shape)))

@@ -77,7 +77,7 @@ EFFECTS = Effect.registry
 
 
 class CorruptionSettings(Section):
-    """How the simulated components are scaled, added up and changed on the way to the measurement.
+    """Scaling, sum and corruption of the simulated components.
 
     Noise is added to the sum of foregrounds and EoR before the effects, so that it is multiplied by gains like them, as
     in the paper.
@@ -127,7 +127,7 @@ class CorruptionSettings(Section):
 
 
 def _as_effects(gains: Any) -> str:
-    """Return how a block of the former field `corruption.gains` is written as a list of effects."""
+    """Return a block of the former field `corruption.gains` written as a list of effects."""
     block = {"kind": gains} if isinstance(gains, str) else dict(gains) if isinstance(gains, Mapping) else {}
     kind = block.pop("kind", "per-channel")
     if kind == "unity":

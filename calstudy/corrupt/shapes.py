@@ -15,13 +15,7 @@ from calstudy.base.units import Delay
 class _Shape(Section, ABC):
     @abstractmethod
     def components(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return functions of frequency, float64, (Nfreqs, Ncomponents), whose squares add up to 1 in the band's mean.
-
-        Parameters
-        ----------
-        frequencies
-            Channel centres, Hz, (Nfreqs,).
-        """
+        """Return functions of frequency (Hz), float64, (Nfreqs, Ncomponents); their squares sum to a band mean of 1."""
 
 
 class Polynomial(_Shape):

@@ -1,4 +1,4 @@
-"""The power that antennas receive: temperatures of sky and receiver, and the autocorrelations that they make."""
+"""The power that antennas receive: temperatures of sky and receiver, and the resulting autocorrelations."""
 
 from __future__ import annotations
 
@@ -31,12 +31,8 @@ class SystemTemperature(Section):
     def autocorrelations(self, frequencies: np.ndarray, effective_area: float | np.ndarray) -> np.ndarray:
         """Return V_aa = k T / A_e in Jy, (Nfreqs,), in the convention V_xx = 1/2 int A I of the simulation.
 
-        Parameters
-        ----------
-        frequencies
-            Channel centres, Hz, (Nfreqs,).
-        effective_area
-            Of an antenna, m2, a number or (Nfreqs,).
+        Frequencies are channel centres, Hz, (Nfreqs,); the effective area of an antenna is in m2, a number or
+        (Nfreqs,).
         """
         return BOLTZMANN * self.kelvin(frequencies) / effective_area / WATTS_PER_JANSKY
 
@@ -57,13 +53,5 @@ class Autocorrelations(SystemTemperature):
 
 
 def effective_area(frequencies: np.ndarray, omega_p: np.ndarray) -> np.ndarray:
-    """Return A_e = lambda^2 / Omega_p of a beam without losses, m2, (Nfreqs,).
-
-    Parameters
-    ----------
-    frequencies
-        Channel centres, Hz, (Nfreqs,).
-    omega_p
-        Solid angle of the power beam, sr, (Nfreqs,).
-    """
+    """Return A_e = lambda^2 / Omega_p of a beam without losses, m2, from Hz and the solid angle of its power, sr."""
     return (SPEED_OF_LIGHT / frequencies) ** 2 / omega_p

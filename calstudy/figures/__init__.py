@@ -1,7 +1,7 @@
-"""Figures of studies: one module each, with its caption, what it needs, how it is drawn, and its tolerances.
+"""Figures of studies: one module each, with its caption, its inputs, its drawing, and its tolerances.
 
-A `StudyFigure` declares all that the rest of the package must know of it. Its name is that of its module; a user's own
-is named by the path of its file in ``outputs.figures``.
+A `StudyFigure` declares all that the rest of the package needs to know about it. Its name is that of its module; a
+user's own figure is named by the path of its file in ``outputs.figures``.
 """
 
 from __future__ import annotations
@@ -54,16 +54,16 @@ class StudyFigure(Plugin):
     variants
         Names of the variants of the data that it requires.
     needs_calibration
-        Whether `residual` must be calibrated data with foregrounds and effects.
+        True if `residual` must be calibrated data with foregrounds and effects.
     needs_signal_loss
-        Whether the experiment must calibrate data with the EoR and without.
+        True if the experiment must calibrate data with the EoR and without.
     needs_least_squares
-        Whether the calibrator must be one that fits by least squares: it is repeated, or its tangent space needed.
+        True if the calibrator must fit by least squares: it is repeated, or its tangent space is needed.
     shows_sky
-        Whether a stand-in for sky, beam or scale enters it, and so is printed on it.
+        True if a stand-in for sky, beam or scale enters it, and so is printed on it.
     tolerances
-        How far its arrays may be from a reference: pairs of a pattern of array names and a tolerance, the first that
-        matches counts (`calstudy.verdicts.tolerances`).
+        Allowed differences of its arrays from a reference: pairs of a pattern of array names and a tolerance, of which
+        the first that matches counts (`calstudy.verdicts.tolerances`).
     """
 
     registry: ClassVar = FIGURES
@@ -100,7 +100,7 @@ class StudyFigure(Plugin):
         """Return the products that the figure shows, by names of its own."""
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return what it needs to know of the experiment besides: sections and JSON-able values."""
+        """Return further settings that the figure takes from the experiment: sections and JSON-able values."""
         del graph
         return {}
 
@@ -111,8 +111,8 @@ class StudyFigure(Plugin):
         Parameters
         ----------
         job
-            Its `inputs` are folders of products; its `settings` what `settings` returned, and ``notes``: the stand-ins
-            to print.
+            Its `inputs` are folders of products; its `settings` are those of the method `settings`, and ``notes``: the
+            stand-ins to print.
         """
 
 
@@ -122,21 +122,15 @@ class ComparisonFigure(StudyFigure):
     Attributes
     ----------
     titles
-        The roles that are compared, from left to right, and how each is headed; empty: all members, by their names in
-        place of roles. Its `draw` finds the product ``name`` of a member's `inputs` under ``name:role`` in
-        ``job.inputs``, and its layout in ``job.settings["layouts"]``.
+        The roles that are compared, from left to right, and their headings; empty: all members, by their names in place
+        of roles. Its `draw` finds the product ``name`` of a member's `inputs` under ``name:role`` in ``job.inputs``,
+        and its layout in ``job.settings["layouts"]``.
     """
 
     titles: ClassVar[Mapping[str, str]] = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
 
     def roles(self, played: Collection[str]) -> Sequence[str]:
-        """Return the roles that it compares in a collection: by default all of `titles`, played or not.
-
-        Parameters
-        ----------
-        played
-            The roles that members of the collection play.
-        """
+        """Return the roles that the figure compares, given those played by members: by default all of `titles`."""
         del played
         return tuple(self.titles)
 
@@ -151,7 +145,7 @@ class ComparisonFigure(StudyFigure):
         return {"spectra": spectra(graph)}
 
     def member_settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return what `draw` finds of one member in ``job.settings["members"]``, by role; by default nothing."""
+        """Return the entry of one member in ``job.settings["members"]``, by role; by default nothing."""
         del graph
         return {}
 
@@ -162,7 +156,7 @@ class CasesFigure(StudyFigure):
     Attributes
     ----------
     scores
-        Which scores it shows, and saves as its arrays: those in ``bands`` of k, or in the experiment's ``bins``.
+        The scores that it shows, and saves as its arrays: those in ``bands`` of k, or in the experiment's ``bins``.
     """
 
     scores: ClassVar[Literal["bands", "bins"]] = "bands"
@@ -203,13 +197,7 @@ class CasesFigure(StudyFigure):
 
 
 class ObservedFigure(StudyFigure):
-    """A figure of measured data.
-
-    Attributes
-    ----------
-    needs_injection
-        Whether a signal must be injected.
-    """
+    """A figure of measured data; `needs_injection` is true if a signal must be injected."""
 
     needs_injection: ClassVar[bool] = False
 
@@ -218,7 +206,7 @@ class ObservedFigure(StudyFigure):
         return "shows measured data, and cannot be drawn of an experiment"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: there is no experiment that it could show."""
+        """Return nothing: there is no experiment to show."""
         del graph
         return {}
 
@@ -228,17 +216,14 @@ class ObservedFigure(StudyFigure):
 
 
 def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:
-    """Return the figures that an experiment asks for; their registry lets no other plug-ins in."""
+    """Return the figures of an experiment; their registry accepts no other plug-ins."""
     return cast(tuple[StudyFigure, ...], experiment.outputs.figures)
 
 
 def draw(job: Job) -> Mapping[str, Any]:
     """Write one figure as png and pdf, and its arrays as npz.
 
-    Raises
-    ------
-    InputError
-        If a user's figure fails, or returns anything but a drawing with plain arrays.
+    Raise InputError if a user's figure fails, or returns anything but a drawing with plain arrays.
     """
     from matplotlib.figure import Figure
 
@@ -261,16 +246,10 @@ DRAW = Stage(name="figure", version=4, make=draw, cost=lambda task: Cost(3, disk
 
 
 def comparison_task(graphs: Mapping[str, Graph], figure: ComparisonFigure, stand_ins: Sequence[str]) -> Task:
-    """Return the task that draws one figure of a collection; `graphs` are those of the members, by role.
+    """Return the task that draws one figure of a collection.
 
-    Parameters
-    ----------
-    graphs
-        Of the members, by the role that they play; by name, for a figure of all members.
-    figure
-        Which.
-    stand_ins
-        To be printed on it, if it shows the sky.
+    `graphs` are those of the members, by role, or by name for a figure of all members. `stand_ins` are printed on the
+    figure if it shows the sky.
     """
     settings: dict[str, Any] = {"layouts": {role: graph.experiment.instrument.layout for role, graph in graphs.items()}}
     with guarded(figure):
@@ -284,17 +263,7 @@ def comparison_task(graphs: Mapping[str, Graph], figure: ComparisonFigure, stand
 
 
 def figure_task(graph: Graph, figure: StudyFigure, stand_ins: Sequence[str]) -> Task:
-    """Return the task that draws one figure of an experiment.
-
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    figure
-        Which.
-    stand_ins
-        To be printed on it, if it shows the sky.
-    """
+    """Return the task that draws one figure of an experiment, with the stand-ins printed on it if it shows the sky."""
     with guarded(figure):
         return _task(figure, stand_ins, figure.settings(graph), figure.inputs(graph))
 
@@ -311,16 +280,8 @@ def cases_task(
 ) -> Task:
     """Return the task that draws one figure of a comparison.
 
-    Parameters
-    ----------
-    figure
-        Which.
-    graphs
-        Of all cases, by `calstudy.products.comparison.case_name`.
-    labels
-        Of the calibrators and the worlds.
-    stand_ins
-        To be printed on it, if it shows the sky.
+    `graphs` are those of all cases, by `calstudy.products.comparison.case_name`; `labels` those of the calibrators and
+    the worlds. `stand_ins` are printed on the figure if it shows the sky.
     """
     with guarded(figure):
         inputs = {name: figure.inputs(graph)["score"] for name, graph in graphs.items()}
@@ -328,17 +289,7 @@ def cases_task(
 
 
 def observed_task(figure: ObservedFigure, graph: ObservedGraph, stand_ins: Sequence[str]) -> Task:
-    """Return the task that draws one figure of measured data.
-
-    Parameters
-    ----------
-    figure
-        Which.
-    graph
-        Of the study.
-    stand_ins
-        To be printed on it, if it shows the sky.
-    """
+    """Return the task that draws one figure of measured data, with the stand-ins printed on it if it shows the sky."""
     with guarded(figure):
         inputs = figure.observed_inputs(graph)
     return _task(figure, stand_ins, {"wedge_buffer": graph.power.wedge_buffer}, inputs)

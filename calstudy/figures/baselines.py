@@ -31,8 +31,6 @@ class BaselineSpectra:
 
     Attributes
     ----------
-    antennas
-        The two antenna numbers.
     baseline_length
         |b| in m.
     delay
@@ -43,8 +41,6 @@ class BaselineSpectra:
         Fitted foregrounds times gains, ĝ_a ĝ_b* F̂.
     residual
         Calibrated residuals R.
-    noise
-        Thermal noise.
     uncorrupted
         Visibilities S+F+N without gain errors, if they are to be drawn.
     """
@@ -70,12 +66,9 @@ LINES: dict[str, tuple[str, dict[str, Any]]] = {
 
 @style.journal_style()
 def draw_baselines(baselines: Sequence[BaselineSpectra], stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw one panel per baseline on common axes, with the edges of the wedge; one baseline fills one column.
+    """Draw one panel per baseline, at least one, on common axes, with the edges of the wedge.
 
-    Raises
-    ------
-    ValueError
-        If there is no baseline.
+    A single baseline fills one column.
     """
     if not baselines:
         raise ValueError("a figure of baselines needs at least one baseline")
@@ -111,22 +104,13 @@ def _draw_baseline(axes: Axes, spectra: BaselineSpectra) -> None:
 
 
 SHOWN_BASELINES = 4
-"""Baselines in the figure, where the experiment names none."""
+"""Number of baselines in the figure where the experiment names none."""
 
 
 def rms_over_time(spectra: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """Return the rms over integrations of the Blackman-Harris delay transforms of spectra.
+    """Return the rms over integrations of the Blackman-Harris delay transforms, real, (..., Ndelays), Jy Hz.
 
-    Parameters
-    ----------
-    spectra
-        Visibilities in Jy, (..., Ntimes, Nfreqs).
-    frequency
-        Channel centres, Hz, (Nfreqs,).
-
-    Returns
-    -------
-    Real, (..., Ndelays), Jy Hz.
+    Spectra are visibilities in Jy, (..., Ntimes, Nfreqs); frequencies are channel centres in Hz, (Nfreqs,).
     """
     return np.sqrt(np.mean(np.abs(delay_transform(spectra, frequency, TAPER)) ** 2, axis=-2))
 
@@ -151,7 +135,7 @@ class Baselines(StudyFigure):
         return {"calibration": inspected_calibration(graph)["calibration"], **inputs}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return which baselines are shown."""
+        """Return the shown baselines."""
         pairs = graph.experiment.outputs.inspect.baselines
         shown = None if pairs is None else [list(pair) for pair in pairs]
         return {"layout": graph.experiment.instrument.layout, "baselines": shown}

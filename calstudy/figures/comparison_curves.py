@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LINEAR = 0.01
-"""The axis of the bias is linear up to this, and logarithmic beyond."""
+"""Upper end of the linear part of the axis of the bias."""
 LABEL_WIDTH = 9
 
 
@@ -29,16 +29,7 @@ def draw_curves(
 ) -> Figure:
     """Draw T above and the bias below for each band of k, calibrators from left to right, with 95 % bars.
 
-    It is meant for calibrators that are values of one setting, in order.
-
-    Parameters
-    ----------
-    cases
-        By world and calibrator.
-    calibrators
-        Their labels, in order.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    The calibrators are values of one setting, in order. `cases` are by world and calibrator.
     """
     from matplotlib.lines import Line2D
 

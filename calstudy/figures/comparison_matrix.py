@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LIMITS, COLOURS = (1e-2, 1e2), "YlOrRd"
-"""Of the bias, and the scale of colours between them."""
+"""Limits of the bias, and the scale of colours between them."""
 DARK = 10.0
-"""Above this bias the text is white."""
+"""Bias above which the text is white."""
 ROW_HEIGHT, HEADING_HEIGHT = 0.3, 0.45
 LABELS_WIDTH = 72
-"""Characters that fit below the matrix."""
+"""Number of characters that fit below the matrix."""
 LARGE_ERROR = 0.1
-"""T with a larger standard deviation is not written with two decimals alone, which would look exact."""
+"""Largest standard deviation of T that is written with two decimals alone; a larger one would make it look exact."""
 ABSURD = 10.0
-"""T of this size is that of gains that are no solution; its order of magnitude is enough."""
+"""T from which on gains are no solution, and only its order of magnitude is written."""
 ROOM_FOR_ERROR = 8
-"""Worlds side by side in whose cells T fits with its error; with more, it has one decimal."""
+"""Largest number of worlds side by side in whose cells T fits with its error; with more, it has one decimal."""
 
 
 @style.journal_style()
@@ -41,17 +41,8 @@ def draw_matrix(
 ) -> Figure:
     """Draw a matrix for each band of k: worlds from left to right, calibrators from top to bottom.
 
-    The colour is the bias. Of a bias within two standard deviations of zero, the 95 % upper limit is written and
-    coloured.
-
-    Parameters
-    ----------
-    cases
-        By world and calibrator.
-    calibrators
-        Their labels, in order; a case without scores is left white, and says so.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    The colour is the bias. For a bias within two standard deviations of zero, the 95 % upper limit is written and
+    coloured. `cases` are by world and calibrator; a case without scores is left white and labelled.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
@@ -74,7 +65,7 @@ def draw_matrix(
 
 
 def _name_worlds(axes: Axes, worlds: Sequence[str]) -> None:
-    """Write the labels of the columns, in several lines or, if words are wider than a column, aslant."""
+    """Write the labels of the columns, in several lines or, if words are wider than a column, slanted."""
     width = LABELS_WIDTH // len(worlds)
     if max(len(word) for world in worlds for word in world.split()) <= width:
         axes.set_xticks(range(len(worlds)), [textwrap.fill(world, width) for world in worlds])
@@ -116,7 +107,7 @@ def _draw_band(
 
 
 def _bias(bias: float, error: float) -> tuple[float, str]:
-    """Return the size that is coloured, the bias or its upper limit, and what is written."""
+    """Return the size that is coloured, the bias or its upper limit, and the text."""
     if np.isfinite(error) and abs(bias) < SIGMAS * error:
         limit = upper_limit(bias, error)
         return limit, f"bias < {_digits(limit)}"

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 LINEAR = {"recovered": 1.0, "bias": 0.1}
-"""An axis is linear up to this, and logarithmic beyond where there is more."""
+"""Upper end of the linear part of an axis; larger values make it logarithmic beyond."""
 REFERENCE = {"recovered": 1.0, "bias": 0.0}
-"""Where a line is drawn: all of the EoR, no bias."""
+"""Position of the line: all of the EoR, no bias."""
 DECADES = {"recovered": 1.5, "bias": 0.7}
 """Length of the linear part of a logarithmic axis, in decades."""
 ROW_HEIGHT, LARGEST_K = 1.7, 1.0
@@ -34,7 +34,7 @@ def look(place: int) -> dict[str, Any]:
     again, place = divmod(place, len(COLOURS))
     return {
         "color": COLOURS[place],
-        # A colour that comes again has another marker.
+        # A repeated colour has another marker.
         "marker": MARKERS[(place + 3 * again) % len(MARKERS)],
         "linestyle": lines[again % len(lines)],
     }
@@ -46,14 +46,7 @@ def draw_spectra(
 ) -> Figure:
     """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, outside the wedge, with 95 % bars.
 
-    Parameters
-    ----------
-    cases
-        By world and calibrator.
-    calibrators
-        Their labels, in order.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    `cases` are by world and calibrator.
     """
     from matplotlib.lines import Line2D
 
@@ -96,7 +89,7 @@ def _used(case: Case, name: str) -> np.ndarray:
 def _scale(axes: Axes, name: str, cases: Iterable[Case]) -> None:
     """Make an axis logarithmic where its values are large, with limits just beyond them, zero and the reference.
 
-    Bars may reach beyond the limits: those of what is known worst would make the rest too small to read.
+    Bars may reach beyond the limits: the largest ones would make the other points too small to read.
     """
     values = np.concatenate([getattr(case.bins, name)[_used(case, name)] for case in cases])
     if not values.size:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BANDS = 2
-"""The bands of k that are drawn, from the lowest: next to the wedge, and beyond."""
+"""Number of drawn bands of k, from the lowest: next to the wedge, and beyond."""
 COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.MAGENTA, style.RED)
 MARKERS = ("o", "s", "^", "D", "v")
 ROW_HEIGHT, HEADING_HEIGHT = 0.21, 0.45
@@ -47,17 +47,9 @@ def draw_variants(
 ) -> Figure:
     """Draw a panel for each kind of world and band of k: calibrators from top to bottom, the bias from left to right.
 
-    Colours are variants of calibrators, symbols those of worlds. Open symbols are 95 % upper limits of a bias that is
-    within two standard deviations of zero; crosses are cases of which most solves stalled or failed.
-
-    Parameters
-    ----------
-    cases
-        By world and calibrator.
-    calibrators
-        Their labels, in order. As in those of worlds, what follows the last comma names the variant.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    Colours are variants of calibrators, symbols those of worlds: the text after the last comma of a label names the
+    variant. Open symbols are 95 % upper limits of a bias that is within two standard deviations of zero; crosses are
+    cases of which most solves stalled or failed. `cases` are by world and calibrator.
     """
     from matplotlib.lines import Line2D
 
@@ -98,7 +90,7 @@ def _drawn(labels: Mapping[str, str], worlds: Sequence[Mapping[str, Case]]) -> b
 
 
 def _stalled(case: Case) -> bool:
-    """Whether most solves of a case stalled or failed."""
+    """Return True if most solves of a case stalled or failed."""
     counts = case.summary["by_status"]
     return 2 * (counts.get("stalled", 0) + counts.get("failed", 0)) > sum(counts.values())
 

@@ -1,4 +1,4 @@
-"""The bias of the residual power against the steps that a solver took."""
+"""The bias of the residual power against the steps of a solver."""
 
 from __future__ import annotations
 
@@ -36,12 +36,10 @@ TOTAL = r"$P^{R}/P^{S}$, EoR in the data"
 
 @dataclass(frozen=True)
 class ConvergencePath:
-    """What even and odd residuals have in common after so many steps of a solver, over the power of the EoR.
+    """Power common to even and odd residuals after a number of steps of a solver, over the power of the EoR.
 
     Attributes
     ----------
-    solver
-        Its name.
     steps
         (Ncheckpoints,) ascending.
     bias, bias_error
@@ -49,7 +47,7 @@ class ConvergencePath:
     with_eor, with_eor_error
         The same with EoR in the data.
     predicted
-        The power that the solver's own distance from the minimum allows for, (Ncheckpoints,).
+        The power that corresponds to the solver's own distance from the minimum, (Ncheckpoints,).
     """
 
     solver: str
@@ -65,24 +63,10 @@ class ConvergencePath:
 def draw_convergence(
     paths: Sequence[ConvergencePath], integrations: Sequence[int], stand_ins: Sequence[str] = ()
 ) -> Figure:
-    """Draw the bias without EoR on the left, and with EoR on the right, against steps.
+    """Draw the bias without EoR on the left, and with EoR on the right, against steps, of one to five solvers.
 
-    Bars are 95 % (1.96 sigma, leaving out one antenna after the other); open markers are negative. Dashes are what the
-    solver predicts from where it stopped.
-
-    Parameters
-    ----------
-    paths
-        One for each solver, at most five.
-    integrations
-        Which were solved, for the title.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
-
-    Raises
-    ------
-    ValueError
-        If there is no path.
+    Bars are 95 % (1.96 sigma, leaving out one antenna after the other); open markers are negative. Dashes are the
+    predictions of the solver from where it stopped. The title names the solved integrations.
     """
     from matplotlib.ticker import FuncFormatter
 
@@ -153,7 +137,7 @@ class Convergence(StudyFigure):
     tolerances = ((r".*\.predicted", Drawn(half, "an estimate to within a factor of two; half of it")),)
 
     def refusal(self, experiment: Experiment) -> str | None:
-        """Return that the weights are not the same in all steps, or what else is missing."""
+        """Return that the weights change between steps, or another reason against the figure, or None."""
         reason, calibration = super().refusal(experiment), experiment.calibration
         if reason is None and isinstance(calibration, GainFit) and isinstance(calibration.weights, GainWeights):
             return "needs weights that stay as they are: with calibration.weights 'gains' solvers run several times"
@@ -181,7 +165,7 @@ class Convergence(StudyFigure):
         return {"solvers": solvers, "integrations": self._integrations(graph)}
 
     def draw(self, job: Job) -> Drawing:
-        """Put the integrations of every solver together, write convergence.csv, and draw them."""
+        """Combine the integrations of every solver, write convergence.csv, and draw them."""
         paths = [_path(job, label) for label in job.settings["solvers"]]
         with (job.output / "convergence.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -195,12 +179,12 @@ class Convergence(StudyFigure):
 
 
 def _path(job: Job, label: str) -> ConvergencePath:
-    """Return the path of a solver, all integrations together: their baselines' powers add up."""
+    """Return the path of a solver over all integrations, whose powers of the baselines add up."""
     found = {
         variant: [read_json(job.inputs[f"{label} {variant} {index}"] / PATHS) for index in job.settings["integrations"]]
         for variant in ("without", "with")
     }
-    # Those that end early stay where they are.
+    # Integrations that end early keep their last value.
     longest = {name: max(items, key=lambda item: len(item["checkpoints"])) for name, items in found.items()}
     count = max(len(item["checkpoints"]) for item in longest.values())
     steps = max(longest.values(), key=lambda item: len(item["checkpoints"]))["checkpoints"]
@@ -230,6 +214,6 @@ def _ratio(items: Sequence[Mapping[str, Any]], row: int) -> tuple[float, float]:
 
 
 def _predicted(item: Mapping[str, Any], row: int) -> float:
-    """Return the power that the solver says it leaves, as if all of it were common, over that of the EoR."""
+    """Return the power that the solver predicts to leave, as if all of it were common, over that of the EoR."""
     even, odd = _checkpoint(item, row)["decrement_rms"]
     return even * odd / item["signal_rms"] ** 2

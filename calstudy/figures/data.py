@@ -48,7 +48,7 @@ class Data(StudyFigure):
         return {**inspected_calibration(graph), "data": data, "noise": noise}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return which baseline and integration are shown."""
+        """Return the shown baseline and integration."""
         return inspected(graph)
 
     def draw(self, job: Job) -> Drawing:

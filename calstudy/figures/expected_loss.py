@@ -1,4 +1,4 @@
-"""What a fit is expected to leave of the EoR, from its own tangent space, against what injection measures."""
+"""The EoR that a fit is expected to leave, from its own tangent space, against the measurement by injection."""
 
 from __future__ import annotations
 
@@ -32,12 +32,8 @@ MAX_DELAY = 1.5e-6
 class ExpectedLoss:
     """Expected and measured transfer functions of one calibration.
 
-    Attributes
-    ----------
-    expected
-        From the tangent space of one integration's fit.
-    measured, map
-        From data with the EoR and without, outside the wedge per |k|, and per baseline length and delay.
+    `expected` is from the tangent space of one integration's fit; `measured` (outside the wedge per |k|) and `map` (per
+    baseline length and delay) are from data with the EoR and without.
     """
 
     expected: ExpectedBins
@@ -49,16 +45,7 @@ class ExpectedLoss:
 def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9, stand_ins: Sequence[str] = ()) -> Figure:
     """Draw T outside the wedge per |k| on the left, and against the delay for some baseline lengths on the right.
 
-    Lines are expected, points measured, with 95 % bars.
-
-    Parameters
-    ----------
-    loss
-        Both transfer functions.
-    buffer
-        What was added to the horizon to tell inside from outside, s.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    Lines are expected, points measured, with 95 % bars. The wedge ends at the horizon plus `buffer`, s.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 2.9)
     left, right = figure.subplots(1, 2, sharey=True)
@@ -111,7 +98,7 @@ def _draw_lengths(axes: Axes, loss: ExpectedLoss) -> None:
 
 
 class ExpectedLossFigure(StudyFigure):
-    """The transfer function that the fit predicts, against the one that injection measures."""
+    """The transfer function that the fit predicts, against the one measured by injection."""
 
     caption = "Signal loss expected from the fit alone, against what injection measures."
     variants = SIGNAL_LOSS_VARIANTS
@@ -130,7 +117,7 @@ class ExpectedLossFigure(StudyFigure):
         return {"expected": expected_loss.expected_loss(graph), "transfer": required(signal_loss.transfer(graph))}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return where the wedge ends."""
+        """Return the buffer of the wedge."""
         return {"wedge_buffer": graph.experiment.power.wedge_buffer}
 
     def draw(self, job: Job) -> Drawing:

@@ -19,23 +19,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NUMBERED_ANTENNAS = 64
-"""Arrays of more antennas than this are drawn without their numbers."""
+"""Largest number of antennas that are drawn with their numbers."""
 
 
 @dataclass(frozen=True)
 class LayoutPanel:
-    """One array.
+    """One array: antenna numbers, (Nants,), and positions east, north and optionally up, (Nants, 3) or (Nants, 2), m.
 
-    Attributes
-    ----------
-    title
-        Name of the array.
-    numbers
-        Antenna numbers, (Nants,) int.
-    enu
-        Antenna positions east, north, up, (Nants, 3) or without up (Nants, 2), metres.
-    highlight
-        Antenna numbers drawn in another colour.
+    Antennas in `highlight` have another colour.
     """
 
     title: str
@@ -48,10 +39,7 @@ class LayoutPanel:
 def draw_layouts(panels: Sequence[LayoutPanel], stand_ins: Sequence[str] = ()) -> Figure:
     """Draw one or two arrays, east to the right and north up, in equal scales.
 
-    Raises
-    ------
-    ValueError
-        If there are not one or two panels, or positions and numbers of a panel do not match.
+    Raise ValueError for another number of panels, or if positions and numbers of a panel do not match.
     """
     if len(panels) not in (1, 2):
         raise ValueError(f"a layout figure has 1 or 2 panels, not {len(panels)}")
@@ -108,7 +96,7 @@ class Layout(StudyFigure):
     shows_sky = False
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: the settings say all."""
+        """Return nothing: the settings are sufficient."""
         return {}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:

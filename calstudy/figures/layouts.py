@@ -17,7 +17,7 @@ class Layouts(ComparisonFigure):
     shows_sky = False
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: the settings say all."""
+        """Return nothing: the settings are sufficient."""
         del graph
         return {}
 

@@ -52,21 +52,13 @@ def read_member(folder: Path) -> MemberBias:
 
 @style.journal_style()
 def draw_member_bias(members: Mapping[str, MemberBias], stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw the absolute value of the bias against k; an open symbol is the 95 % upper limit where it is not above that.
-
-    Parameters
-    ----------
-    members
-        By name.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
-    """
+    """Draw |bias| against k, or, where it is within its 95 % error, the 95 % upper limit as an open symbol."""
     from matplotlib.lines import Line2D
 
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
     axes = figure.subplots()
     for place, member in enumerate(members.values()):
-        # Beside each other within a bin: what is limited by the same noise is the same.
+        # Points are side by side within a bin, because members limited by the same noise coincide.
         k = member.k + (place / len(members) - 0.5) * 0.6 * np.diff(member.k).min()
         size, error = np.abs(member.bias), SIGMAS_95 * member.bias_error
         seen, its = size > error, look(place)
@@ -90,7 +82,7 @@ def _error(reference: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 
 class MemberBiasFigure(ComparisonFigure):
-    """What calibration leaves of the foregrounds over the EoR, for every member of a collection."""
+    """The foregrounds that calibration leaves over the EoR, for every member of a collection."""
 
     titles: ClassVar[Mapping[str, str]] = {}
     caption = (

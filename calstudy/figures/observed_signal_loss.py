@@ -1,4 +1,4 @@
-"""What a calibration of measured data leaves of an injected EoR, beside what the fit predicts of itself."""
+"""The injected EoR that a calibration of measured data leaves, beside the prediction of the fit."""
 
 from __future__ import annotations
 
@@ -34,14 +34,8 @@ LAST_K = 1.5
 class ObservedLoss:
     """Transfer functions of a calibration of measured data.
 
-    Attributes
-    ----------
-    outside, inside
-        By injection, per |k|, outside and inside the wedge.
-    map
-        By injection, per baseline length and delay.
-    expected
-        What the fit predicts; None if it is not known.
+    `outside` and `inside` the wedge are per |k| and `map` per baseline length and delay, by injection; `expected` is
+    the prediction of the fit, None if not known.
     """
 
     outside: TransferFunction
@@ -52,16 +46,9 @@ class ObservedLoss:
 
 @style.journal_style()
 def draw_observed_loss(loss: ObservedLoss, buffer: float, stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw T per |k| on the left, with what is expected outside the wedge as a line, and per (|b|, tau) on the right.
+    """Draw T per |k| on the left, with the expectation outside the wedge as a line, and per (|b|, tau) on the right.
 
-    Parameters
-    ----------
-    loss
-        Bars are 95 % (1.96 sigma).
-    buffer
-        What was added to the horizon to tell inside from outside, s: the dashed line.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    Bars are 95 % (1.96 sigma). The dashed line is the horizon plus `buffer`, s.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))

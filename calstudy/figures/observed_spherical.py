@@ -1,4 +1,4 @@
-"""Spherical power spectra of measured data, as given, calibrated, and what is left, with the errors of their noise."""
+"""Spherical power spectra of measured data, as given, calibrated, and of the residual, with errors by the noise."""
 
 from __future__ import annotations
 
@@ -36,16 +36,9 @@ def draw_observed(
 ) -> Figure:
     """Draw |P| of measured data over all modes and outside the wedge, open where negative.
 
-    Bars are 95 % by the noise; the grey line is one standard deviation of the noise of the residual.
-
-    Parameters
-    ----------
-    columns
-        "all-modes" and "outside-wedge", each with the series of `MARKINGS`. Power in mK² h⁻³ Mpc³.
-    buffer
-        What was added to the horizon, s.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    Bars are 95 % by the noise; the grey line is one standard deviation of the noise of the residual. The columns
+    "all-modes" and "outside-wedge" have the series of `MARKINGS`, in mK² h⁻³ Mpc³; the wedge ends at the horizon plus
+    `buffer`, s.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
     grid = figure.subplots(1, len(columns), sharex=True, sharey=True, squeeze=False)[0]

@@ -1,4 +1,4 @@
-"""Cylindrical power spectra of measured data, as given, calibrated, and what is left, and of their noise."""
+"""Cylindrical power spectra of measured data, as given, calibrated, of the residual, and of the noise."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ObservedWedge(ObservedFigure):
         return {"spectra": observed_spectra(graph)}
 
     def draw(self, job: Job) -> Drawing:
-        """Draw a panel for each."""
+        """Draw a panel for each spectrum."""
         from calstudy.power.spectra import CylindricalSpectrum
         from calstudy.power.tables import load_spectrum
 

@@ -31,7 +31,7 @@ CORRELATION_COLOURS = "RdBu_r"
 LEVEL = 0.95
 CORRECTED_PULL = r"$(P^R/T - P^S)/\sigma$, mean"
 KINDS = {"eor": ("o", style.BLUE, r"P^S", -0.15), "input": ("s", style.ORANGE, r"\mathrm{input}", 0.15)}
-"""Marker, colour and name of what P^R is compared with, and how far its points are shifted, in widths of a bin."""
+"""Marker, colour and name of the powers with which P^R is compared, and the shift of points in widths of a bin."""
 BLOCKS = (style.ORANGE, style.GREEN, style.MAGENTA)
 
 
@@ -42,18 +42,10 @@ def draw_realizations(
     max_k: float = 1.0,
     stand_ins: Sequence[str] = (),
 ) -> Figure:
-    """Draw what realizations have in common: T, its errors and their correlation, pulls, coverage, corrected power.
+    """Draw statistics of realizations: T, its errors and their correlation, pulls, coverage, corrected power.
 
-    Parameters
-    ----------
-    results
-        By region; outside and inside the wedge are shown.
-    names
-        What each block draws, such as ``gains and noise``.
-    max_k
-        Upper end of the axes of k, h/Mpc.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    Results are by region, of which those outside and inside the wedge are shown. `names` are the parts that each block
+    draws, such as ``gains and noise``. The axes of k end at `max_k`, h/Mpc.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 4.9)
     ((transfer, errors, correlation), (pulls, covered, corrected)) = figure.subplots(2, 3)
@@ -84,7 +76,7 @@ def _draw_transfer(axes: Axes, results: Mapping[str, RegionResults]) -> None:
 
 
 def _draw_errors(axes: Axes, results: RegionResults, names: Sequence[str]) -> None:
-    """Draw the quoted error of T, and its scatter by what is drawn."""
+    """Draw the quoted error of T, and its scatter by the parts that are drawn."""
     pooled = results.pooled
     axes.plot(pooled.k, pooled.total["transfer"].quoted, color=style.BLACK, label="quoted error")
     for name, block, colour in zip(names, pooled.blocks["transfer"], BLOCKS, strict=False):
@@ -122,7 +114,7 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
         mean = (deviations / results.corrected.error[:, known]).mean(axis=0)
         axes.plot(pooled.k[known], mean, "x", color=style.GREEN, label=CORRECTED_PULL, zorder=3)
     axes.axhspan(-1, 1, color=style.BAND, alpha=0.5, linewidth=0, zorder=0)
-    # Linear where pulls should be; where most of the EoR is lost they are far below.
+    # Linear over the expected range of pulls; where most of the EoR is lost they are far below.
     axes.set_yscale("symlog", linthresh=3)
     bottom = min(-3.0, axes.get_ylim()[0])
     axes.set_yticks([-10, -3, -2, -1, 0, 1, 2, 3], ["−10", "−3", "−2", "−1", "0", "1", "2", "3"])
@@ -146,7 +138,7 @@ def _draw_coverage(axes: Axes, results: RegionResults) -> None:
 
 
 def _draw_corrected(axes: Axes, results: RegionResults) -> None:
-    """Draw P^R and P^R / T over the input: the mean, with the 95 % error of it by what was drawn."""
+    """Draw P^R and P^R / T over the input: the mean, with its 95 % error by all that was drawn."""
     pooled = results.pooled
     powers = {"P^R": (pooled.values["ratio"] * results.eor, style.GREY, "o", -0.15)}
     if results.corrected is not None:
@@ -173,7 +165,7 @@ def _quoted(arrays: Arrays, name: str) -> np.ndarray:
 
 
 class Realizations(StudyFigure):
-    """What realizations of an experiment have in common: T, pulls, coverage, and the correlation between bins."""
+    """Statistics of the realizations of an experiment: T, pulls, coverage, and the correlation between bins."""
 
     caption = (
         "Realizations: transfer function T with the scatter of one realization; its quoted error and its scatter; the "
@@ -194,11 +186,11 @@ class Realizations(StudyFigure):
         return "pools the realizations of an experiment, and cannot be drawn of a single one"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return what is measured on every realization."""
+        """Return the measurements on every realization."""
         return realizations.inputs(graph)
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return which realization has which draws."""
+        """Return the draws of each realization."""
         return realizations.settings(graph)
 
     def draw(self, job: Job) -> Drawing:

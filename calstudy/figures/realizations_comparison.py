@@ -36,16 +36,8 @@ def draw_comparison(
 ) -> Figure:
     """Draw T of two arrays with the scatter of one realization, and the mean difference with its 95 % error.
 
-    Parameters
-    ----------
-    arrays
-        Two, by title, in the same bins.
-    difference
-        T of the first less that of the second.
-    max_k
-        Upper end of the axis of k, h/Mpc.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    `arrays` are two, by title, in the same bins; `difference` is T of the first less that of the second. The axis of k
+    ends at `max_k`, h/Mpc.
     """
     figure = style.new_figure(style.ONE_COLUMN, 4.2)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
@@ -76,11 +68,11 @@ class RealizationsComparison(ComparisonFigure):
     max_k: Wavenumber = Field(1.0, gt=0, description="Upper end of the axis of k; the arrays have all bins.")
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return what is measured on every realization of one member."""
+        """Return the measurements on every realization of one member."""
         return realizations.inputs(graph)
 
     def member_settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return which realization has which draws."""
+        """Return the draws of each realization."""
         return realizations.settings(graph)
 
     def draw(self, job: Job) -> Drawing:

@@ -21,16 +21,10 @@ if TYPE_CHECKING:
 
 @style.journal_style()
 def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6, stand_ins: Sequence[str] = ()) -> Figure:
-    """Draw the amplitude of every antenna's gain transform, and their median, in one column.
+    """Draw the amplitude of the transform of every antenna's gain, and their median, in one column.
 
-    Parameters
-    ----------
-    gains
-        Gains of shape (Nants, Nfreqs), see `calstudy.plotting.domains.in_two_domains`.
-    max_delay
-        Delays from -max_delay / 4 to max_delay are shown, seconds: Eq. REFGAIN has its peaks at positive delays.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    Gains are (Nants, Nfreqs), see `calstudy.plotting.domains.in_two_domains`. Delays from -max_delay / 4 to max_delay
+    (s) are shown: Eq. REFGAIN has its peaks at positive delays.
     """
     amplitude = np.abs(gains.transform)
     figure = style.new_figure(style.ONE_COLUMN, 2.7)
@@ -60,7 +54,7 @@ class Reflections(StudyFigure):
         return {"gains": corruption.gains(graph)}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return which integration is shown."""
+        """Return the shown integration."""
         return {"integration": graph.experiment.outputs.inspect.integration}
 
     def draw(self, job: Job) -> Drawing:

@@ -29,11 +29,11 @@ SHOWN = {
     "default-step": "default solver, step",
     "default-solve": "default solver, solve",
 }
-"""What the figures show of what was timed."""
+"""Labels of the timings that the figures show."""
 AXES = {"rows": ("number of antennas", r"N_\mathrm{ant}"), "line": ("longest baseline (m)", r"b_\mathrm{max}")}
 CLOCKS = {"cpu": "one core", "gpu": "GPU"}
 MOST = 2 * len(COLOURS)
-"""Series in one figure; the second four have open markers and broken lines."""
+"""Largest number of series in one figure; the second four have open markers and broken lines."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,6 @@ class RuntimeSeries:
 
     Attributes
     ----------
-    label
-        Machine or solver.
     size
         Number of antennas, or longest baseline in m, (Nsizes,), increasing.
     median, low, high
@@ -61,7 +59,7 @@ class RuntimeSeries:
 
 
 def summarize_runtime(label: str, size: ArrayLike, seconds: Sequence[Sequence[float]]) -> RuntimeSeries:
-    """Reduce the run times of every size to medians, 95 % bands and a power law; raises what `fit_power_law` raises."""
+    """Reduce the run times of every size to medians, 95 % bands and a power law; raise what `fit_power_law` raises."""
     sizes = np.asarray(size, dtype=float)
     low, median, high = np.array([np.quantile(item, QUANTILES) for item in seconds]).T
     return RuntimeSeries(label, sizes, median, low, high, fit_power_law(sizes, median))
@@ -77,23 +75,8 @@ def draw_runtime(
 ) -> Figure:
     r"""Draw medians (markers), 95 % bands and fitted power laws (lines) on logarithmic axes, in one column.
 
-    Parameters
-    ----------
-    series
-        One to eight.
-    size_label
-        Label of the lower axis with its unit, such as ``"number of antennas"`` or ``"longest baseline (m)"``.
-    symbol
-        The size in mathematical notation, for the fits in the legend: ``r"N_\mathrm{ant}"``.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
-    time_label
-        Label of the upright axis with its unit.
-
-    Raises
-    ------
-    ValueError
-        If there are not one to eight series.
+    There are one to eight series. `size_label` and `time_label` include the unit, such as ``"longest baseline (m)"``;
+    `symbol` is the size in mathematical notation, for the fits in the legend: ``r"N_\mathrm{ant}"``.
     """
     if not 1 <= len(series) <= MOST:
         raise ValueError(f"a run-time figure has 1 to {MOST} series, not {len(series)}")
@@ -113,9 +96,9 @@ def draw_runtime(
 
 
 def _add_legend(figure: Figure, series: Sequence[RuntimeSeries], symbol: str) -> None:
-    """Put one line per series above the axes: its marker on its fit, what it is, and the fitted exponent."""
+    """Put one line per series above the axes: its marker on its fit, its label, and the fitted exponent."""
     lines = figure.axes[0].get_lines()
-    # What matplotlib declares for a figure leaves out that a handle may be several artists.
+    # The type hints of matplotlib do not allow several artists as one handle.
     handles: list[Any] = [(lines[2 * index + 1], lines[2 * index]) for index in range(len(series))]
     labels = [
         rf"{item.label} $\propto {symbol}^{{\,{item.fit.exponent:.2f} \pm {item.fit.error:.2f}}}$" for item in series
@@ -137,7 +120,7 @@ class Runtime(StudyFigure):
         return f"runtime-{self.panel}"
 
     def refusal(self, experiment: Experiment) -> str:
-        """Refuse: an experiment times nothing."""
+        """Refuse: an experiment measures no run times."""
         return "shows a run-time study, and cannot be drawn of an experiment"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
@@ -155,7 +138,7 @@ class Runtime(StudyFigure):
 
 
 def _series(cases: Sequence[Mapping[str, Any]]) -> list[RuntimeSeries]:
-    """Return what is shown, solver after solver, for each device."""
+    """Return the shown run times, solver after solver, for each device."""
     devices = sorted({case["device"] for case in cases})
     series = []
     for device in devices:

@@ -1,4 +1,4 @@
-"""What a calibration leaves of the EoR: transfer functions per wavenumber, and per baseline length and delay."""
+"""The EoR that a calibration leaves: transfer functions per wavenumber, and per baseline length and delay."""
 
 from __future__ import annotations
 
@@ -41,15 +41,7 @@ EMPTY = "0.8"
 
 @dataclass(frozen=True)
 class SignalLoss:
-    """The transfer functions of one calibration.
-
-    Attributes
-    ----------
-    outside, inside
-        Per |k|, outside and inside the wedge.
-    map
-        Per baseline length and delay.
-    """
+    """The transfer functions of one calibration: per |k| outside and inside the wedge, and per length and delay."""
 
     outside: TransferFunction
     inside: TransferFunction
@@ -62,21 +54,9 @@ def draw_signal_loss(
 ) -> Figure:
     """Draw T per |k| outside and inside the wedge on the left, per (|b|, tau) on the right.
 
-    Parameters
-    ----------
-    loss
-        Bars are 95 % (1.96 sigma); a point without an error (one baseline in its bin) has none.
-    buffer
-        What was added to the horizon to tell inside from outside, s: the dashed line.
-    max_delay
-        Upper end of the delay axis, s; all delays if None or larger than those.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
-
-    Raises
-    ------
-    ValueError
-        If no bin outside or inside the wedge has a transfer function.
+    Bars are 95 % (1.96 sigma); a point without an error (one baseline in its bin) has none. The dashed line is the
+    horizon plus `buffer`, s. The delay axis ends at `max_delay`, s, if that is not None and within the delays. Raise
+    ValueError if no bin has a transfer function.
     """
     if not any(np.isfinite(part.transfer).any() for part in (loss.outside, loss.inside)):
         raise ValueError("no bin of |k| has a transfer function, expected at least one with modes in it")
@@ -106,24 +86,12 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
     )
     axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, _last_k(loss)), ylim=_limits(loss))
     handles, labels = axes.get_legend_handles_labels()
-    # The line comes first otherwise; the points are what the figure is about.
+    # The points, which matter most, come first in the legend; the line would by default.
     axes.legend(handles[1:] + handles[:1], labels[1:] + labels[:1], loc="center right")
 
 
 def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, colour: str) -> None:
-    """Draw one transfer function as points with 95 % bars at the centres of its bins.
-
-    Parameters
-    ----------
-    axes
-        To draw on.
-    part
-        What is drawn; bins without modes are left out.
-    label
-        In the legend.
-    marker, colour
-        As matplotlib has them.
-    """
+    """Draw one transfer function as points with 95 % bars at the centres of its bins, except empty ones."""
     known = np.isfinite(part.transfer)
     axes.errorbar(
         part.k[known],
@@ -139,7 +107,7 @@ def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, c
 
 
 def _last_k(loss: SignalLoss) -> float:
-    """Return the end of the last bin with modes, but not far beyond the last of the window's interesting part."""
+    """Return the end of the last bin with modes, at most 1.5 h/Mpc."""
     filled = np.isfinite(loss.outside.transfer) | np.isfinite(loss.inside.transfer)
     return min(float(loss.outside.bin_edges[1:][filled].max()), 1.5)
 
@@ -150,7 +118,7 @@ def _limits(loss: SignalLoss) -> tuple[float, float]:
 
 
 def draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, max_delay: float | None) -> None:
-    """Draw T per baseline length and delay, with its colour bar; parameters as for `draw_signal_loss`."""
+    """Draw T per baseline length and delay, with its colour bar; parameters are as for `draw_signal_loss`."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -186,7 +154,7 @@ class SignalLossFigure(StudyFigure):
         return {"transfer": required(signal_loss.transfer(graph))}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return where the wedge ends."""
+        """Return the buffer of the wedge."""
         return {"wedge_buffer": graph.experiment.power.wedge_buffer}
 
     def draw(self, job: Job) -> Drawing:

@@ -39,17 +39,8 @@ def draw_solver_comparison(
     """Draw P^R, and below it P^R without EoR, of two solvers: a column for each array.
 
     Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ; the dotted line
-    is 1.96 σ of the thermal noise.
-
-    Parameters
-    ----------
-    arrays
-        By the title of the array its spectra with the paper's solver, and with the default one; power in
-        mK² h⁻³ Mpc³, k in h/Mpc.
-    last_k
-        Upper end of the k axis, h/Mpc.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    is 1.96 σ of the thermal noise. `arrays` has, by title, the spectra with the paper's solver and with the default
+    one; power in mK² h⁻³ Mpc³, k in h/Mpc up to `last_k`.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 5.6)
     figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
@@ -79,7 +70,7 @@ def _draw_panel(axes: Axes, solvers: Sequence[SphericalColumn], name: str) -> No
 
 
 def _first_k(spectrum: SphericalSpectrum) -> float:
-    """Return where the leftmost point is drawn."""
+    """Return the k of the leftmost point, with its shift."""
     left = spectrum.k + min(marking.shift for marking in SOLVERS) * np.diff(spectrum.bin_edges)
     return float(left[np.isfinite(spectrum.power.real)].min())
 

@@ -33,8 +33,6 @@ class SphericalColumn:
 
     Attributes
     ----------
-    title
-        What is averaged, or which array.
     eor
         P^S with the sample variance as its error: the grey band.
     uncorrupted
@@ -59,7 +57,7 @@ class SphericalColumn:
 
 
 class Marking(NamedTuple):
-    """How one series is drawn; `shift` moves it sideways by that part of a bin, to uncover what it would hide."""
+    """The look of one series; `shift`, in widths of a bin, moves it sideways to uncover points behind it."""
 
     label: str
     marker: str
@@ -75,7 +73,7 @@ MARKINGS = {
     "residual_without_eor": Marking(r"$P^{R}$, no EoR", "s", style.CYAN, 2.4, 0.15),
     "residual": Marking(r"$P^{R}$", "s", style.ORANGE, 2.8),
 }
-"""Series in the order in which they are drawn, the later over the earlier."""
+"""Series in the order of drawing, the later over the earlier."""
 LEGEND_ORDER = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "noise")
 ZOOMED = ("residual", "residual_without_eor", "noise")
 
@@ -84,22 +82,10 @@ ZOOMED = ("residual", "residual_without_eor", "noise")
 def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stand_ins: Sequence[str] = ()) -> Figure:
     """Draw spherical power spectra: full range above, signal and residuals enlarged below.
 
-    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ.
-
-    Parameters
-    ----------
-    columns
-        One or two, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone
-        (Fig. SPHERICAL_LOW_SNR). Power in mK² h⁻³ Mpc³, k in h/Mpc.
-    zoom_k
-        Upper end of the lower row's k axis, h/Mpc.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
-
-    Raises
-    ------
-    ValueError
-        If there are not one or two columns, a spectrum has no power at all, or a power has no error bar.
+    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ. There are one
+    or two columns, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone (Fig.
+    SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³; the lower row ends at `zoom_k`, h/Mpc. Raise ValueError for another
+    number of columns, a spectrum without any power, or a power without an error bar.
     """
     if len(columns) not in (1, 2):
         raise ValueError(f"a spherical figure has 1 or 2 columns, not {len(columns)}")
@@ -154,21 +140,7 @@ def draw_band(axes: Axes, eor: SphericalSpectrum) -> None:
 
 
 def draw_points(axes: Axes, spectrum: SphericalSpectrum, marking: Marking, name: str, zorder: float) -> None:
-    """Draw |P| with 95 % bars, open where P is negative.
-
-    Parameters
-    ----------
-    axes
-        With a logarithmic scale of power.
-    spectrum
-        What is drawn.
-    marking
-        How.
-    name
-        What the artists are called.
-    zorder
-        Of the artists.
-    """
+    """Draw |P| with 95 % bars on a logarithmic axis, open where P is negative; `name` labels the artists."""
     power = spectrum.power.real
     k = _shifted(spectrum, marking.shift)
     for negative in (False, True):
@@ -217,7 +189,7 @@ def _shifted(spectrum: SphericalSpectrum, shift: float) -> np.ndarray:
 
 
 def _k_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
-    """Return limits that hold all drawn points, the shifted ones too."""
+    """Return limits that hold all drawn points, including shifted ones."""
     reach = max(abs(marking.shift) for marking in MARKINGS.values())
     spectra = [(item, np.isfinite(item.power.real)) for item in _present(columns, ("eor", *MARKINGS))]
     first = min(_shifted(item, -reach)[finite].min() for item, finite in spectra if finite.any())
@@ -251,21 +223,11 @@ def _add_legend(figure: Figure, columns: Sequence[SphericalColumn]) -> None:
 
 
 SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eor", "noise")
-"""The variants that are shown as far as the experiment has them."""
+"""The variants that are shown if the experiment has them."""
 
 
 def read_column(folder: Path, title: str, modes: str) -> SphericalColumn:
-    """Read the spherical spectra of all series that a product of stage `spectra` has, over one choice of modes.
-
-    Parameters
-    ----------
-    folder
-        Of the product.
-    title
-        Of the column.
-    modes
-        "all-modes" or "outside-wedge".
-    """
+    """Read the spherical spectra of all series of a product of stage `spectra`, for "all-modes" or "outside-wedge"."""
     from calstudy.power.spectra import SphericalSpectrum
     from calstudy.power.tables import load_spectrum
 
@@ -286,7 +248,7 @@ class Spherical(StudyFigure):
         return {"spectra": spectra.spectra(graph)}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return where the wedge ends."""
+        """Return the buffer of the wedge."""
         return {"wedge_buffer": graph.experiment.power.wedge_buffer}
 
     def excised(self, job: Job) -> SphericalColumn:

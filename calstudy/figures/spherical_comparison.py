@@ -23,17 +23,8 @@ def draw_spherical_comparison(
 ) -> Figure:
     """Draw both arrays as `draw_spherical` does, the minimally redundant one left and the redundant one right.
 
-    The columns should average the same Fourier modes: those outside the wedge and its buffer. Their titles are
-    replaced by the names of the arrays.
-
-    Parameters
-    ----------
-    minimally_redundant, redundant
-        Spectra of both arrays.
-    zoom_k
-        Upper end of the lower row's k axis, h/Mpc.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    The columns should average the same Fourier modes: those outside the wedge and its buffer. Their titles are replaced
+    by the names of the arrays.
     """
     columns = (
         replace(minimally_redundant, title="Minimally redundant"),

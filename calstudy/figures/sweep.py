@@ -1,4 +1,4 @@
-"""Signal loss against what was varied: one panel per block of a sweep."""
+"""Signal loss against the varied fields: one panel per block of a sweep."""
 
 from __future__ import annotations
 
@@ -31,30 +31,22 @@ if TYPE_CHECKING:
 SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
 """Marker and colour of each band of k, from small k up."""
 SKIES = "sky.eor.seed"
-"""The field whose values are further samples of the same thing, to be pooled."""
+"""The field whose values are further samples of the same EoR, to be pooled."""
 WHERE = ("point", "changes", "region")
 """First columns of the summary; those of a transfer function follow."""
 SUMMARY = "summary.csv"
 COLUMNS = 2
 PANEL_HEIGHT = 1.9
 LABEL_WIDTH = 15
-"""Characters of a value in one line below its points."""
+"""Number of characters of a value in one line below its points."""
 
 
 @dataclass(frozen=True)
 class SweepPanel:
     """Transfer functions outside the wedge for the values of one field, or of the combinations of several.
 
-    Attributes
-    ----------
-    field
-        What was varied: dotted path.
-    note
-        What was set besides, for the title; may be empty.
-    values
-        The values as they were written.
-    transfers
-        One per value, all in the same bands of k.
+    `field` is the dotted path of the varied field, and `note` names other changes for the title; it may be empty.
+    `values` are texts as in the file, each with one of `transfers`, all in the same bands of k.
     """
 
     field: str
@@ -67,19 +59,8 @@ class SweepPanel:
 def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> Figure:
     """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
 
-    Dashes are T free of the flux scale, which is written above each value (see `calstudy.power.transfer`).
-
-    Parameters
-    ----------
-    panels
-        At least one; at most five bands of k.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
-
-    Raises
-    ------
-    ValueError
-        If there is no panel, or the transfer functions have different bands.
+    Dashes are T free of the flux scale, which is written above each value (see `calstudy.power.transfer`). There are at
+    most five bands of k. Raise ValueError if there is no panel, or the transfer functions have different bands.
     """
     if not panels:
         raise ValueError("a figure of a sweep has no panel, expected at least one")
@@ -91,7 +72,7 @@ def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> F
     width = style.ONE_COLUMN if columns == 1 else style.TWO_COLUMNS
     figure = style.new_figure(width, 0.5 + PANEL_HEIGHT * rows)
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    # Above the points the flux scale is written.
+    # Leave room for the flux scale above the points.
     top = max(1.2, 1.15 * max(_highest(panel) for panel in panels))
     for axes, panel in zip(grid.flat, panels, strict=False):
         _draw_panel(axes, panel)
@@ -179,7 +160,7 @@ class Sweep(StudyFigure):
         return {"transfer": required(signal_loss.transfer(graph))}
 
     def draw(self, job: Job) -> Drawing:
-        """Write summary.csv, and draw T against what was varied."""
+        """Write summary.csv, and draw T against the varied fields."""
         blocks = job.settings["blocks"]
         _write_summary(job.output / SUMMARY, [point for block in blocks for point in block], job.inputs)
         panels = [_panel(block, job.inputs) for block in blocks]
@@ -208,7 +189,7 @@ def _write_summary(path: Path, points: Sequence[Mapping[str, Any]], folders: Map
 
 
 def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> Any:
-    """Return one block as a panel: a category per combination of what varies, EoR skies of one combination pooled."""
+    """Return one block as a panel: a category per combination of values, with its EoR skies pooled."""
     from calstudy.power.transfer import pool
 
     fields = list(block[0]["changes"])

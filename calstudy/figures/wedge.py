@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from calstudy.power.spectra import CylindricalSpectrum
 
-# Yellow against blue: signs stay apart for every kind of colour vision, and both darken with |P|.
+# Yellow against blue: signs are distinct for every kind of colour vision, and both scales darken with |P|.
 POSITIVE = ("#fffbe0", "#fbd65c", "#ee8a1e", "#c23a2b", "#76134f", "#1d0b2e")
 NEGATIVE = ("#e3f1fb", "#7fbfe8", "#2b7bbd", "#0b3a75")
 EMPTY = "0.8"
@@ -69,21 +69,10 @@ def draw_wedge(
 ) -> Figure:
     """Draw the real parts of five cylindrical power spectra on one scale of colours, negative values in blue.
 
-    Parameters
-    ----------
-    panels
-        Spectra with strictly increasing baseline lengths and delays >= 0, power in mK² h⁻³ Mpc³.
-    buffer
-        The dashed line is this delay above the horizon, seconds.
-    max_delay
-        Upper end of the delay axis, seconds; all delays if None or larger than those.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
-
-    Raises
-    ------
-    ValueError
-        If the axes of a spectrum are not increasing or do not match its power, or the delays of two spectra differ.
+    Spectra have strictly increasing baseline lengths and delays >= 0, power in mK² h⁻³ Mpc³. The dashed line is
+    `buffer` (s) above the horizon. The delay axis ends at `max_delay`, s, if that is not None and within the delays.
+    Raise ValueError if the axes of a spectrum are not increasing or do not match its power, or the delays of two
+    spectra differ.
     """
     spectra = {name: getattr(panels, name) for name in TITLES}
     return draw_panels(spectra, TITLES, buffer, max_delay, stand_ins)
@@ -97,7 +86,7 @@ def draw_panels(
     max_delay: float | None,
     stand_ins: Sequence[str] = (),
 ) -> Figure:
-    """Draw the real parts of several cylindrical power spectra, by their names; for the rest see `draw_wedge`."""
+    """Draw the real parts of several cylindrical power spectra, by their names, as `draw_wedge` does."""
     from matplotlib.colors import LogNorm
 
     first = next(iter(spectra.values()))
@@ -140,9 +129,9 @@ def _check(name: str, spectrum: CylindricalSpectrum, delay: np.ndarray) -> None:
 
 
 def _colour_limits(spectra: Iterable[CylindricalSpectrum]) -> tuple[float, float, float]:
-    """Return the least |P| with a colour of its own, the largest P and the largest -P, in whole decades.
+    """Return the smallest |P| with its own colour, the largest P and the largest -P, in whole decades.
 
-    The least is where a tenth of the faintest panel's values lie below.
+    The smallest is the tenth percentile of |P| in the faintest panel.
     """
     panels = [spectrum.power.real[np.isfinite(spectrum.power.real)] for spectrum in spectra]
     faintest = min((np.quantile(np.abs(panel[panel != 0]), 0.1) for panel in panels if panel.any()), default=1.0)
@@ -158,7 +147,7 @@ def _draw_power(axes: Axes, spectrum: CylindricalSpectrum, floor: float, norms: 
     for sign, norm, colours in ((1, norms[0], POSITIVE), (-1, norms[1], NEGATIVE)):
         drawn = power >= 0 if sign > 0 else power < 0
         signed = np.ma.masked_where(~drawn, sign * power)
-        # Fainter than the scale, exact zeros included, is not missing: it has the lowest colour.
+        # Powers below the scale, exact zeros included, are not missing: they have the lowest colour.
         axes.pcolormesh(x, y, np.ma.maximum(signed, floor), norm=norm, cmap=colour_map(colours), rasterized=True)
 
 
@@ -198,7 +187,7 @@ class Wedge(StudyFigure):
         return {"spectra": spectra.spectra(graph)}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return where the wedge ends."""
+        """Return the buffer of the wedge."""
         return {"wedge_buffer": graph.experiment.power.wedge_buffer}
 
     def draw(self, job: Job) -> Drawing:

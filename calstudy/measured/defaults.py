@@ -15,9 +15,9 @@ PATIENT = {"name": "gauss-newton", "max_steps": 500}
 
 
 def defaults(has_sky_model: bool) -> dict[str, Any]:
-    """Return fields that have these values for measured data, where a calibrator has them and a user does not say.
+    """Return default fields for measured data, which apply where a calibrator has them and the user does not set them.
 
-    Without a model of the sky nothing knows the scale; visibilities of any phase may sum to nothing.
+    Without a model of the sky the scale is not known; visibilities of any phase may sum to zero.
     """
     return {"solver": PATIENT} if has_sky_model else {"solver": PATIENT, "prior": "gains"}
 
@@ -25,14 +25,7 @@ def defaults(has_sky_model: bool) -> dict[str, Any]:
 def with_defaults(content: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return the content of a file about measured data with the defaults in its section `calibration`.
 
-    Content that is not valid is returned as it is, for validation says what is wrong.
-
-    Parameters
-    ----------
-    content
-        Of the file.
-    folder
-        Where relative paths start.
+    Relative paths start at `folder`. Invalid content is returned unchanged, because validation reports the error.
     """
     section, observed = content.get("calibration") or {}, content.get("observed")
     block = {CALIBRATORS.tag: section} if isinstance(section, str) else section

@@ -1,4 +1,4 @@
-"""The signal loss to be expected of a finished calibration."""
+"""The expected signal loss of a finished calibration."""
 
 from __future__ import annotations
 
@@ -31,27 +31,13 @@ def expect(
     polarization: int = 0,
     taper: str = TAPER,
 ) -> ExpectedTransfer | None:
-    """Return what is expected to be left of a white signal in the middle one of the usable solves.
+    """Return the expected remainder of a white signal in the middle one of the usable solves.
 
-    Exact for arrays whose matrices are small, from `PROBES` random vectors for others; the baselines are those of
-    `result.model`, those of one integration after the other where several were solved together.
-
-    Parameters
-    ----------
-    data, settings
-        As they were given to `calstudy.calibrate.execution.run_calibrator`.
-    result
-        What it returned.
-    assumed
-        Sky model and noise, if there were any.
-    polarization
-        Index of the polarization.
-    taper
-        Of the delay modes.
-
-    Returns
-    -------
-    None if no solve of this polarization gave a solution.
+    It is exact for arrays whose matrices are small, and from `PROBES` random vectors for others. The baselines are
+    those of `result.model`, repeated for each integration where several were solved together. `data`, `settings` and
+    `assumed` (sky model and noise) are those of `calstudy.calibrate.execution.run_calibrator`, and `result` is its
+    result; `polarization` is an index, `taper` that of the delay modes. Return None if no solve of this polarization
+    gave a solution.
     """
     number = int(result.model.polarization_array[polarization])
     usable = [record for record in result.solutions if record.polarization == number and record.status in USABLE]

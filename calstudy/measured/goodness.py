@@ -1,4 +1,4 @@
-"""How well a calibration fits the noise: chi^2 of what was fitted, and of integrations that were not."""
+"""Goodness of fit of a calibration: chi^2 of the fitted integrations, and of integrations that were not fitted."""
 
 from __future__ import annotations
 
@@ -18,21 +18,14 @@ if TYPE_CHECKING:
     from calstudy.calibrate.problem import CalibrationProblem
 
 NEIGHBOURS = 1.5
-"""Integrations farther apart than this many of them are not compared."""
+"""Largest distance of compared integrations, in integration times."""
 
 
 def count_unknowns(problem: CalibrationProblem, settings: GainFit) -> float | None:
-    """Return the number of complex unknowns of a fit that the data determine; None if a prior shares in that.
+    """Return the number of complex unknowns of a fit that the data determine; None if a prior determines some.
 
     Unknowns of channels and antennas without data are left out, and the phase of each channel, which nothing
-    determines. The overall scale is one real number, and not looked at.
-
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    settings
-        Of the fit.
+    determines. The overall scale is one real number and is not counted.
     """
     structure = problem.structure
     if isinstance(settings, ForegroundFit) and settings.foreground_prior.finite:
@@ -46,14 +39,9 @@ def count_unknowns(problem: CalibrationProblem, settings: GainFit) -> float | No
 
 
 def predicted(gains: UVCal, model: UVData) -> UVData:
-    """Return what a solution says that was measured, g_a g_b* F, flagged where there is no solution.
+    """Return the visibilities that a solution predicts, g_a g_b* F, flagged where there is no solution.
 
-    Parameters
-    ----------
-    gains
-        Of all antennas of the model.
-    model
-        F, calibrated.
+    `gains` are of all antennas of the model F, which is calibrated.
     """
     order = np.argsort(gains.ant_array)
     first, second = (order[np.searchsorted(gains.ant_array, column, sorter=order)] for column in antenna_pairs(model).T)
@@ -67,12 +55,7 @@ def predicted(gains: UVCal, model: UVData) -> UVData:
 def chi_squared(data: UVData, prediction: UVData) -> tuple[float, int]:
     """Return chi^2, the sum of |V - prediction|^2 / sigma^2, and the number of samples.
 
-    Parameters
-    ----------
-    data
-        With autocorrelations, of which sigma is known.
-    prediction
-        Of some of the baselines, at the same times.
+    sigma is from the autocorrelations of `data`. The prediction is of some of the baselines, at the same times.
     """
     pairs, total, count = antenna_pairs(prediction), 0.0, 0
     rows = _rows(data, pairs)
@@ -96,20 +79,10 @@ def _rows(data: UVData, pairs: np.ndarray) -> list[int]:
 def held_out(data: UVData, prediction: UVData) -> tuple[float, int]:
     """Return chi^2 of integrations that were not fitted, from the solutions of the integrations before and after.
 
-    g_a g_b* F is free of all that a fit cannot know. That of the two neighbours, fringe-stopped to the integration
-    between them, is averaged: the sky that moves linearly in between cancels.
-
-    Parameters
-    ----------
-    data
-        What was not fitted, with autocorrelations.
-    prediction
-        g_a g_b* F of the other integrations.
-
-    Returns
-    -------
-    chi_squared, samples
-        No samples if no integration lies between two others.
+    g_a g_b* F does not depend on the degeneracies of a fit. That of the two neighbours, fringe-stopped to the
+    integration between them, is averaged: the sky that moves linearly in between cancels. `data`, with
+    autocorrelations, was not fitted; `prediction` is g_a g_b* F of the other integrations. The number of samples is
+    zero if no integration lies between two others.
     """
     use_bundled_earth_orientation()
     total, count = 0.0, 0
@@ -137,7 +110,7 @@ def _at_rows(data: UVData, pairs: np.ndarray) -> UVData:
 
 
 def _stopped(data: UVData, time: float) -> UVData:
-    """Return data phased to the point that is at the zenith at some time."""
+    """Return data phased to the point that is at the zenith at the given Julian date."""
     found = data.copy()
     found.phase_to_time(Time(time, format="jd", scale="utc"))
     return found

@@ -1,4 +1,4 @@
-"""Two halves of measured data that see the same sky with independent noise, even and odd."""
+"""Two halves of measured data, even and odd, that see the same sky with independent noise."""
 
 from __future__ import annotations
 
@@ -29,22 +29,18 @@ SECONDS_PER_DAY = 86400.0
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known of measured data from their metadata.
+    """Properties of measured data from their metadata.
 
     Attributes
     ----------
-    unit
-        Of the visibilities.
     frame
         Antennas, baselines, autocorrelations among them, and channels, ascending.
-    times
-        Julian dates of the integrations, (Ntimes,).
-    sidereal_times
-        rad, (Ntimes,).
+    times, sidereal_times
+        Julian dates and rad of the integrations, (Ntimes,).
     integration
         Duration of the shortest, s.
     autos
-        Whether there are autocorrelations of all antennas.
+        True if there are autocorrelations of all antennas.
     """
 
     unit: str
@@ -56,7 +52,7 @@ class Facts:
 
     @property
     def duration(self) -> float:
-        """From the beginning of the first integration to the end of the last, s."""
+        """Time from the beginning of the first integration to the end of the last, s."""
         return float(np.ptp(self.times)) * SECONDS_PER_DAY + self.integration
 
     @property
@@ -71,13 +67,13 @@ class Facts:
 
     @property
     def channels(self) -> Channels:
-        """Its channels, which are equally spaced."""
+        """The channels, which are equally spaced."""
         width = float(np.ptp(self.frequencies)) / (self.frequencies.size - 1)
         first = float(self.frequencies[0])
         return Channels.model_construct(first=first, width=float(f"{width:.12g}"), count=self.frequencies.size)
 
     def size(self, n_times: int) -> Size:
-        """Return the size of `n_times` of its integrations."""
+        """Return the size of `n_times` of the integrations."""
         lengths = np.array([np.linalg.norm(vector) for vector in self.frame.vectors[~self.frame.autos]])
         return Size(
             antennas=self.antennas,
@@ -91,19 +87,13 @@ class Facts:
 
 @dataclass(frozen=True)
 class Halves:
-    """What is known of the two halves before they are read.
-
-    Attributes
-    ----------
-    facts
-        Of the files of each, by parity.
-    """
+    """Metadata of the two halves, by parity, before they are read."""
 
     facts: Mapping[str, Facts]
 
     @property
     def interleaved(self) -> bool:
-        """Whether both are in the same files."""
+        """True if both halves are in the same files."""
         return self.facts["even"] is self.facts["odd"]
 
     def times(self, parity: str) -> np.ndarray:
@@ -113,34 +103,21 @@ class Halves:
 
     @property
     def centre(self) -> float | None:
-        """Julian date at which the phase centre of both is at the zenith; None for that of each one's own middle."""
+        """Julian date at which the phase centre of both is at the zenith; None for the middle of each half."""
         if not self.interleaved:
             return None
         times = self.facts["even"].times
         return float((times.min() + times.max()) / 2)
 
     def averaging(self, power: PowerSettings) -> dict[str, Any]:
-        """Return how a half is averaged: the phase centre, or the number of blocks, their span and those that are kept.
+        """Return the averaging of a half: the phase centre, or the number of blocks, their span and the kept ones.
 
         The span is that of both halves if they are interleaved; otherwise each half has its own. Blocks that one half
-        lacks, because of gaps, are left out of both.
-
-        Parameters
-        ----------
-        power
-            Whose `coherent_time` is the duration of a block.
-
-        Returns
-        -------
-        ``centre``, a Julian date or None; or ``blocks``, ``span`` (two Julian dates or None) and, if some blocks are
-        left out, the numbers of those that are ``kept``.
-
-        Raises
-        ------
-        InputError
-            If it makes blocks that the halves cannot have in common.
+        lacks, because of gaps, are left out of both. The keys are ``centre``, a Julian date or None; or ``blocks``,
+        ``span`` (two Julian dates or None) and, if some blocks are left out, the numbers of those that are ``kept``.
+        Raise InputError if `coherent_time` gives blocks that the halves cannot have in common.
         """
-        # Reading metadata does not need what averages data, which takes long to import.
+        # Reading metadata does not need the averaging of data, which takes long to import.
         from calstudy.power.average import divide
 
         even, odd = (self.facts[parity] for parity in PARITIES)
@@ -172,23 +149,11 @@ class Halves:
 def read_facts(
     paths: tuple[Path, ...], selection: Selection, positions: Path | None = None, even: bool = True
 ) -> Facts:
-    """Read the metadata of measured data.
+    """Read the metadata of the selected part of files or folders that belong together.
 
-    Parameters
-    ----------
-    paths
-        Of files or folders that belong together.
-    selection
-        The part that is wanted.
-    positions
-        File of the antennas' positions, in place of those in the data.
-    even
-        Whether channels must be at equal distances, and enough of them for power spectra.
-
-    Raises
-    ------
-    InputError
-        If the files cannot be read, or what is selected has no baselines, or `even` does not hold.
+    `positions` is a file of antenna positions that replace those in the data. `even` requires equally spaced channels,
+    and enough of them for power spectra. Raise InputError if the files cannot be read, or the selection has no
+    baselines, or `even` is not satisfied.
     """
     # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
     from calstudy.calibrate.standard_formats import PARALLEL_HANDS
@@ -227,19 +192,9 @@ def read_facts(
 
 
 def modelled(frame: Frame, path: Path) -> Frame:
-    """Return what is left of a frame with a sky model: the baselines of its file, and autocorrelations.
+    """Return the part of a frame that a sky model has: the baselines of its file, and autocorrelations.
 
-    Parameters
-    ----------
-    frame
-        Of the data.
-    path
-        Of the sky model, whose metadata are read.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or has none of the cross-correlations.
+    Raise InputError if the file cannot be read, or has none of the cross-correlations.
     """
     from calstudy.measured.reading import read_metadata
 
@@ -270,13 +225,7 @@ def _require_even(frequencies: np.ndarray) -> None:
 
 
 def require_same_sky(even: Facts, odd: Facts) -> None:
-    """Raise InputError unless two data sets can be crossed: the same array, channels and sidereal times.
-
-    Parameters
-    ----------
-    even, odd
-        Of the two data sets.
-    """
+    """Raise InputError unless two data sets can be crossed: the same array, channels and sidereal times."""
     if even.frequencies.shape != odd.frequencies.shape or not np.allclose(
         even.frequencies, odd.frequencies, rtol=0, atol=0.01 * even.channels.width
     ):
@@ -291,22 +240,14 @@ def require_same_sky(even: Facts, odd: Facts) -> None:
 
 
 def interleaved(data: UVData, parity: str) -> UVData:
-    """Return every second integration, from the first (even) or the second (odd).
-
-    Parameters
-    ----------
-    data
-        Rectangular and time-major.
-    parity
-        "even" or "odd".
-    """
+    """Return every second integration of rectangular, time-major data, from the first (even) or the second (odd)."""
     times = np.arange(PARITIES.index(parity), data.Ntimes, 2)
     rows = (times[:, None] * data.Nbls + np.arange(data.Nbls)).ravel()
     return data.select(blt_inds=rows, inplace=False, run_check=False)
 
 
 def flag_channels(data: UVData, text: str) -> None:
-    """Flag the channels in a range of frequencies, such as ``149.7 MHz..150.2 MHz``; raises InputError if none is."""
+    """Flag the channels in a range such as ``149.7 MHz..150.2 MHz``; raise InputError if it holds no channel."""
     low, high = parse_values({"frequencies": text}, "observed.flag: ").frequencies or (None, None)
     frequencies = np.ravel(data.freq_array)
     chosen = (frequencies >= (low or -np.inf)) & (frequencies <= (high or np.inf))
@@ -319,12 +260,9 @@ def flag_channels(data: UVData, text: str) -> None:
 
 
 def east_and_north(data: UVData) -> list[str]:
-    """Name the feeds of prepared data so that x is east and y is north; return what was changed in words.
+    """Name the feeds of prepared data so that x is east and y is north; return sentences on the changes.
 
-    Raises
-    ------
-    InputError
-        If the feeds are not linear, or neither to the east nor to the north.
+    Raise InputError if the feeds are not linear, or neither to the east nor to the north.
     """
     telescope = data.telescope
     linear = bool(np.all(np.isin(data.polarization_array, (-5, -6))))

@@ -1,4 +1,4 @@
-"""Flags where data of several baselines stand out from their surroundings in time and frequency, by hera_qm."""
+"""Flags of data of several baselines that stand out from their surroundings in time and frequency, by hera_qm."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ CELL, CHANNEL, INTEGRATION = 0.2, 0.05, 0.5
 """Fractions of samples that stand out, from which on a channel of an integration, a channel, and an integration are
 flagged: those of HERA's first season (`hera_qm.xrfi.xrfi_h1c_pipe`, with the rms of the fractions of baselines)."""
 LEAST_INTEGRATIONS, LEAST_CHANNELS = 3, 17
-"""With fewer there are no surroundings: hera_qm takes eight samples to each side."""
+"""Smallest numbers that have surroundings: hera_qm takes eight samples to each side."""
 NAMED = 8
-"""At most this many ranges of channels are named in a note."""
+"""Largest number of ranges of channels named in a note."""
 
 
 def require_surroundings(integrations: int, channels: int) -> None:
-    """Raise InputError unless so many integrations and channels, that are not flagged, have surroundings."""
+    """Raise InputError unless so many unflagged integrations and channels have surroundings."""
     if integrations < LEAST_INTEGRATIONS or channels < LEAST_CHANNELS:
         raise InputError(
             f"flag_interference: takes at least {LEAST_INTEGRATIONS} integrations and {LEAST_CHANNELS} channels that "
@@ -33,24 +33,15 @@ def require_surroundings(integrations: int, channels: int) -> None:
 
 
 def flag_interference(data: UVData, settings: Interference) -> str:
-    """Flag interference in all baselines and polarizations; return in words what was flagged.
+    """Flag interference in all baselines and polarizations; return a sentence on the flagged samples.
 
     Of each cross-correlation |V| is compared with the median of its surroundings, and with their scatter
     (`hera_qm.xrfi.xrfi_waterfall`). A channel of an integration is flagged if it stands out in a fifth of the baselines
     that have it, in any polarization; a channel if a twentieth of all its samples stand out; an integration if half of
     all its samples do. Autocorrelations do not take part: their noise is so low that the bandpass stands out.
 
-    Parameters
-    ----------
-    data
-        Rectangular and time-major; changed. Samples that are flagged do not take part, and stay flagged.
-    settings
-        How far samples must stand out.
-
-    Raises
-    ------
-    InputError
-        If there are only autocorrelations, or too few integrations or channels that are not flagged.
+    The data must be rectangular and time-major, and are changed. Flagged samples do not take part, and stay flagged.
+    Raise InputError if there are only autocorrelations, or too few integrations or channels that are not flagged.
     """
     pairs = antenna_pairs(data)
     crosses = pairs[:, 0] != pairs[:, 1]
@@ -71,19 +62,19 @@ def flag_interference(data: UVData, settings: Interference) -> str:
 
 
 def _cells(amplitudes: np.ndarray, known: np.ndarray, settings: Interference) -> np.ndarray:
-    """Return what is to be flagged, (Ntimes, Nfreqs), for |V| and what is known of it, (Ntimes, Nbls, Nfreqs)."""
+    """Return a mask of samples to flag, (Ntimes, Nfreqs), from |V| and a mask of known ones, (Ntimes, Nbls, Nfreqs)."""
     from hera_qm.xrfi import xrfi_waterfall
 
     hits = np.zeros(known.shape, bool)
     for baseline in range(known.shape[1]):
         seen = known[:, baseline]
-        # What is flagged altogether is left out; otherwise it would be the surroundings of its neighbours.
+        # Completely flagged rows and columns are left out; otherwise they would be their neighbours' surroundings.
         part = np.ix_(seen.any(axis=1), seen.any(axis=0))
         if min(seen[part].shape) < LEAST_INTEGRATIONS:
             continue
         values = _filled(amplitudes[:, baseline][part].astype(float), seen[part])
         with warnings.catch_warnings(), np.errstate(all="ignore"):
-            # It tells that few integrations are less than its box.
+            # It warns of fewer integrations than its box holds.
             warnings.simplefilter("ignore")
             stand_out = xrfi_waterfall(values, nsig_init=settings.significance, nsig_adj=settings.adjacent_significance)
         hits[:, baseline][part] = stand_out & seen[part]

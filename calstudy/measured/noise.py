@@ -1,16 +1,17 @@
 r"""The noise of measured data: from the difference of two halves, and from the autocorrelations.
 
 With E and O the averages of the halves, of n_e and n_o integrations and phased to the same point of the sky, the sky
-cancels in E - O, and the variance of it is sigma^2 (1/n_e + 1/n_o) for noise of variance sigma^2. The cross power of E
-and O has noise of the geometric mean of the variances of E and O, sigma^2 / sqrt(n_e n_o). Hence the power P_N of
+cancels in E - O, whose variance is sigma^2 (1/n_e + 1/n_o) for noise of variance sigma^2. The cross power of E and O
+has noise of the geometric mean of the variances of E and O, sigma^2 / sqrt(n_e n_o). Hence the noise of even x odd
+follows from the power P_N of
 
-    sqrt(sqrt(n_e n_o) / (n_e + n_o)) (E - O)
+    sqrt(sqrt(n_e n_o) / (n_e + n_o)) (E - O):
 
-is what the noise of even x odd follows from: one real part of a product has the variance P_N^2 / 2.
+the real part of one product has the variance P_N^2 / 2.
 
-The autocorrelations give the same by the radiometer equation, sigma^2 = V_aa V_bb / (channel width x time), over
-|g_a g_b|^2 for calibrated data. What the mean of the delay power is of visibilities whose moduli are known does not
-depend on their phases (Parseval), so that it is that of real visibilities sigma(nu).
+The autocorrelations give the same by the radiometer equation, sigma^2 = V_aa V_bb / (channel width x time), over |g_a
+g_b|^2 for calibrated data. The mean of the delay power of visibilities of known moduli does not depend on their phases
+(Parseval), so that it is that of real visibilities sigma(nu).
 """
 
 from __future__ import annotations
@@ -32,18 +33,8 @@ if TYPE_CHECKING:
 def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:
     """Return sigma^2 of samples of some baselines by the radiometer equation, (Ntimes, len(pairs), Nfreqs).
 
-    Parameters
-    ----------
-    data
-        With autocorrelations.
-    pairs
-        Antenna numbers (a, b), (Nbls, 2).
-    polarization
-        Index of the polarization.
-
-    Returns
-    -------
-    NaN where it is not known; None without the autocorrelations of all antennas.
+    `pairs` are antenna numbers, (Nbls, 2), and `polarization` is an index. The result is NaN where it is not known, and
+    None without the autocorrelations of all antennas.
     """
     all_pairs = antenna_pairs(data)
     autos = {int(a): row for row, (a, b) in enumerate(all_pairs) if a == b}
@@ -64,16 +55,8 @@ def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> n
 def sample_noise(data: UVData) -> float | None:
     """Return sigma of cross-correlations with nsamples of 1, by the radiometer equation, in the unit of the data.
 
-    It is the rms over all unflagged samples and polarizations.
-
-    Parameters
-    ----------
-    data
-        With autocorrelations.
-
-    Returns
-    -------
-    None without the autocorrelations of all antennas, or if none of their samples can be used.
+    It is the rms over all unflagged samples and polarizations; None without the autocorrelations of all antennas, or if
+    none of their samples can be used.
     """
     all_pairs, all_flags = antenna_pairs(data), flag_cube(data)
     crosses = all_pairs[:, 0] != all_pairs[:, 1]
@@ -92,11 +75,7 @@ def sample_noise(data: UVData) -> float | None:
 def half_difference(even: UVData, odd: UVData) -> UVData:
     """Return the difference of two averages, with the power P_N of the noise of their product.
 
-    Parameters
-    ----------
-    even, odd
-        One integration each, of the same baselines, phased to the same point. Not mutated. What is flagged in either is
-        flagged.
+    Both have one integration of the same baselines, phased to the same point. Samples flagged in either are flagged.
     """
     found = even.copy()
     n_even, n_odd = (_weights(uvd) for uvd in (even, odd))
@@ -108,21 +87,15 @@ def half_difference(even: UVData, odd: UVData) -> UVData:
 
 
 def _weights(uvd: UVData) -> np.ndarray:
-    """Return how long each sample was measured, s times nsamples."""
+    """Return the time of measurement of each sample, s times nsamples."""
     return uvd.nsample_array * np.asarray(uvd.integration_time)[:, None, None]
 
 
 def noise_of_average(variance: np.ndarray, uvd: UVData, times: np.ndarray) -> np.ndarray:
     """Return sigma of the average over some integrations, (Nbls, Nfreqs, Npols); NaN where nothing is unflagged.
 
-    Parameters
-    ----------
-    variance
-        sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols).
-    uvd
-        The data that are averaged: flags and numbers of samples, which are the weights.
-    times
-        Indices of the integrations, (n,).
+    `variance` is sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols); the numbers of samples in `uvd` are the
+    weights. `times` are indices of integrations, (n,).
     """
     weights = np.where(flag_cube(uvd), 0, uvd.nsample_array.reshape(variance.shape))[times]
     variance = variance[times]
@@ -132,20 +105,11 @@ def noise_of_average(variance: np.ndarray, uvd: UVData, times: np.ndarray) -> np
 
 
 def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> np.ndarray:
-    """Return P_N of each baseline, the mean over delays, (Nu,).
+    """Return P_N of each baseline, the mean over delays, (Nu,); NaN for a baseline without delays beyond the buffer.
 
-    Parameters
-    ----------
-    noise
-        Power of `half_difference`, or of the real noise from autocorrelations, of each baseline with itself.
-    buffer
-        Delays within |b|/c + buffer (s) are left out of a difference: what the sky changes between the halves is there.
-    everywhere
-        Whether to take all delays nevertheless.
-
-    Returns
-    -------
-    NaN for a baseline without delays beyond the buffer.
+    `noise` is the power of `half_difference`, or of the real noise from autocorrelations, of each baseline with itself.
+    Unless `everywhere`, delays within |b|/c + `buffer` (s) are left out: they contain changes of the sky between the
+    halves.
     """
     used = np.ones(noise.power.shape, bool) if everywhere else outside_wedge(noise, buffer)
     count = used.sum(axis=1)
@@ -154,16 +118,9 @@ def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> 
 
 
 def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarray) -> np.ndarray:
-    """Return P_N of each unit of spectra, (Nu,): the mean over its baselines.
+    """Return P_N of each unit of spectra (baseline or redundant group), (Nu,): the mean over its baselines.
 
-    Parameters
-    ----------
-    spectra
-        Of units: baselines, or redundant groups.
-    noise
-        Of each baseline with itself.
-    levels
-        P_N of each baseline; NaN is left out.
+    `noise` gives the vectors of the baselines, and `levels` P_N of each; NaN is left out.
     """
     known = np.isfinite(levels)
     both = np.concatenate([spectra.vectors, -spectra.vectors])

@@ -1,4 +1,4 @@
-"""Antenna positions of measured data whose file has wrong ones."""
+"""Antenna positions of measured data that replace wrong ones in the file."""
 
 from __future__ import annotations
 
@@ -14,19 +14,11 @@ from calstudy.instrument.settings import CsvLayout
 
 
 def place_antennas(data: UVData, path: Path) -> str:
-    """Give antennas their positions, and baselines the vectors between these; return in words what was changed.
+    """Give antennas their positions, and baselines the vectors between these; return a sentence on the changes.
 
-    Parameters
-    ----------
-    data
-        Drift-scan visibilities, perhaps only metadata; changed.
-    path
-        CSV file with columns number, east_m, north_m and up_m, about the location of the telescope.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be used, or lacks an antenna of the data, or the data are phased to a source.
+    `data` are drift-scan visibilities, perhaps only metadata, and are changed. `path` is a CSV file with columns
+    number, east_m, north_m and up_m, about the location of the telescope. Raise InputError if the file cannot be used,
+    or lacks an antenna of the data, or the data are phased to a source.
     """
     if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
         raise InputError("observed.positions: the data are phased to a source, by the positions that they have")

@@ -1,4 +1,4 @@
-"""What stands out in a finished calibration: gains, and chi^2 of antennas, channels and integrations."""
+"""Outliers of a finished calibration: gains, and chi^2 of antennas, channels and integrations."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from calstudy.measured.noise import radiometer_variance
 
 # Bandpasses and the antennas of an array differ by less than this; interference exceeds it by orders of magnitude.
 GAIN_FACTOR = 5.0
-# Of means over many samples: what is noise alone scatters by a few per cent.
+# Means of pure noise over many samples scatter by a few per cent.
 CHI2_FACTOR = 3.0
 NAMED = 6
-"""So many channels or antennas are named in a warning; solution.json has all of them."""
+"""Largest number of channels or antennas named in a warning; solution.json has all of them."""
 # Median over mean of the square of a complex normal variable.
 MEDIAN_OVER_MEAN = np.log(2)
 
@@ -29,8 +29,6 @@ class Quality:
 
     Attributes
     ----------
-    polarization
-        Its name.
     antennas
         Names of the antennas with solutions, (Nants,).
     frequency
@@ -41,9 +39,9 @@ class Quality:
         Median |g| of each antenna over the median of all antennas, (Nants,).
     chi2_by_antenna, chi2_by_channel, chi2_by_integration
         Mean of |V - g g* F|^2 / sigma^2 over unflagged samples, (Nants,), (Nfreqs,), (Ntimes,). Parameters of the fit
-        are not counted, so that it is a bit below one for noise.
+        are not counted, so that it is slightly below one for noise.
     noise
-        Where sigma is from, in words.
+        The source of sigma, in words.
     """
 
     polarization: str
@@ -58,7 +56,7 @@ class Quality:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences that name channels, antennas and integrations which stand out."""
+        """Sentences that name the channels, antennas and integrations that stand out."""
         highest = np.fmax.reduce(self.gain_by_channel, axis=0)
         channels = [f"{frequency / 1e6:.3f} MHz" for frequency in self.frequency]
         integrations = [f"integration {index}" for index in range(self.chi2_by_integration.size)]
@@ -106,7 +104,7 @@ def _median(values: np.ndarray) -> float:
 def _sentence(
     what: str, sign: str, names: Sequence[str], ratios: np.ndarray, factor: float, question: str = ""
 ) -> str | None:
-    """Return a sentence that names what has a ratio above a factor, the largest first; None if nothing has."""
+    """Return a sentence that names entries with a ratio above a factor, the largest first; None if there are none."""
     order = [int(index) for index in np.argsort(-np.nan_to_num(ratios)) if ratios[index] > factor]
     if not order:
         return None
@@ -120,20 +118,12 @@ def _ratio(sign: str, value: float) -> str:
 
 
 def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Quality:
-    """Measure what stands out in a calibration.
+    """Compute the gain ratios and chi^2 of a calibration.
 
     The noise is that of the radiometer equation, sigma^2 = V_aa V_bb / (channel width x integration time x nsamples),
     if the data have the autocorrelations of all calibrated antennas. Otherwise it is the median of |V - g g* F|, the
-    same for all samples, and chi^2 tells only which parts are worse than others.
-
-    Parameters
-    ----------
-    data
-        What was calibrated, as given to `calstudy.calibrate.execution.run_calibrator`.
-    result
-        What came out.
-    polarization
-        Index of the polarization.
+    same for all samples, and chi^2 only shows which parts are worse than others. `data` are those of
+    `calstudy.calibrate.execution.run_calibrator`, and `polarization` is an index.
     """
     gains, pairs = result.gains, antenna_pairs(result.model)
     numbers = np.unique(pairs)

@@ -1,6 +1,6 @@
 """Read visibilities of any format and bring them into the shape that calibration needs.
 
-Nothing is invented: samples that the shape needs and the data lack are flagged, and each change is reported in a note.
+Samples that the shape needs and the data lack are flagged, and each change is reported in a note.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from calstudy.measured.selection import Selection, select
 
 logger = logging.getLogger(__name__)
 
-# With fewer of its samples present, a data set has no common times and baselines worth speaking of.
+# With a smaller fraction of its samples present, a data set has too few baselines at common times.
 MIN_PRESENT = 0.5
-# Hz. Those of radio telescopes; others are in another unit, or damaged.
+# Range of radio telescopes, Hz; other values have another unit, or the file is damaged.
 LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e6, 1e12
 EVERYTHING = Selection()
 
@@ -37,14 +37,14 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
     Raises
     ------
     InputError
-        If a path does not exist, pyuvdata cannot read it, or its antennas have no place.
+        If a path does not exist, pyuvdata cannot read it, or its antennas have no positions.
     """
     _require_readable(paths)
     names = [str(path) for path in paths]
     keep_compiled_pyuvdata()
     try:
         data = UVData.from_file(names[0] if len(names) == 1 else names)
-    # Readers of eight formats raise whatever their libraries do; a file that cannot be read is the user's to mend.
+    # Readers of eight formats raise any error of their libraries; the user must repair a file that cannot be read.
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError) as error:
         raise InputError(f"{', '.join(names)}: cannot be read as visibilities ({_first_sentence(error)})") from None
     if data.data_array is None:
@@ -56,14 +56,14 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
 
 
 def read_metadata(paths: Sequence[Path]) -> UVData:
-    """Read what `read_visibilities` does without visibilities, where the format allows it; raises likewise."""
+    """Read a data set as `read_visibilities` does, but without visibilities where the format allows it."""
     _require_readable(paths)
     names = [str(path) for path in paths]
     data = UVData()
     keep_compiled_pyuvdata()
     try:
         data.read(names[0] if len(names) == 1 else names, read_data=False)
-    # As above; what cannot be read in parts may be readable as a whole.
+    # As above; a file that cannot be read in parts may be readable as a whole.
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError):
         return read_visibilities(paths)
     # The times of Miriad folders come with the visibilities.
@@ -90,7 +90,7 @@ def _require_readable(paths: Sequence[Path]) -> None:
 
 
 def _require_plausible(data: UVData, names: str) -> None:
-    """Raise InputError unless frequencies, channel widths, times and durations can be meant."""
+    """Raise InputError unless frequencies, channel widths, times and durations are plausible."""
     frequencies, widths = np.ravel(data.freq_array), np.ravel(data.channel_width)
     if not np.isfinite(frequencies).all():
         count = np.sum(~np.isfinite(frequencies))
@@ -123,25 +123,18 @@ def _first_sentence(error: Exception) -> str:
 def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:
     """Select, unphase, order and fill a data set; the given one is not changed.
 
-    Parameters
-    ----------
-    data
-        Visibilities as read.
-    selection
-        The part to keep.
-
     Returns
     -------
     data
         Parallel hands only, drift-scan, every baseline once at every time in time-major order; samples that were
         missing or not finite are flagged.
     notes
-        One sentence for each thing that was changed.
+        One sentence for each change.
 
     Raises
     ------
     InputError
-        If nothing is left, the polarizations are not of feeds, or baselines have hardly any times in common.
+        If nothing is left, the polarizations are not of feeds, or less than half of the samples are at common times.
     """
     notes: list[str] = []
     data = select(data, replace(selection, times=None)).copy()
@@ -180,7 +173,7 @@ def _keep_parallel_hands(data: UVData, notes: list[str]) -> None:
 
 
 def _name_feeds(data: UVData, notes: list[str]) -> None:
-    """Gains need to know which feeds they belong to; old files do not say."""
+    """Name the feeds of old files without names, because gains belong to feeds."""
     if data.telescope.feed_array is None:
         linear = bool(np.all(data.polarization_array <= -5))
         data.telescope.set_feeds_from_x_orientation(
@@ -227,7 +220,7 @@ def _filled(data: UVData, notes: list[str]) -> UVData:
     source = np.full(total, -1)
     source[place] = np.arange(data.Nblts)
     missing = source < 0
-    # A missing sample takes what belongs to its time from one sample, and what belongs to its baseline from another.
+    # A missing sample takes the properties of its time from one sample, and those of its baseline from another.
     of_time, of_baseline = np.empty(times.size, int), np.empty(baselines.size, int)
     of_time[time_index], of_baseline[baseline_index] = np.arange(data.Nblts), np.arange(data.Nblts)
     by_time = np.where(missing, np.repeat(of_time, baselines.size), source)
@@ -244,7 +237,7 @@ OF_BASELINE = ("ant_1_array", "ant_2_array", "baseline_array", "uvw_array", "int
 
 
 def _reindexed(data: UVData, by_time: np.ndarray, by_baseline: np.ndarray) -> UVData:
-    """Return data whose sample i is made of sample by_baseline[i], and of by_time[i] in what belongs to the time."""
+    """Return data whose sample i is sample by_baseline[i], with the properties of the time from sample by_time[i]."""
     result = data.copy()
     for parameter in data:
         values, form = getattr(data, parameter), getattr(data, parameter).form

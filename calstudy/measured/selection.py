@@ -1,4 +1,4 @@
-"""Which part of a data set is calibrated."""
+"""The part of a data set that is calibrated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KEYS = {
     "frequencies": "frequencies=120 MHz..180 MHz",
     "polarizations": "polarizations=xx,yy",
 }
-"""What can be selected, with an example each."""
+"""Keys of selections, with an example each."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Selection:
     polarizations
         Names such as ``xx`` or ``ee``.
     autos
-        Whether a selection of lengths keeps the autocorrelations of the antennas that are left.
+        If true, a selection of lengths keeps the autocorrelations of the antennas that are left.
     """
 
     antennas: tuple[str, ...] | None = None
@@ -54,7 +54,7 @@ class Selection:
 
 
 def parse_selection(texts: Sequence[str]) -> Selection:
-    """Read ``key=value`` texts as given to --select; see `KEYS` for what each key takes.
+    """Read the ``key=value`` texts of --select; `KEYS` has an example of each.
 
     Raises
     ------
@@ -73,22 +73,7 @@ def parse_selection(texts: Sequence[str]) -> Selection:
 
 
 def parse_values(values: Mapping[str, str], where: str, autos: bool = False) -> Selection:
-    """Read a value for each of some of the `KEYS`.
-
-    Parameters
-    ----------
-    values
-        By key.
-    where
-        What stands before a key in a message.
-    autos
-        Of the selection.
-
-    Raises
-    ------
-    InputError
-        If a value cannot be read.
-    """
+    """Read a value for each of some of the `KEYS`; raise InputError, with `where` before the key, for a bad one."""
     return Selection(**{key: _value(key, value, f"{where}{key}") for key, value in values.items()}, autos=autos)
 
 
@@ -156,7 +141,7 @@ def _within(values: np.ndarray, ends: tuple[Any, Any], key: str, what: str) -> n
 
 
 def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: bool) -> np.ndarray:
-    """Return which samples belong to baselines of these lengths; autocorrelations have length zero.
+    """Return a mask of the samples of baselines of these lengths (m); autocorrelations have length zero.
 
     With `autos` those of the antennas of these baselines are kept, too.
     """
@@ -190,7 +175,7 @@ def _polarization(data: UVData, name: str) -> int:
     for shown, number in zip(data.get_pols(), list(data.polarization_array), strict=True):
         numbers[shown.lower()] = int(number)
     if data.telescope.feed_array is None:
-        # Old files do not tell the orientation of their feeds; x is taken to be east, as when they are calibrated.
+        # Old files lack the orientation of their feeds; x is taken to be east, as in calibration.
         numbers |= {east: numbers[x] for east, x in (("ee", "xx"), ("nn", "yy")) if x in numbers}
     if name.lower() not in numbers:
         raise InputError(

@@ -32,19 +32,9 @@ IN_PACKAGE = re.compile(r"(?P<package>[A-Za-z_][A-Za-z0-9_.]+):(?P<path>[^/\\].*
 
 
 def find_data(text: str, folder: Path) -> Path:
-    """Return the absolute path of a file or folder, which may be given relative to a folder or to a package.
+    """Return the absolute path of a file or folder from ``package:path``, or from a path relative to `folder`.
 
-    Parameters
-    ----------
-    text
-        A path, or ``package:path``.
-    folder
-        Where relative paths start.
-
-    Raises
-    ------
-    InputError
-        If there is no such package, file or folder.
+    Raise InputError if there is no such package, file or folder.
     """
     if "\0" in text:
         raise InputError(f"{text!r} cannot be the path of a file")
@@ -129,7 +119,7 @@ class Select(Section):
 
 
 class Factor(Section):
-    """One unit of the data is so many Jy."""
+    """One unit of the data is a constant number of Jy."""
 
     kind: Literal["factor"]
     unit: FluxDensity = Field(gt=0, description="What one unit of the data is.")
@@ -148,7 +138,7 @@ FluxScale = Annotated[Factor | FromAutocorrelations, Field(discriminator="kind")
 
 
 class Interference(Section):
-    """How far data must stand out from their surroundings to be flagged."""
+    """Thresholds for flags of data that stand out from their surroundings."""
 
     significance: float = Field(6.0, ge=2, le=100, description="Standard deviations.")
     adjacent_significance: float = Field(
@@ -206,7 +196,7 @@ class ObservedSettings(Section):
 
 
 class InjectionSettings(Section):
-    """A simulated EoR that is put into the data under the gains that were solved for."""
+    """A simulated EoR that is added to the data under the fitted gains."""
 
     eor: Eor = Field(Eor(nside=128), description="As `sky.eor` of an experiment.")
     level: Decibel | None = Field(

@@ -1,4 +1,4 @@
-"""From a calibration to the arrays of its diagnostic figure."""
+"""Arrays of the diagnostic figure of a calibration."""
 
 from __future__ import annotations
 
@@ -13,16 +13,9 @@ from calstudy.observed.diagnostics_figure import MAX_ANTENNAS, Diagnostics, dela
 
 
 def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> Diagnostics:
-    """Collect what the diagnostic figure shows of one polarization.
+    """Collect the arrays of the diagnostic figure for one polarization, given by its index.
 
-    Parameters
-    ----------
-    data
-        What was calibrated, as given to `calstudy.calibrate.execution.run_calibrator`.
-    result
-        What came out.
-    polarization
-        Index of the polarization.
+    `data` are those of `calstudy.calibrate.execution.run_calibrator`, and `result` is its result.
     """
     model = result.model
     kept = {tuple(pair) for pair in antenna_pairs(model).tolist()}
@@ -61,7 +54,7 @@ def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> 
 
 
 def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the names of antennas with solutions, spread over the array, and their gains, NaN where flagged."""
+    """Return names of antennas with solutions, spread over the array, and their gains, NaN where flagged."""
     gains = result.gains
     flags = gains.flag_array[..., polarization]
     used = np.flatnonzero(~flags.all(axis=(1, 2)))

@@ -1,4 +1,4 @@
-"""What one looks at after a calibration: data, model and residual in delay, the gains, and how the solves converged."""
+"""The diagnostic figure of a calibration: data, model and residual in delay, gains, and convergence of the solves."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LINEAR_RANGE = 5.0
 SHORT_AXIS = 100.0
 LABELLED_DIGITS = (2, 3, 5)
 MAX_ANTENNAS = 8
-"""Gains are drawn of at most so many antennas; more would be a tangle."""
+"""Largest number of antennas whose gains are drawn."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,6 @@ class Diagnostics:
 
     Attributes
     ----------
-    polarization
-        Its name.
-    unit
-        Of the visibilities.
     delay
         s, ascending, (Ndelays,).
     lengths
@@ -49,7 +45,7 @@ class Diagnostics:
     losses
         Loss after each step over the first loss of its own solve, one array for each solve.
     converged
-        Whether each solve did, (Nsolves,).
+        True for each solve that converged, (Nsolves,).
     chi2_antennas
         Names of all calibrated antennas, (Nants,).
     chi2_by_antenna, chi2_by_channel, chi2_by_integration
@@ -75,20 +71,10 @@ class Diagnostics:
 
 
 def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.ndarray:
-    """Return the tapered delay transform's rms over integrations.
+    """Return the rms over integrations of the tapered delay transform, (Nbls, n_channels).
 
-    Parameters
-    ----------
-    cube
-        Visibilities, zero where flagged, (Ntimes, Nbls, Nfreqs).
-    positions
-        Channel numbers on an even grid, (Nfreqs,).
-    n_channels
-        Length of the grid.
-
-    Returns
-    -------
-    ndarray, (Nbls, n_channels), normalized so that a tone at a delay of the transform keeps its amplitude.
+    `cube` holds visibilities, zero where flagged, (Ntimes, Nbls, Nfreqs); `positions` are channel numbers on an even
+    grid of `n_channels`, (Nfreqs,). A tone at a delay of the transform keeps its amplitude.
     """
     taper = blackmanharris(n_channels)
     power = np.zeros((cube.shape[1], n_channels))

@@ -9,7 +9,7 @@ from calstudy.calibrate.gain_comparison import GainDifference
 from calstudy.plotting import style
 
 MOST_NAMES = 40
-"""Antennas are named on the axis if there are not more."""
+"""Largest number of antennas that are named on the axis."""
 
 
 @style.journal_style()

@@ -1,4 +1,4 @@
-"""The calibrator and its settings, from a file and from what was typed."""
+"""The calibrator and its settings, from a file and from the command line."""
 
 from __future__ import annotations
 
@@ -22,23 +22,12 @@ def read_calibrator(
 ) -> Calibrator:
     """Return the calibrator of a YAML file, or the default one, with changes; a value of None changes nothing.
 
-    Parameters
-    ----------
-    path
-        A file whose content is that of a `calibration` section, or that has one.
-    changes
-        Dotted path to value, applied first.
-    defaults
-        Likewise, where the calibrator has such a field: what is not asked for, and another calibrator need not know.
-    overrides
-        ``path=value`` texts, applied last. Relative paths start at the working directory.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, there is no such calibrator, or a field holds what is not allowed.
+    The file is a `calibration` section, or has one. `changes`, by dotted path, apply first. `defaults` likewise, but
+    only where the calibrator has such a field and the user has not set it. `overrides`, ``path=value`` texts, apply
+    last; relative paths in them start at the working directory. Raise InputError if the file cannot be read, there is
+    no such calibrator, or a field has an invalid value.
     """
-    # As in an experiment file, whose fields of the section have this in front.
+    # Overrides may use the path of the field in an experiment file.
     typed = [(field.removeprefix("calibration."), value) for field, value in map(parse_override, overrides)]
     asked = [(field, value) for field, value in changes.items() if value is not None]
     wanted = _changed(path, [*asked, *typed])

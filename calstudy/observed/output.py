@@ -1,4 +1,4 @@
-"""Write what a calibration gives, in standard formats, and never over something else unasked."""
+"""Files of a calibration in standard formats, which replace existing ones only on request."""
 
 from __future__ import annotations
 
@@ -24,16 +24,9 @@ FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
 
 
 def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
-    """Raise InputError if the folder cannot be written, or a file that will be written exists and may not be replaced.
+    """Raise InputError if the folder cannot be written, or a file exists that may not be replaced.
 
-    Parameters
-    ----------
-    folder
-        Where to.
-    extras
-        What is written besides the usual: `CALFITS`, `EXPECTED`.
-    overwrite
-        Whether files may be replaced.
+    `extras` names the optional files: `CALFITS`, `EXPECTED`.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output {folder}: is a file, not a folder")
@@ -47,14 +40,9 @@ def require_free(folder: Path, extras: Sequence[str], overwrite: bool) -> None:
 
 
 def describe(result: CalibrationResult, context: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of solution.json: what was asked, what was changed in the data, and every solve.
+    """Return the content of solution.json: the request, the changes of the data, and every solve.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    context
-        JSON types: settings, notes and the like.
+    `context` has JSON types: settings, notes and the like.
     """
     summary = result.summary()
     return {
@@ -69,12 +57,9 @@ def describe(result: CalibrationResult, context: dict[str, Any]) -> dict[str, An
 
 @contextmanager
 def writing_to(folder: Path) -> Iterator[None]:
-    """Make a folder for what the block writes; a disk that is full, and a folder that vanishes, are told in a sentence.
+    """Make a folder for the files of the block; raise InputError if the disk is full or the folder vanishes.
 
-    Raises
-    ------
-    InputError
-        In these cases. Any other error is a bug, and passes.
+    Any other error is a bug, and passes.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -101,8 +86,6 @@ def write_result(
 
     Parameters
     ----------
-    result
-        The calibration.
     description
         From `describe`.
     folder
@@ -110,13 +93,9 @@ def write_result(
     figure
         A matplotlib figure and its arrays.
     extras
-        `CALFITS` if the gains are to be written as calfits as well.
+        `CALFITS` to write the gains as calfits as well.
     expected
         Expected transfer functions, by polarization.
-
-    Returns
-    -------
-    The paths.
 
     Raises
     ------

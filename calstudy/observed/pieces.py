@@ -1,4 +1,4 @@
-"""Calibration in pieces of consecutive integrations, each kept in a folder, so that an interrupted one is resumed."""
+"""Calibration in pieces of consecutive integrations, each kept in a folder, so that an interrupted one can resume."""
 
 from __future__ import annotations
 
@@ -23,20 +23,12 @@ from calstudy.products.files import GAINS, MODEL, RESIDUAL
 
 RECORDS = "records.json"
 NOT_FINITE = ("newton_decrement", "decrement_rms")
-"""Numbers of a record that JSON has as null where they are NaN."""
+"""Numbers of a record that are null in JSON where they are NaN."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """What is calibrated, and from what.
-
-    Attributes
-    ----------
-    data, sky_model
-        As `calstudy.calibrate.execution.run_calibrator` takes them.
-    gains
-        To start from; those closest in time are taken.
-    """
+    """Data and sky model of a calibration, and gains to start from, of which the closest in time are taken."""
 
     data: UVData
     sky_model: UVData | None = None
@@ -44,17 +36,7 @@ class Given:
 
 
 def pieces_folder(output: Path, paths: Sequence[Path], content: Mapping[str, Any]) -> Path:
-    """Return the folder in which pieces are kept: other settings, or files that have changed, have another.
-
-    Parameters
-    ----------
-    output
-        Folder of the results.
-    paths
-        All input files.
-    content
-        JSON types: settings and selection.
-    """
+    """Return the folder of the pieces, another one for other settings (`content`, JSON types) or changed files."""
     files = [[str(path.resolve()), path.stat().st_mtime_ns, path.stat().st_size] for path in paths]
     return output / f".unfinished-{digest_json({'version': __version__, 'files': files, **content})[:12]}"
 
@@ -62,16 +44,8 @@ def pieces_folder(output: Path, paths: Sequence[Path], content: Mapping[str, Any
 def calibrate_in_pieces(calibrator: Calibrator, given: Given, folder: Path, progress: Progress) -> CalibrationResult:
     """Calibrate `calibrator.chunks` pieces of integrations; pieces in the folder are not made again.
 
-    Parameters
-    ----------
-    calibrator
-        Fitted to the memory.
-    given
-        Data, sky model, gains.
-    folder
-        Where finished pieces are kept; the caller removes it. Not used for a single piece.
-    progress
-        Called after each solve with the number done and the total.
+    The calibrator is fitted to the memory. The caller removes the folder, which a single piece does not use. `progress`
+    is called after each solve with the number done and the total.
     """
     groups = calibrator.solves(given.data.Ntimes)
     count = min(calibrator.chunks, len(groups))
@@ -126,7 +100,7 @@ def _joined(results: Sequence[CalibrationResult]) -> CalibrationResult:
 
 
 def _write(result: CalibrationResult, place: Path) -> None:
-    """Write a piece; it is there whole or not at all."""
+    """Write a piece completely or not at all."""
     work = place.with_name(f".writing-{uuid4().hex}")
     try:
         with writing_to(work):
@@ -157,5 +131,5 @@ def _record(content: Mapping[str, Any]) -> SolveRecord:
     fields = {name: value for name, value in content.items() if name not in ("first_loss", "last_loss")}
     losses = [np.nan if loss is None else loss for loss in fields.pop("loss_history")]
     numbers = {name: np.nan if fields[name] is None else fields[name] for name in NOT_FINITE}
-    # Pieces of earlier versions do not say it.
+    # Pieces of earlier versions lack it.
     return SolveRecord(**{"cpu_seconds": None, **fields, **numbers, "loss_history": np.array(losses, float)})

@@ -19,23 +19,10 @@ SECONDS_PER_DAY = 86400.0
 def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:
     """Phase to the zenith at the middle of the run and average all integrations into one.
 
-    Parameters
-    ----------
-    uvd
-        Drift-scan visibilities. Not mutated. Flagged samples do not enter the average; samples weigh by nsamples.
-    centre
-        Julian date in place of the middle, for data sets that are to have the same phase centre; integrations may then
-        be missing.
-
-    Returns
-    -------
-    UVData with one integration, phased to the ICRS position of the zenith at the middle of the run, in the same unit
-    and with the baselines in the same order.
-
-    Raises
-    ------
-    ValueError
-        If the data set is not rectangular.
+    Flagged samples do not enter the average; the others weigh by nsamples. `centre` is a Julian date that replaces the
+    middle, for data sets that must share a phase centre; integrations may then be missing. The result is phased in
+    ICRS, with the unit and the order of baselines of `uvd`, which is not changed. Raise ValueError if `uvd` is not
+    rectangular.
     """
     require_rectangular(uvd)
     use_bundled_earth_orientation()
@@ -56,16 +43,10 @@ def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive integrations that are averaged into one.
+    """Consecutive integrations, by their indices `times`, (n,), that are averaged into one.
 
-    Attributes
-    ----------
-    times
-        Their indices, (n,).
-    centre
-        Julian date at which the phase centre is at the zenith; None for their middle.
-    number
-        Of the block among those of the run, from 0.
+    `centre` is the Julian date at which the phase centre is at the zenith; None for the middle of the integrations.
+    `number` is the place of the block in the run, from 0.
     """
 
     times: np.ndarray
@@ -74,23 +55,11 @@ class Block:
 
 
 def divide(times_jd: np.ndarray, integration: float, count: int, span: Sequence[float] | None = None) -> list[Block]:
-    """Divide a run into blocks of the same duration.
+    """Divide a run into `count` blocks of the same duration and return those that have integrations.
 
-    Parameters
-    ----------
-    times_jd
-        Julian dates of the integrations, ascending, (n,).
-    integration
-        Duration of one, s.
-    count
-        Number of blocks, see `calstudy.power.settings.PowerSettings.n_blocks`.
-    span
-        First and last integration of the run, if others than those in `times_jd`, for data sets whose blocks are to
-        have the same phase centres.
-
-    Returns
-    -------
-    The blocks that have integrations.
+    `times_jd` are Julian dates, ascending, (n,), and `integration` is the duration of one, s. `span` is the first and
+    the last integration of the run if not those of `times_jd`, for data sets whose blocks must share their phase
+    centres.
     """
     first, last = span or (times_jd[0], times_jd[-1])
     half = integration / SECONDS_PER_DAY / 2
@@ -103,19 +72,7 @@ def divide(times_jd: np.ndarray, integration: float, count: int, span: Sequence[
 
 
 def average_in_blocks(uvd: UVData, blocks: Sequence[Block]) -> UVData:
-    """Average the integrations of each block as `fringe_stop_and_average` does.
-
-    Parameters
-    ----------
-    uvd
-        Drift-scan visibilities. Not mutated.
-    blocks
-        From `divide`.
-
-    Returns
-    -------
-    UVData with one integration for each block, phased to its own centre.
-    """
+    """Average the integrations of each block as `fringe_stop_and_average` does, each block phased to its own centre."""
     if len(blocks) == 1 and blocks[0].times.size == uvd.Ntimes:
         return fringe_stop_and_average(uvd, blocks[0].centre)
     times = np.unique(uvd.time_array)
@@ -127,6 +84,6 @@ def average_in_blocks(uvd: UVData, blocks: Sequence[Block]) -> UVData:
 
 
 def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Where each of `wanted` is in `values`, both 1D of unique entries."""
+    """Return the index in `values` of each of `wanted`, both 1D with unique entries."""
     order = np.argsort(values)
     return order[np.searchsorted(values, wanted, sorter=order)]

@@ -1,4 +1,4 @@
-r"""Mean, scatter and covariance of what many realizations measured, whose parts were drawn in blocks.
+r"""Mean, scatter and covariance over many realizations whose parts were drawn in blocks.
 
 A study draws its parts (EoR, gains, noise) again in blocks. Each of B blocks draws its own parts K_b times and leaves
 the others as they are in the first realization, x_0, which is in every block. A measured quantity is
@@ -6,9 +6,9 @@ the others as they are in the first realization, x_0, which is in every block. A
     x = mu + sum_S f_S,
 
 where S runs over the sets of blocks and f_S, with variance V_S, depends on the draws of all blocks in S together: the
-terms of a random-effects model. S of one block is a main effect. S of several is an interaction, such as the product of
-noise and EoR in P^R: it is another one as soon as one of its factors is drawn again. The only assumption is that the
-draws are independent.
+terms of a random-effects model. An S of one block is a main effect. An S of several is an interaction, such as the
+product of noise and EoR in P^R: it changes as soon as one of its factors is drawn again. The only assumption is that
+the draws are independent.
 
 **One block.** mu and V are the mean and the variance of K realizations; nothing else is assumed.
 
@@ -16,31 +16,32 @@ draws are independent.
 
     mu = x_0 + sum_b a (m_b - x_0),   a = 1 / sqrt(B).
 
-Blocks scatter by s_b^2, whose expectation is the sum of V_S over all S that contain b. V_S is in the variance of mu as
+Blocks scatter by s_b^2, whose expectation is the sum of V_S over all S that contain b. In the variance of mu, V_S has
+the factor
 
     (1 - |S| a)^2 + sum_{b in S} a^2 / (K_b - 1),
 
-|S| the number of blocks in S, and in
+where |S| is the number of blocks in S, and in
 
     error^2 = sum_b s_b^2 [(1 - a)^2 + a^2 / (K_b - 1)]
 
-with |S| (1 - a)^2 in place of the first term. The latter is not below the former as long as a^2 <= 1 / |S|. They are
-equal for main effects, and for what depends on all blocks. The error is therefore right for these, whatever their
+the first term is |S| (1 - a)^2 instead. The latter is not below the former as long as a^2 <= 1 / |S|. They are equal
+for main effects, and for terms that depend on all blocks. The error is therefore right for these, whatever their
 shares, and too large for interactions of two out of three blocks. Without interactions a = 1 - 1 / K_b would be best;
 the error is larger than that by 6 % for ten and four draws that scatter alike, and by up to 19 % where only the block
-of ten has scatter. With that a, however, a mere interaction has the error 0.84 instead of 0.63 (in units of its
+of ten has scatter. With that a, however, a pure interaction has the error 0.84 instead of 0.63 (in units of its
 scatter), and 0.59 from s_b^2 / K_b. `a` is 1 - 1 / K_b where that is smaller.
 
-**Scatter of several blocks.** The variance of one realization is sum_S V_S. The sum of the s_b^2 has V_S in it |S|
-times. Interactions show in the first realization, for it is the only one that is in several blocks:
+**Scatter of several blocks.** The variance of one realization is sum_S V_S. The sum of the s_b^2 contains V_S |S|
+times. The first realization shows the interactions, because it is the only one that is in several blocks:
 
     <(x_0 - m_b) (x_0 - m_c)> = sum of V_S over all S that contain b and c.
 
-With P the sum of this over all pairs of blocks, V = sum_b s_b^2 - 2 P / B counts main effects and what depends on all
-blocks once, and interactions of two out of three blocks 4/3 times. In one bin, P is a product of two numbers, and
-hardly known. So the part of sum_b s_b^2 that is counted too often is estimated from all bins together, in units of
-their quoted errors, and taken to be the same in all of them. It is between 0 and the part without which V would be
-below the largest s_b^2. The estimate needs many independent bins: where all bins move together, the scatter is
+With P the sum of this over all pairs of blocks, V = sum_b s_b^2 - 2 P / B counts main effects and terms that depend on
+all blocks once, and interactions of two out of three blocks 4/3 times. In one bin, P is a single product of two numbers
+and very uncertain. The part of sum_b s_b^2 that is counted too often is therefore estimated from all bins together, in
+units of their quoted errors, and taken to be the same in all of them. It is between 0 and the part without which V
+would be below the largest s_b^2. The estimate needs many independent bins: where all bins move together, the scatter is
 uncertain by up to sqrt(B).
 """
 
@@ -59,8 +60,8 @@ class Pooled:
 
     Attributes
     ----------
-    mean, scatter, error
-        Mean, standard deviation of one realization, and standard error of the mean, (Nk,).
+    scatter, error
+        Standard deviation of one realization, and standard error of the mean, (Nk,).
     quoted
         rms of the errors that the realizations quote, (Nk,).
     covariance
@@ -84,18 +85,7 @@ class Pooled:
 
 
 def pool(values: np.ndarray, quoted: np.ndarray) -> Pooled:
-    """Pool one quantity over K realizations, of one block.
-
-    Parameters
-    ----------
-    values, quoted
-        Of each realization and its quoted error, (K, Nk).
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two realizations.
-    """
+    """Pool values and their quoted errors, (K, Nk), over the K realizations of one block, at least two."""
     if len(values) < 2:
         raise ValueError(f"{len(values)} realization to pool, expected at least two")
     deviations = values - values.mean(axis=0)
@@ -106,14 +96,9 @@ def pool(values: np.ndarray, quoted: np.ndarray) -> Pooled:
 
 
 def together(values: np.ndarray, quoted: np.ndarray, blocks: Sequence[Sequence[int]]) -> Pooled:
-    """Pool one quantity over all blocks.
+    """Pool values and their quoted errors, (K, Nk), over all blocks.
 
-    Parameters
-    ----------
-    values, quoted
-        Of each realization and its quoted error, (K, Nk).
-    blocks
-        The realizations of each block; the first is in all of them.
+    `blocks` lists the realizations of each block; the first realization is in all of them.
     """
     pooled = [pool(values[list(block)], quoted[list(block)]) for block in blocks]
     common, mean, variance = values[0], values[0].copy(), np.zeros(values.shape[1])
@@ -141,12 +126,8 @@ def together(values: np.ndarray, quoted: np.ndarray, blocks: Sequence[Sequence[i
 def _counted_twice(scatters: np.ndarray, from_others: np.ndarray) -> float:
     """Return the part of the sum of the blocks' variances that is in several of them, over all bins.
 
-    Parameters
-    ----------
-    scatters
-        Standard deviation of one realization in each of B blocks, in a unit that makes bins alike, (B, Nk).
-    from_others
-        The first realization less the mean of the others of each block, (B, Nk).
+    `scatters` are the standard deviations of one realization in each of B blocks, in a unit that makes bins alike;
+    `from_others` the first realization less the mean of the others of each block; (B, Nk) each.
     """
     known = np.isfinite(scatters).all(axis=0)
     squares = np.sum(scatters[:, known] ** 2, axis=1)

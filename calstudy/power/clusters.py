@@ -1,8 +1,8 @@
 r"""Errors of sums over baselines that have antennas in common.
 
-What a calibration does to a signal is done by its gains, and each gain acts on all baselines of its antenna. The
-scatter of baselines, taken as independent, therefore understates the error of a sum over them. Errors here come from
-leaving out antennas.
+A calibration changes a signal through its gains, and each gain acts on all baselines of its antenna. The scatter of
+baselines, taken as independent, therefore understates the error of a sum over them. Errors here come from leaving out
+antennas.
 
 Let d_s be the deviation that each sample s (a baseline, or a redundant group) adds to a sum of mean zero, d_a that of
 all pairs of baselines that contain antenna a, w_a the part of the modes that these pairs have, and f_{sa} their part of
@@ -16,12 +16,12 @@ The second counts the first as well, f_{sa}^2 of it for each antenna of a sample
     var = n / (n - 1) sum_s d_s^2 + (N - 1) / N sum_a [d_a^2 - sum_s (f_{sa} d_s)^2] / (1 - w_a)^2
 
 for n samples. For samples of one baseline and many antennas this is the sum of d_s d_t over all baselines s and t with
-an antenna in common, the variance of dyadic data (Fafchamps & Gubert 2007, J. Dev. Econ. 83, 326). What the antennas
-add may come out negative by chance, and is then taken as zero.
+an antenna in common, the variance of dyadic data (Fafchamps & Gubert 2007, J. Dev. Econ. 83, 326). The term of the
+antennas may be negative by chance, and is then taken as zero.
 
 Two cases are conservative. Deviations of single baselines within redundant groups have no term of their own: errors
 are then 1.2 to 1.6 times too large. And where gains are fitted to all baselines, the loss of all baselines together is
-fixed by counting unknowns, which no scatter knows.
+fixed by the number of unknowns, which does not appear in any scatter.
 """
 
 from __future__ import annotations
@@ -38,28 +38,22 @@ if TYPE_CHECKING:
 
 
 LARGEST_PART = 0.5
-"""Where an antenna has a larger part of the modes of a bin, little is left without it; this part is assumed."""
+"""Upper limit of w_a: little of a bin is left without an antenna that has a larger part of its modes."""
 
 
 @dataclass(frozen=True)
 class Clusters:
-    """How the modes of delay spectra fall into bins, and within these into samples and antennas.
+    """Sums into which the modes of delay spectra fall: by bin, and within bins by sample and antenna.
 
     Attributes
     ----------
-    n_bins
-        Number of bins.
     mode, share_mode
         Sum to which each mode (Nu, Nd) and each antenna's share of a unit (Nm, Nd) belongs; -1 for none.
-    owner
-        Bin of each sum over a sample, (Nsums,).
-    weight
-        Modes in each sum over a sample, each once per pair of baselines, (Nsums,).
-    share_sample, share_antenna
-        Sum over a sample, and antenna, of each sum over the share of an antenna in a sample, (Nshares,). Empty if the
-        antennas are not known.
-    share_weight
-        As `weight`, of the pairs that contain the antenna, (Nshares,).
+    owner, weight
+        Bin of each sum over a sample, and the modes in it, each once per pair of baselines, (Nsums,).
+    share_sample, share_antenna, share_weight
+        Sum over a sample, antenna, and weight of each sum over the share of an antenna in a sample, (Nshares,). The
+        weight counts the pairs that contain the antenna. Empty if the antennas are not known.
     """
 
     n_bins: int
@@ -73,18 +67,9 @@ class Clusters:
 
     @classmethod
     def of(cls, spectra: DelaySpectra, bins: np.ndarray, samples: np.ndarray, n_bins: int) -> Clusters:
-        """Find the sums.
+        """Find the sums from the bin, -1 for none, and the sample of each mode, (Nu, Nd) int each.
 
-        Parameters
-        ----------
-        spectra
-            Give the units and what their antennas share.
-        bins
-            Bin of each mode, (Nu, Nd) int; -1 for those left out.
-        samples
-            Number of the sample of each mode, (Nu, Nd) int. A sample has modes of one unit only.
-        n_bins
-            Number of bins.
+        A sample has modes of one unit only.
         """
         mode, (owner, _) = _number(bins, samples)
         unit = spectra.share_unit
@@ -100,7 +85,7 @@ class Clusters:
 
     @classmethod
     def of_baselines(cls, antennas: np.ndarray) -> Clusters:
-        """Return those of one number per baseline, all in one bin, from its antennas, (Nbls, 2)."""
+        """Return the clusters of one number per baseline, all in one bin, from the antennas of each, (Nbls, 2)."""
         baselines = np.arange(len(antennas))
         return cls(
             n_bins=1,
@@ -115,18 +100,13 @@ class Clusters:
 
     @property
     def n_samples(self) -> np.ndarray:
-        """Samples in each bin, (n_bins,) int."""
+        """Number of samples in each bin, (n_bins,) int."""
         return np.bincount(self.owner, minlength=self.n_bins)
 
     def sums(self, values: np.ndarray, shares: np.ndarray) -> Sums:
-        """Add up.
+        """Add up a quantity of each mode, (Nu, Nd), summed over the pairs of its unit.
 
-        Parameters
-        ----------
-        values
-            What each mode adds, summed over the pairs of its unit, (Nu, Nd).
-        shares
-            The part of it by the pairs that contain an antenna, (Nm, Nd).
+        `shares` are the parts of it by the pairs that contain an antenna, (Nm, Nd).
         """
         samples = _added(values, self.mode, self.owner.size)
         return Sums(self, samples, _added(shares, self.share_mode, self.share_sample.size))
@@ -137,21 +117,13 @@ class Clusters:
 
     @property
     def counts(self) -> Sums:
-        """Numbers of modes, each once per pair of baselines."""
+        """Numbers of modes, each counted once per pair of baselines."""
         return Sums(self, self.weight, self.share_weight)
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Sums over the samples of each bin, and over the antennas' shares in them.
-
-    Attributes
-    ----------
-    clusters
-        What is added up.
-    samples, shares
-        (Nsums,) and (Nshares,).
-    """
+    """Sums over the samples of each bin, (Nsums,), and over the antennas' shares in them, (Nshares,)."""
 
     clusters: Clusters
     samples: np.ndarray
@@ -164,7 +136,6 @@ class Sums:
         return np.where(self.clusters.n_samples > 0, total, np.nan)
 
     def __sub__(self, other: Sums) -> Sums:
-        """Return the sums of the difference."""
         return Sums(self.clusters, self.samples - other.samples, self.shares - other.shares)
 
     def ratio(self, reference: Sums) -> tuple[np.ndarray, np.ndarray]:
@@ -180,14 +151,8 @@ class Sums:
 def linear_error(terms: tuple[tuple[np.ndarray, Sums], ...]) -> np.ndarray:
     """Return the standard deviation of a linear combination of totals whose deviations add up to zero in each bin.
 
-    Parameters
-    ----------
-    terms
-        Factors, (n_bins,), and the sums that they multiply.
-
-    Returns
-    -------
-    (n_bins,); NaN in bins of one sample, whose scatter is not known.
+    `terms` are factors, (n_bins,), and the sums that they multiply. The error, (n_bins,), is NaN in bins of one sample,
+    whose scatter is not known.
     """
     clusters = terms[0][1].clusters
     share_owner = clusters.owner[clusters.share_sample]
@@ -217,7 +182,7 @@ def _number(groups: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, tuple[np
 
 
 def _combinations(group: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the groups and labels of all combinations of the two, not negative, and the number of each entry's."""
+    """Return the groups and labels, none negative, of all combinations, and the combination's number of each entry."""
     count = int(label.max(initial=0)) + 1
     found, index = np.unique(group * count + label, return_inverse=True)
     return found // count, found % count, index
@@ -229,18 +194,10 @@ def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
 
 
 def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
-    """Return how modes fall into bins of |k|, outside or inside the wedge, each unit being a sample.
+    """Return the clusters of the modes in bins of |k|, outside or inside the wedge; each unit is a sample.
 
-    Parameters
-    ----------
-    spectra
-        Whose modes.
-    edges
-        Of the bins, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
-    buffer
-        Modes with |tau| <= |b|/c + buffer (s) are inside the wedge.
-    inside
-        Which modes are meant; the others are left out.
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with |tau| <=
+    |b|/c + `buffer` (s) are inside the wedge.
     """
     bins = np.searchsorted(edges, np.hypot(spectra.k_perp[:, None], spectra.k_parallel), side="left") - 1
     bins[(bins >= edges.size - 1) | (outside_wedge(spectra, buffer) == inside)] = -1

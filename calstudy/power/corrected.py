@@ -1,14 +1,14 @@
 r"""P^R corrected for signal loss: divided by the transfer function T of other realizations than the one it corrects.
 
-P^R / T estimates the EoR without loss. T of the same data would not do: it knows the EoR and the noise that are to be
-measured. T of realization r is the mean over realizations of other gains and other noise, which cause most of the
+P^R / T estimates the EoR without loss. T of the same data would not serve: it contains the EoR and the noise that are
+to be measured. T of realization r is the mean over realizations of other gains and other noise, which cause most of the
 scatter of T (through the flux scale); each draw of them has the same weight. The EoR may be the same: T is a ratio to
-its power, and hardly depends on it. T_r differs from that mean by
+its power, and nearly independent of it. T_r differs from that mean by
 
     sigma_T^2 = sum_b s_b^2 sum_g w_g^2
 
-(`calstudy.power.realizations` has the blocks b of what is drawn), where g are the draws of block b, w = 1 for the draw
-of r, less the share that each draw has in the mean. s_b^2 is the scatter of the other realizations. What depends on
+(`calstudy.power.realizations` defines the blocks b of draws), where g are the draws of block b, w = 1 for the draw of
+r, less the share that each draw has in the mean. s_b^2 is the scatter of the other realizations. A term that depends on
 several blocks together is in each of their s_b^2, and so makes sigma_T too large rather than too small.
 
 Noise and EoR pass through the same projection, which reduces the noise in P^R by about T as well; dividing by T
@@ -17,7 +17,7 @@ restores it to that of the data. So with P = P^R / T,
     sigma^2 (P - P^S) = sigma_{R-S}^2 + (P sigma_T / T)^2,
 
 where sigma_{R-S} is the error of P^R - P^S, of noise and its product with the EoR
-(`SphericalSpectrum.difference_error`); P less the input power has the sample variance of the input power besides,
+(`SphericalSpectrum.difference_error`); P less the input power also has the sample variance of the input power,
 
     sigma_S^2 = P_input^2 / (independent modes of the signal).
 
@@ -25,7 +25,7 @@ The sample error of a spectrum follows its own power instead, so that low powers
 modes such bars cover the input in 94.2 % of cases instead of 95.1, with twelve in 91.1 instead of 95.4 %. The 95 %
 interval is the set of input powers that differ from P by at most 1.96 of the standard deviations that belong to them.
 
-There is no result where too little of the EoR is left, or where what is left is power from elsewhere
+There is no result where too little of the EoR is left, or where most of the power is from elsewhere
 (`calstudy.power.correctable`).
 """
 
@@ -47,7 +47,7 @@ class Corrected:
     Attributes
     ----------
     transfer, transfer_error
-        Mean T of the other realizations, and by how much T of this one is expected to differ from it, (K, Nk).
+        Mean T of the other realizations, and the expected deviation of this one's T from it, (K, Nk).
     power
         P^R / T, (K, Nk), mK^2 h^-3 Mpc^3.
     error, error_with_sample
@@ -55,7 +55,7 @@ class Corrected:
     power_known_scale
         P^R s^2 / (T s^2), (K, Nk): P^R on the true flux scale, by s of the realization itself, over T s^2 of others.
     shared
-        How many parts (of EoR, gains and noise) at most are the same in the realizations that T is from, (K,) int.
+        Largest number of parts (EoR, gains, noise) in common with a realization that T is from, (K,) int.
     reasons
         Why a bin is not corrected in any realization, (Nk,) str; empty where it is.
     """
@@ -73,12 +73,8 @@ class Corrected:
 def transfer_of_others(values: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean T of other realizations, and the expected deviation of each one's own T from it, (K, Nk) each.
 
-    Parameters
-    ----------
-    values
-        T of all realizations, (K, Nk).
-    design
-        Which draws they have. A block with fewer than two other realizations leaves the deviation unknown: NaN.
+    `values` are T of all realizations, (K, Nk). A block of the design with fewer than two other realizations leaves the
+    deviation unknown: NaN.
     """
     mean, variance = np.empty(values.shape), np.zeros(values.shape)
     for own in range(len(values)):
@@ -143,14 +139,10 @@ def _of_others(name: str, samples: Sequence[Sample], design: Design) -> tuple[np
 
 
 def _reason(known: np.ndarray, error: np.ndarray, judged: np.ndarray) -> str:
-    """Say why a bin is not corrected in any of K realizations, by the first of them with an error.
+    """Explain why a bin is not corrected in any of K realizations, by the first of them with an error.
 
-    Parameters
-    ----------
-    known, error
-        Where it is corrected, and the error of T by scatter, (K,).
-    judged
-        T, C and their errors, as `why_not` takes them, (K, 4).
+    `known` and `error`, (K,), are where it is corrected and the error of T by scatter; `judged`, (K, 4), the arguments
+    of `why_not`.
     """
     if known.any():
         return ""

@@ -1,7 +1,7 @@
-"""From baselines and delays to wavenumbers: the one cosmology of a study.
+"""Conversion of baselines and delays to wavenumbers, with the one cosmology of a study.
 
-The amplitude of the simulated 21 cm signal and the power spectrum estimator both go through astropy's cosmologies.
-hera_pspec has its own class with its own distances; `hera_conversions` makes one that agrees with astropy.
+The amplitude of the simulated 21 cm signal and the power spectrum estimator both use astropy's cosmologies. hera_pspec
+has its own class with its own distances; `hera_conversions` makes one that agrees with astropy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 
 def make_cosmology(name: str) -> FLRW:
-    """Return astropy's cosmology of this name ("Planck15", "Planck18" or "WMAP9"); raises ValueError for another."""
+    """Return astropy's cosmology of this name ("Planck15", "Planck18" or "WMAP9"); raise ValueError for another."""
     import astropy.cosmology
 
     if name not in astropy.cosmology.available:
@@ -46,55 +46,23 @@ def radial_scale(cosmology: FLRW, z: float) -> float:
 
 
 def k_perpendicular(cosmology: FLRW, length: np.ndarray, frequency: float) -> np.ndarray:
-    """Return k_perp = 2 pi |b| / (lambda X) in h/Mpc.
-
-    Parameters
-    ----------
-    cosmology
-        Gives X and h.
-    length
-        Baseline lengths in m, any shape.
-    frequency
-        Hz.
-    """
+    """Return k_perp = 2 pi |b| / (lambda X) in h/Mpc for baseline lengths in m, of any shape, at a frequency in Hz."""
     wavelengths = np.asarray(length) * frequency / SPEED_OF_LIGHT
     return 2 * np.pi * wavelengths / transverse_scale(cosmology, redshift(frequency)) / cosmology.h
 
 
 def k_parallel(cosmology: FLRW, delay: np.ndarray, frequency: float) -> np.ndarray:
-    """Return k_par = 2 pi tau / Y in h/Mpc.
-
-    Parameters
-    ----------
-    cosmology
-        Gives Y and h.
-    delay
-        s, any shape.
-    frequency
-        Band centre in Hz.
-    """
+    """Return k_par = 2 pi tau / Y in h/Mpc for delays in s, of any shape, at the centre of the band in Hz."""
     return 2 * np.pi * np.asarray(delay) / radial_scale(cosmology, redshift(frequency)) / cosmology.h
 
 
 def hera_conversions(cosmology: FLRW, z: float) -> Cosmo_Conversions:
-    """Return hera_pspec's cosmology object with astropy's distances around redshift `z`.
+    """Return hera_pspec's cosmology object with astropy's distances around redshift `z`, the centre of the band.
 
-    hera_pspec knows matter, curvature and Lambda only, which makes its X^2 Y 0.1 to 0.8 % too large for Planck15
-    because radiation and massive neutrinos are missing, and stores those numbers in its files. Here the matter and
-    Lambda terms are set so that both H(z) and the comoving distance equal astropy's at `z`: *effective* densities,
-    which survive a round trip through HDF5 and describe this redshift, not today.
-
-    Parameters
-    ----------
-    cosmology
-        A flat astropy cosmology.
-    z
-        Redshift at the centre of the band.
-
-    Raises
-    ------
-    ValueError
-        If the cosmology is not flat.
+    hera_pspec has only matter, curvature and Lambda, which makes its X^2 Y 0.1 to 0.8 % too large for Planck15 because
+    radiation and massive neutrinos are missing, and stores those numbers in its files. Here the matter and Lambda terms
+    are set so that both H(z) and the comoving distance equal astropy's at `z`: *effective* densities, which survive a
+    round trip through HDF5 and describe this redshift, not today. Raise ValueError if the cosmology is not flat.
     """
     from hera_pspec.conversions import Cosmo_Conversions
 
@@ -109,7 +77,7 @@ def hera_conversions(cosmology: FLRW, z: float) -> Cosmo_Conversions:
 
 
 def _effective_densities(cosmology: FLRW, z: float) -> tuple[float, float]:
-    """Lambda and matter for which E^2 = Lambda + matter (1+z)^3 has astropy's H and comoving distance at `z`."""
+    """Return Lambda and matter of E^2 = Lambda + matter (1+z)^3 with astropy's H and comoving distance at `z`."""
     from scipy.integrate import quad
     from scipy.optimize import brentq
 

@@ -10,17 +10,7 @@ from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra
 
 
 def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: bool = True) -> CylindricalSpectrum:
-    """Average over baselines of similar length, with equal weights for all pairs.
-
-    Parameters
-    ----------
-    spectra
-        Delay spectra of units.
-    settings
-        Width of the bins in baseline length.
-    folded
-        Average delays of opposite sign.
-    """
+    """Average over baselines of similar length with equal weights for all pairs; `folded` averages +-tau as well."""
     bins, index = np.unique(np.floor(spectra.length / settings.length_bin).astype(int), return_inverse=True)
     power = np.zeros((bins.size, spectra.delay.size), dtype=complex)
     np.add.at(power, index, spectra.n_pairs[:, None] * spectra.power)

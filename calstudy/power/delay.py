@@ -16,11 +16,11 @@ TAPERS = {
     "tukey": "tukey",
     "none": "boxcar",
 }
-"""The tapers of `calstudy.power.settings.PowerSettings`, and what scipy.signal.windows calls them."""
+"""The tapers of `calstudy.power.settings.PowerSettings`, and their names in scipy.signal.windows."""
 
 
 def make_taper(name: str, n_channels: int) -> np.ndarray:
-    """Return the taper T(nu), shape (n_channels,), peak 1; raises ValueError for an unknown name."""
+    """Return the taper T(nu), shape (n_channels,), peak 1; raise ValueError for an unknown name."""
     if name not in TAPERS:
         raise ValueError(f"taper {name!r} is unknown, allowed: {', '.join(TAPERS)}")
     from scipy.signal import windows
@@ -75,7 +75,7 @@ def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: st
 
 
 def channel_width(frequencies: np.ndarray) -> float:
-    """Return the spacing in Hz of `frequencies` (Nfreqs,); raises ValueError unless equally spaced and ascending."""
+    """Return the spacing in Hz of `frequencies` (Nfreqs,); raise ValueError unless equally spaced and ascending."""
     steps = np.diff(frequencies)
     if steps.size == 0 or steps[0] <= 0 or not np.allclose(steps, steps[0], rtol=1e-6):
         raise ValueError("frequencies must be at least two equally spaced ascending channels")
@@ -83,15 +83,11 @@ def channel_width(frequencies: np.ndarray) -> float:
 
 
 def mode_correlation(taper: str, n_channels: int) -> np.ndarray:
-    """Return how the powers of two delays of one baseline correlate, for white Gaussian data.
+    """Return the correlation of the powers of two delays of one baseline, for white Gaussian data.
 
     A taper T mixes neighbouring delays: V~(tau) and V~(tau + m/B) have the correlation sum T^2 exp(2 pi i m n / N) over
-    sum T^2, and the powers, quadratic in Gaussian variables, the square of its modulus.
-
-    Returns
-    -------
-    Correlation coefficients at separations of 0, 1, ... n_channels // 2 delay bins, shape (n_channels // 2 + 1,); they
-    are periodic in n_channels.
+    sum T^2, and the powers, quadratic in Gaussian variables, the square of its modulus. The coefficients, (n_channels
+    // 2 + 1,), are for separations of 0, 1, ... n_channels // 2 delay bins; they are periodic in n_channels.
     """
     amplitude = np.abs(np.fft.rfft(make_taper(taper, n_channels) ** 2))
     return (amplitude / amplitude[0]) ** 2

@@ -15,16 +15,9 @@ MILLIKELVIN2 = 1e6
 
 
 def input_power(settings: Eor, k: np.ndarray, cosmology: str) -> np.ndarray:
-    """Return P(k), mK^2 h^-3 Mpc^3, at wavenumbers `k` (h/Mpc, any shape).
+    """Return the input P(k), mK^2 h^-3 Mpc^3, at wavenumbers `k` (h/Mpc, any shape).
 
-    Parameters
-    ----------
-    settings
-        Of the EoR sky: amplitude and shape are in units without h.
-    k
-        Wavenumbers.
-    cosmology
-        Name, as in the `power` section.
+    Amplitude and shape in the settings of the EoR sky are in units without h.
     """
     h = float(make_cosmology(cosmology).h)
     index = settings.index if settings.spectrum == "power-law" else 0.0

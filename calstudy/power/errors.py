@@ -11,11 +11,11 @@ Averages have fewer independent modes than modes:
 
 - a taper correlates neighbouring delays (`calstudy.power.delay.mode_correlation`); tau and -tau are independent;
 - the n (n-1) products of different baselines of a redundant group have independent noise and the same signal:
-  sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same goes for two polarizations. The product of signal and
-  noise has the noise of n baselines in it, and its variance falls by n;
+  sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same holds for two polarizations. The product of signal and
+  noise contains the noise of n baselines, and its variance falls by n;
 - the signal of two baselines closer than the size of an antenna is partly the same. For a Gaussian beam with squared
   integral Omega_pp the visibilities correlate by exp(-pi Omega_pp |db|^2 / lambda^2), powers by its square;
-- powers of several times have independent noise. Their signal is partly the same as long as the beam has not moved on:
+- powers of several times have independent noise. Their signal is partly the same as long as the beams overlap:
   visibilities of a zenith that moved by theta correlate by exp(-pi theta^2 / (4 Omega_pp)), powers by its square.
 """
 
@@ -35,34 +35,19 @@ NEGLIGIBLE = 1e-3
 
 
 def noise_level(noise: DelaySpectra) -> float:
-    """Return sigma_N of a single product of two baselines, from spectra of noise only.
+    """Return sigma_N of a single product of two baselines, in the unit of ``noise.power``, from spectra of noise only.
 
-    The rms over all units and delays of the real part, scaled up by the number of products averaged in each unit. The
-    noise must be white and alike on all baselines, as in the paper's simulations.
-
-    Returns
-    -------
-    Standard deviation in the unit of ``noise.power``.
+    It is the rms over all units and delays of the real part, scaled up by the number of products averaged in each unit.
+    The noise must be white and alike on all baselines, as in the paper's simulations.
     """
     products = noise.n_pairs * noise.n_polarizations * noise.n_times
     return float(np.sqrt(np.mean(products[:, None] * noise.power.real**2)))
 
 
 def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return how many independent products of noise each bin averages: sigma_N falls by its square root.
+    """Return the number of independent products of noise in each bin, (n_bins,) float, zero for empty bins.
 
-    Parameters
-    ----------
-    spectra
-        The averaged spectra.
-    bins
-        Bin of each mode, (Nu, Nd) int, -1 for those left out.
-    n_bins
-        Number of bins.
-
-    Returns
-    -------
-    (n_bins,) float, zero for empty bins.
+    sigma_N falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
     """
     return _modes_of_noise(spectra, bins, n_bins, spectra.n_pairs)
 
@@ -70,16 +55,8 @@ def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndar
 def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.ndarray) -> np.ndarray:
     """Return sigma_N of each bin where the units differ in their noise, (n_bins,); NaN for empty bins.
 
-    Parameters
-    ----------
-    spectra
-        The averaged spectra.
-    bins
-        Bin of each mode, (Nu, Nd) int, -1 for those left out.
-    n_bins
-        Number of bins.
-    noise
-        P_N of a single product of each unit, whose real part has the variance P_N^2 / 2, (Nu,).
+    `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out. `noise`, (Nu,), is P_N of a single product
+    of each unit, whose real part has the variance P_N^2 / 2.
     """
     with np.errstate(divide="ignore"):
         independent = spectra.n_pairs / (noise**2 / 2)
@@ -89,50 +66,31 @@ def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.
 
 
 def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return how many independent products of signal and noise each bin averages; parameters as in `noise_modes`."""
+    """Return the number of independent products of signal and noise in each bin; parameters as in `noise_modes`."""
     return _modes_of_noise(spectra, bins, n_bins, spectra.n_baselines)
 
 
 def _modes_of_noise(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
-    """Return the effective modes where a unit averages so many independent samples of each polarization, (Nu,)."""
+    """Return the effective modes where a unit averages `independent` samples of each polarization, (Nu,)."""
     units = np.arange(len(spectra.n_pairs))
     samples = independent * spectra.n_polarizations * spectra.n_times
     return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / samples))
 
 
 def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return how many independent modes of the signal each bin averages: sigma_S falls by its square root.
+    """Return the number of independent modes of the signal in each bin, (n_bins,) float, zero for empty bins.
 
-    Parameters
-    ----------
-    spectra
-        The averaged spectra.
-    bins
-        Bin of each mode, (Nu, Nd) int, -1 for those left out.
-    n_bins
-        Number of bins.
-
-    Returns
-    -------
-    (n_bins,) float, zero for empty bins.
+    sigma_S falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
     """
     first, second, correlation = _signal_correlation(spectra)
     return _effective_modes(spectra, bins, n_bins, (first, second, correlation)) * spectra.independent_times
 
 
 def independent_times(sidereal_times: np.ndarray, latitude: float, omega_pp: float) -> float:
-    """Return how many independent skies an antenna that points to the zenith sees at some times.
+    """Return the number of independent skies that an antenna pointing to the zenith sees at n sidereal times (rad).
 
-    n^2 over the sum of the correlations of the powers of all n times with each other.
-
-    Parameters
-    ----------
-    sidereal_times
-        rad, (n,).
-    latitude
-        Of the array, rad.
-    omega_pp
-        Integral of the squared power beam in sr; the beam is taken as Gaussian.
+    It is n^2 over the sum of the correlations of the powers of all times with each other. The latitude is in rad; the
+    beam is taken as Gaussian, with the integral of its square `omega_pp` in sr.
     """
     apart = sidereal_times[:, None] - sidereal_times
     moved = 2 * np.arcsin(np.cos(latitude) * np.abs(np.sin(apart / 2)))
@@ -144,20 +102,9 @@ def with_errors(
 ) -> SphericalSpectrum:
     """Return `spectrum` with its error bars, sigma_P = sigma_N + sigma_S in each bin.
 
-    Parameters
-    ----------
-    spectrum
-        Any averaged spectrum. Not mutated.
-    noise
-        sigma_N of a single product, from `noise_level`; zero for spectra of the signal only.
-    signal
-        Spectrum of the signal only in the same bins, whose real part is the sample standard deviation of one mode;
-        None for spectra of noise only.
-
-    Raises
-    ------
-    ValueError
-        If the bins differ.
+    `noise` is sigma_N of a single product, from `noise_level`; zero for spectra of the signal only. `signal` is the
+    spectrum of the signal only in the same bins, whose real part is the sample standard deviation of one mode; None for
+    spectra of noise only. Raise ValueError if the bins differ.
     """
     if signal is not None and not np.array_equal(signal.bin_edges, spectrum.bin_edges):
         raise ValueError("the signal's spectrum has other bins than the spectrum that needs errors, expected the same")
@@ -169,7 +116,7 @@ def with_errors(
 
 
 def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of units (both orders and with themselves) that share signal, and the correlation of their powers."""
+    """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
     rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / constants.c.value) ** 2
     reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
     tree = cKDTree(spectra.vectors)
@@ -195,7 +142,7 @@ def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, 
 def _effective_modes(
     spectra: DelaySpectra, bins: np.ndarray, n_bins: int, covariance: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """(sum w)^2 / sum_ij w_i w_j C_ij over the modes i, j of each bin, w the number of pairs, C units times delays."""
+    """Return (sum w)^2 / sum_ij w_i w_j C_ij over modes i, j of each bin: w number of pairs, C units times delays."""
     first, second, between_units = covariance
     weights = spectra.n_pairs.astype(float)
     between_units = between_units * weights[first] * weights[second]

@@ -55,12 +55,8 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
 
     Either each baseline with itself (ab = cd), or each with every *other* one of its redundant group, in both orders
     (ab != cd), reversed if necessary to match the group. With ``pairs="auto"`` groups are used if at least half of the
-    baselines have a redundant partner.
-
-    Raises
-    ------
-    ValueError
-        If groups are requested and no two baselines are redundant, or an antenna number is too large for hera_pspec.
+    baselines have a redundant partner. Raise ValueError if groups are requested and no two baselines are redundant, or
+    if an antenna number is too large for hera_pspec.
     """
     baselines = [(int(a), int(b)) for a, b in antenna_pairs(uvd)]
     if antenna_pairs(uvd).max() > LARGEST_ANTENNA_NUMBER:
@@ -94,17 +90,9 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
 def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_convention: str | None) -> np.ndarray:
     """Return the beam-weighted mean brightness temperature of a visibility of 1 Jy, in K/Jy, shape (Nfreqs,).
 
-    A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2, and half of that in the convention
-    V_xx = 1/2 int A I (``pol_convention`` None or "sum").
-
-    Parameters
-    ----------
-    frequencies
-        Hz, shape (Nfreqs,).
-    omega_p
-        Solid angle of the power beam in sr, shape (Nfreqs,).
-    pol_convention
-        As in `pyuvdata.UVData`: "avg", "sum" or None.
+    A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2, and half of that in the convention V_xx
+    = 1/2 int A I (`pol_convention` None or "sum", as in `pyuvdata.UVData`; "avg" otherwise). Frequencies in Hz and the
+    solid angle of the power beam in sr are (Nfreqs,).
     """
     halves = {None: 2.0, "sum": 2.0, "avg": 1.0}
     if pol_convention not in halves:
@@ -115,7 +103,7 @@ def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_conventi
 
 @lru_cache(maxsize=4)
 def _conversions(cosmology: str, z: float) -> Cosmo_Conversions:
-    """Return hera_pspec's cosmology object, which remembers its volumes: all spectra of a run ask for the same."""
+    """Return hera_pspec's cosmology object with a cache of its volumes: all spectra of a run ask for the same."""
     conversions = hera_conversions(make_cosmology(cosmology), z)
     conversions.X2Y = lru_cache(maxsize=10_000)(conversions.X2Y)
     return conversions
@@ -128,26 +116,13 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     identity weighting. The beam is divided out channel by channel (Omega_p to temperature, Omega_pp / Omega_p^2 in the
     normalization), so its frequency dependence is accounted for; X and Y are taken over the band likewise.
 
-    Parameters
-    ----------
-    even, odd
-        One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy. Not mutated.
-    beam
-        Gives the solid angles of the power beam.
-    settings
-        Taper, pairs, redundancy tolerance, cosmology.
+    `even` and `odd` have one integration each, in Jy. The result has one spectrum per baseline pair and polarization,
+    complex, in mK^2 h^-3 Mpc^3, unfolded, without window functions; it can be written to HDF5 and read back. It has
+    hera_pspec's conventions: conj(even) times odd, with the kernel exp(-2 pi i tau nu), so that its delay axis is the
+    paper's, reversed.
 
-    Returns
-    -------
-    UVPSpec, one spectrum per baseline pair and polarization, complex, in mK^2 h^-3 Mpc^3, unfolded, without window
-    functions; it can be written to HDF5 and read back. hera_pspec's conventions: conj(even) times odd, with the kernel
-    exp(-2 pi i tau nu), so that its delay axis is the paper's, reversed.
-
-    Raises
-    ------
-    ValueError
-        If the data sets differ in anything but data, have more than one integration, are not in Jy, or leave no
-        unflagged pair. Baselines that are completely flagged are left out.
+    Baselines that are completely flagged are left out. Raise ValueError if the data sets differ in anything but data,
+    have more than one integration, are not in Jy, or leave no unflagged pair.
     """
     _require_match(even, odd)
     pairs = _unflagged(make_pairs(even, settings), even, odd)

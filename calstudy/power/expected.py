@@ -45,20 +45,10 @@ def bin_expected(
     buffer: float,
     length_bin: float,
 ) -> ExpectedBins:
-    """Average over bins.
+    """Average the expected transfer function, (Nbls, Ndelays), and its error over bins; NaN without data.
 
-    Parameters
-    ----------
-    modes
-        Where the modes are.
-    transfer, error
-        Expected transfer function of each, (Nbls, Ndelays); NaN without data.
-    edges
-        Bin edges of |k|, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
-    buffer
-        Modes with |tau| <= |b|/c + buffer (s) are inside the wedge.
-    length_bin
-        Width of the bins of baseline length, m.
+    `edges` of |k| are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with
+    |tau| <= |b|/c + `buffer` (s) are inside the wedge. `length_bin` is the width of the bins of baseline length, m.
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(transfer)
@@ -90,14 +80,8 @@ def bin_response(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return T = P^D / P^S and C = Re <S* D> / P^S outside the wedge, (Nk,) each; NaN in bins without signal.
 
-    Parameters
-    ----------
-    modes
-        Where the modes are.
-    signal, response
-        Amplitudes of the signal S and of what is left of it, D, (Nbls, Ndelays), complex.
-    edges, buffer
-        As for `bin_expected`.
+    `signal` holds the amplitudes of the signal S, and `response` those of the part D that is left of it, (Nbls,
+    Ndelays), complex; `edges` and `buffer` are as in `bin_expected`.
     """
     limits = np.asarray(edges, float)
     bins, used = _bins_outside(modes, limits, buffer)
@@ -110,6 +94,6 @@ def bin_response(
 
 
 def _bins_outside(modes: BaselineModes, limits: np.ndarray, buffer: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bin of |k| of each mode, and whether it is in one and outside the wedge."""
+    """Return the bin of |k| of each mode, and a mask of the modes that are in a bin and outside the wedge."""
     bins = np.searchsorted(limits, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
     return bins, outside_wedge(modes, buffer) & (bins >= 0) & (bins < limits.size - 1)

@@ -1,4 +1,4 @@
-"""What an estimator of power spectra is: from two averaged data sets to delay spectra."""
+"""The interface of estimators of power spectra: from two averaged data sets to delay spectra."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PowerBeam(Protocol):
     """The part of the beam interface that estimators use (`calstudy.instrument.beams`)."""
 
     def solid_angles(self, frequencies: np.ndarray, pol: str) -> tuple[np.ndarray, np.ndarray]:
-        """Integrals over the sky in sr of the power beam and of its square, (Nfreqs,) each, for "xx" or "yy"."""
+        """Return integrals over the sky in sr of the power beam and its square, (Nfreqs,) each, for "xx" or "yy"."""
 
 
 class Estimator(Plugin, ABC):
@@ -41,9 +41,9 @@ class Estimator(Plugin, ABC):
         Parameters
         ----------
         even, odd
-            One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy with
-            V_xx = 1/2 int A I. They share the sky but not the noise. Not to be changed. `odd` is `even` where the power
-            of one data set is asked for.
+            One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy with V_xx
+            = 1/2 int A I. They share the sky but not the noise, and must not be changed. `odd` is `even` where the
+            power of one data set is computed.
         beam
             Of the array.
         settings
@@ -54,15 +54,7 @@ class Estimator(Plugin, ABC):
     def estimate_and_export(
         self, even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings, folder: Path
     ) -> DelaySpectra:
-        """Return what `estimate` does, and write what else there is, in formats of its own, into an empty folder.
-
-        Parameters
-        ----------
-        even, odd, beam, settings
-            As for `estimate`.
-        folder
-            Empty.
-        """
+        """Return the delay spectra of `estimate`, and write files in formats of the estimator into an empty folder."""
         del folder
         return self.estimate(even, odd, beam, settings)
 
@@ -72,14 +64,10 @@ def estimate_spectra(
 ) -> DelaySpectra:
     """Return the delay spectra of even times odd by the estimator of the settings, checked.
 
-    Parameters
-    ----------
-    even, odd, beam, settings
-        As for `Estimator.estimate`, but of one integration or several, whose powers are averaged. Integrations that are
-        completely flagged in either are left out, and so are baselines that are completely flagged in another one.
-    folder
-        Where the estimator may write files of its own; nowhere if None. With several integrations there is a folder for
-        each, `block-1` and so on.
+    The data are as for `Estimator.estimate`, but of one integration or several, whose powers are averaged. Integrations
+    that are completely flagged in either are left out, and so are baselines that are completely flagged in another one.
+    The estimator may write files into `folder`, or nowhere if it is None; with several integrations each has its own
+    folder, `block-1` and so on.
 
     Raises
     ------
@@ -136,7 +124,6 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
 
 
 def _integration(uvd: UVData, number: int) -> UVData:
-    """Return one integration."""
     rows = np.arange(number * uvd.Nbls, (number + 1) * uvd.Nbls)
     found = uvd.select(blt_inds=rows, inplace=False, run_check=False)
     # hera_pspec refuses data with phase centres besides their own.
@@ -147,7 +134,7 @@ def _integration(uvd: UVData, number: int) -> UVData:
 
 
 def _fault(found: object) -> str | None:
-    """Return what is wrong with what an estimator returned, or None."""
+    """Return the fault of the result of an estimator, or None."""
     from calstudy.power.delay import TAPERS
     from calstudy.power.spectra import DelaySpectra
 

@@ -1,8 +1,8 @@
 """A faster implementation of the hera_pspec estimator, for diagonal weighting.
 
-Weighting visibilities by flags and a taper is a diagonal matrix. The normalization matrices of the quadratic estimator
-are then circulant with a closed form; hera_pspec sums over four channel indices (80 s and 3.2 GB at 384 channels). They
-depend on the flags only; hera_pspec keeps dense matrices for every baseline (7 GB for 630).
+The weights of visibilities by flags and a taper form a diagonal matrix. The normalization matrices of the quadratic
+estimator are then circulant with a closed form; hera_pspec sums over four channel indices (80 s and 3.2 GB at 384
+channels). They depend on the flags only; hera_pspec keeps dense matrices for every baseline (7 GB for 630).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from hera_pspec import PSpecData
 class DiagonalPSpecData(PSpecData):
     """`hera_pspec.PSpecData` for identity weighting, a taper, and as many delays as channels.
 
-    Same interface, same numbers to rounding: ``pspec(..., input_data_weight="identity", norm="I", allow_fft=True)``.
-    Matrices are shared by all baselines with the same flags.
+    The interface and, to rounding, the numbers are those of ``pspec(..., input_data_weight="identity", norm="I",
+    allow_fft=True)``. Baselines with the same flags share matrices.
     """
 
     def clear_cache(self, keys: list | None = None) -> None:
@@ -28,7 +28,7 @@ class DiagonalPSpecData(PSpecData):
         self._normalized: tuple | None = None
 
     def validate_pol(self, dsets: tuple[int, int], pol_pair: tuple[int, int]) -> bool:
-        """Return whether both data sets have these polarizations, given as integers.
+        """Check that both data sets have these polarizations, given as integers.
 
         hera_pspec's own test reads the telescope's ``x_orientation``, which pyuvdata has deprecated.
         """
@@ -99,7 +99,7 @@ class DiagonalPSpecData(PSpecData):
         return self._by_flags[key]
 
     def _circulant_response(self, key1: tuple, key2: tuple, damping: np.ndarray, exact_norm: bool) -> np.ndarray:
-        """Half of sum_ij r1_i r2_j damping_(j-i) exp(-2 pi i (a-b)(j-i) / N), channels i, j, for all delays a, b."""
+        """Return sum_ij r1_i r2_j damping_(j-i) exp(-2 pi i (a-b)(j-i) / N) / 2 over channels, for all delays a, b."""
         self._require_diagonal(exact_norm)
         n = self.spw_Nfreqs
         first, second = self.R(key1).diagonal().real, self.R(key2).diagonal().real

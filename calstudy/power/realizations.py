@@ -1,4 +1,4 @@
-"""What many realizations measured: quantities, their means and scatter (`calstudy.power.blocks`), and coverage."""
+"""Pooling of realizations: quantities, their means and scatter (`calstudy.power.blocks`), and coverage."""
 
 from __future__ import annotations
 
@@ -17,16 +17,11 @@ SIGMAS_95 = 1.96
 
 @dataclass(frozen=True)
 class Sample:
-    """What one realization measured in Nk bins of |k|.
+    """Spectra of one realization in Nk bins of |k|.
 
-    Attributes
-    ----------
-    residual, without_eor, eor
-        P^R of data with and without the EoR, and P^S, with their errors.
-    put_in
-        Power of the EoR from which the sky was drawn, (Nk,), mK^2 h^-3 Mpc^3.
-    transfer
-        T in the same bins, or None where it is not known.
+    `residual`, `without_eor` and `eor` are P^R of data with and without the EoR, and P^S, with their errors. `put_in`
+    is the power of the EoR from which the sky was drawn, (Nk,), mK^2 h^-3 Mpc^3. `transfer` is T in the same bins, None
+    if not known.
     """
 
     residual: SphericalSpectrum
@@ -38,15 +33,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number per bin of k that is pooled.
-
-    Attributes
-    ----------
-    symbol
-        For tables.
-    value, error
-        From a sample to the value and its quoted standard deviation, (Nk,) each.
-    """
+    """A number per bin of k that is pooled: functions of a sample give its value and quoted error, (Nk,)."""
 
     symbol: str
     value: Callable[[Sample], np.ndarray]
@@ -86,7 +73,7 @@ QUANTITIES = {
         "P^R0 / sigma_N", lambda s: _pull(s.without_eor.power.real, s.without_eor.error), _one
     ),
 }
-"""Of power spectra, known in every region."""
+"""Quantities of power spectra, known in every region."""
 
 
 def _of_transfer(name: str) -> tuple[Callable[[Sample], np.ndarray], Callable[[Sample], np.ndarray]]:
@@ -105,30 +92,30 @@ TRANSFER_QUANTITIES = {
     "cross_transfer": Quantity("C", *_of_transfer("cross_transfer")),
     "squared_coherence": Quantity("C^2 / T", *_of_transfer("squared_coherence")),
 }
-"""Of the transfer function: fields of `TransferFunction`; a single number counts for all bins."""
+"""Quantities of the transfer function, by its fields; a single number counts for all bins."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """Which realization has which draws.
+    """The draws of each realization.
 
     Attributes
     ----------
     draws
         Number of the draw of each part, for each of K realizations.
     blocks
-        Parts that each block draws, and which realizations belong to it; the first belongs to all.
+        Parts that each block draws, and the realizations that belong to it; the first belongs to all.
     """
 
     draws: Sequence[Mapping[str, int]]
     blocks: Sequence[tuple[Sequence[str], Sequence[int]]]
 
     def shared(self, first: int, second: int) -> int:
-        """Return how many parts two realizations have in common."""
+        """Return the number of parts that two realizations have in common."""
         return sum(self.draws[second][part] == number for part, number in self.draws[first].items())
 
     def others(self, realization: int) -> dict[int, float]:
-        """Return which other realizations T of one is taken from, and their weights, which add up to one.
+        """Return the other realizations from which T of one is taken, and their weights, which add up to one.
 
         These are the realizations with other gains and other noise, on which T depends most, whatever their EoR. Each
         draw of gains and noise has the same weight, shared by its realizations. Where no other gains and noise are
@@ -154,18 +141,9 @@ class Design:
 class PooledRegion:
     """All quantities in one part of Fourier space.
 
-    Attributes
-    ----------
-    k, bin_edges
-        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
-    design
-        Which realization has which draws.
-    values, quoted
-        Of all K realizations, (K, Nk), by the name of the quantity.
-    blocks
-        Pooled over each block, by the name of the quantity.
-    total
-        Of all blocks together.
+    `k` are the centres, (Nk,), and `bin_edges` the edges, (Nk + 1,), of the bins, h/Mpc. By the name of the quantity,
+    `values` and `quoted` hold all K realizations, (K, Nk), `blocks` the pooled ones of each block, and `total` those of
+    all blocks together.
     """
 
     k: np.ndarray
@@ -183,13 +161,7 @@ def quantities_of(sample: Sample) -> dict[str, Quantity]:
 
 
 def pool_region(samples: Sequence[Sample], design: Design) -> PooledRegion:
-    """Pool all quantities; all samples must have the same bins.
-
-    Raises
-    ------
-    ValueError
-        If they have not.
-    """
+    """Pool all quantities; raise ValueError unless all samples have the same bins."""
     first = samples[0].eor
     if any(not np.array_equal(sample.eor.bin_edges, first.bin_edges) for sample in samples):
         raise ValueError("the realizations have different bins of k, expected the same")
@@ -211,18 +183,12 @@ def inside_bars(deviations: np.ndarray, errors: np.ndarray) -> np.ndarray:
 
 
 def coverage(inside: np.ndarray, independent: bool) -> Finding:
-    """Return the part of 95 % bars that cover, and its uncertainty.
+    """Return the part of 95 % bars that cover, and its uncertainty, from `inside_bars`, (K, Nk).
 
-    The uncertainty is the larger of that by the scatter over realizations, which knows of correlated bins, and the
-    binomial one for 95 % of independent bins.
-
-    Parameters
-    ----------
-    inside
-        From `inside_bars`, (K, Nk).
-    independent
-        Whether what the bars are for is drawn in every realization; if not, the realizations repeat the same trials,
-        and one realization's number of bins decides.
+    The uncertainty is the larger of the one from the scatter over realizations, which includes correlated bins, and the
+    binomial one for 95 % of independent bins. If the quantity that the bars should cover is not drawn in every
+    realization (`independent`), the realizations repeat the same trials, and the number of bins of one realization
+    decides.
     """
     known = np.isfinite(inside)
     if not known.any():
@@ -235,16 +201,9 @@ def coverage(inside: np.ndarray, independent: bool) -> Finding:
 
 
 def mean_over_bins(values: np.ndarray, design: Design) -> Finding:
-    """Return the mean of a quantity over bins, and its error by the scatter over all that was drawn.
+    """Return the mean of a quantity, (K, Nbins), over bins, and its error by the scatter over all that was drawn.
 
     Bins that are not known in all realizations are left out.
-
-    Parameters
-    ----------
-    values
-        Of all realizations, (K, Nbins).
-    design
-        Which draws they have.
     """
     known = np.isfinite(values).all(axis=0)
     if not known.any():
@@ -255,13 +214,10 @@ def mean_over_bins(values: np.ndarray, design: Design) -> Finding:
 
 
 def error_ratio(values: np.ndarray, quoted: np.ndarray) -> Finding:
-    """Return the scatter over realizations over the quoted error, rms over bins, with its jackknife error.
+    """Return the scatter over the realizations of a block over the quoted error, rms over bins, with a jackknife error.
 
-    Parameters
-    ----------
-    values, quoted
-        Of the realizations of one block and their quoted errors, (K, Nbins). One: the quoted errors are right for what
-        the block draws.
+    `values` and `quoted` are (K, Nbins). A ratio of one means that the quoted errors are right for the parts that the
+    block draws.
     """
     known = np.isfinite(values).all(axis=0) & np.isfinite(quoted).all(axis=0)
     count = len(values)

@@ -1,15 +1,15 @@
-"""Scores of a calibration in bins of k: the signal that it leaves, the power that it adds, and what comes out.
+"""Scores of a calibration in bins of k: the signal that it leaves, the power that it adds, and the recovered power.
 
-Of the calibrated residual R of data with the EoR, and R0 of data without it:
+Of the calibrated residual R of data with the EoR, and R0 of data without it, the scores are
 
 - the transfer function T of the signal, free of the flux scale (`calstudy.power.transfer`);
-- the bias s^2 P^R0 / P^S, power that is there without any EoR: foregrounds that are left, in units of the EoR, and
-  free of the flux scale s as well, for a calibration that makes everything smaller must not look better for it;
-- the recovered power P^R / P^S, as it comes out.
+- the bias s^2 P^R0 / P^S, the power that is present without any EoR: foregrounds that are left, in units of the EoR. It
+  is free of the flux scale s as well, so that a calibration that makes everything smaller does not look better;
+- the recovered power P^R / P^S, as measured.
 
-A fit that stops before its minimum leaves a part of the signal that depends on where it started and stopped. Where the
-linear response of the fit is known (`calstudy.calibrate.expected_loss`), which does not, its difference from T is a
-part of the error of T.
+A fit that stops before its minimum leaves a part of the signal that depends on where it started and stopped. The linear
+response of the fit (`calstudy.calibrate.expected_loss`) does not depend on these. Where it is known, its difference
+from T is a part of the error of T.
 
 Noise is in the errors of the last two, and not in their means, because spectra are crossed between two realizations of
 the noise. Errors are found by leaving out antennas (`calstudy.power.clusters`).
@@ -33,14 +33,8 @@ BANDS = (0.1, 0.2, 0.5, 1.0)
 class CalibratedSpectra:
     """Delay spectra of the same units and delays.
 
-    Attributes
-    ----------
-    signal
-        Of the EoR alone.
-    response, cross
-        Of what the EoR changes in the residual, and of the EoR times this.
-    residual, residual_without_eor
-        Of the calibrated residual of data with the EoR and without.
+    `signal` is of the EoR alone, `response` of the change of the residual by the EoR, and `cross` of the EoR times this
+    change; `residual` and `residual_without_eor` are of the calibrated residual of data with and without the EoR.
     """
 
     signal: DelaySpectra
@@ -52,7 +46,7 @@ class CalibratedSpectra:
 
 @dataclass(frozen=True)
 class Score:
-    """What a calibration does in Nk bins of |k|, outside the wedge. Bins without signal hold NaN.
+    """Scores of a calibration in Nk bins of |k|, outside the wedge. Bins without signal hold NaN.
 
     Attributes
     ----------
@@ -89,18 +83,10 @@ class Score:
 
 
 def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
-    """Return the scores in bins of |k|.
+    """Return the scores in bins of |k| outside the wedge.
 
-    Parameters
-    ----------
-    spectra
-        Of the calibrated residuals and the EoR.
-    edges
-        Bin edges, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
-    buffer
-        Modes with |tau| <= |b|/c + buffer (s) are left out.
-    flux_scale
-        s of the calibration; NaN if not known.
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with |tau| <=
+    |b|/c + `buffer` (s) are left out. `flux_scale` is s of the calibration; NaN if not known.
     """
     limits, signal = np.asarray(edges, dtype=float), spectra.signal
     clusters = clusters_in_k(signal, limits, buffer, inside=False)

@@ -68,12 +68,9 @@ class PowerSettings(Section):
     )
 
     def n_blocks(self, duration: float, integration: float) -> int:
-        """Return in how many blocks a run is averaged: none is longer than `coherent_time`, or one integration if more.
+        """Return the number of blocks in which a run is averaged, from the durations of the run and an integration, s.
 
-        Parameters
-        ----------
-        duration, integration
-            Of the run and of one of its integrations, s.
+        No block is longer than `coherent_time`, or than one integration if that is longer.
         """
         if self.coherent_time is None:
             return 1

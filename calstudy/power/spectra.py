@@ -1,4 +1,4 @@
-"""Power spectra as plain arrays: per baseline and delay, and the cylindrical and spherical averages of them.
+"""Power spectra as plain arrays: per baseline and delay, and their cylindrical and spherical averages.
 
 A *unit* is one sample of the sky: a baseline crossed with itself, or a redundant group whose baselines are crossed with
 each other. The pairs of a unit share the signal; their noise products are independent.
@@ -49,13 +49,13 @@ class DelaySpectra:
     taper
         Name of the taper, see `calstudy.power.delay.TAPERS`.
     share_unit, share_antenna, share_pairs, share_power
-        What each unit owes to each of its antennas: unit and number of the antenna, (Nm,) int; how many of the unit's
-        pairs contain the antenna, (Nm,) int; and the sum of the powers of these pairs, (Nm, Nd) complex. From these,
-        errors are found by leaving out antennas (`calstudy.power.clusters`). Empty if not known: the errors of ratios
-        then come from the scatter of units, which is too small where units share antennas.
+        The share of each antenna in each unit: unit and number of the antenna, (Nm,) int; number of the unit's pairs
+        that contain the antenna, (Nm,) int; and the sum of the powers of these pairs, (Nm, Nd) complex. Errors by
+        leaving out antennas need these (`calstudy.power.clusters`). Empty if not known: the errors of ratios then come
+        from the scatter of units, which is too small where units share antennas.
     n_times, independent_times
-        Times whose powers are averaged; each has its own noise. How many independent skies they see, at most as many
-        (`calstudy.power.errors.independent_times`).
+        Number of times whose powers are averaged, each with its own noise, and number of independent skies that they
+        see, at most as many (`calstudy.power.errors.independent_times`).
     """
 
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
@@ -84,11 +84,11 @@ class DelaySpectra:
 
     @property
     def n_baselines(self) -> np.ndarray:
-        """Baselines of each unit, (Nu,): one that is crossed with itself, or n with n (n - 1) pairs."""
+        """Number of baselines of each unit, (Nu,): one that is crossed with itself, or n with n (n - 1) pairs."""
         return np.where(self.n_pairs == 1, 1.0, (1 + np.sqrt(1 + 4 * self.n_pairs)) / 2)
 
     def pairs_of_units(self) -> list[tuple[object, ...]]:
-        """Return what tells each unit: its vector to a mm, and in how many of its pairs each antenna is."""
+        """Return a key of each unit: its vector to a mm, and the number of its pairs that contain each antenna."""
         members: list[list[tuple[int, int]]] = [[] for _ in self.n_pairs]
         for unit, antenna, count in zip(self.share_unit, self.share_antenna, self.share_pairs, strict=True):
             members[unit].append((int(antenna), int(count)))
@@ -113,14 +113,9 @@ class DelaySpectra:
 
 @dataclass(frozen=True)
 class BaselineModes:
-    """The modes of baselines and delays.
+    """The modes of baselines of a length (m) and k_perp (h/Mpc), (Nbls,).
 
-    Attributes
-    ----------
-    length, k_perp
-        m and h/Mpc, (Nbls,).
-    delay, k_parallel
-        s and h/Mpc, ascending, (Ndelays,).
+    `delay` (s) and `k_parallel` (h/Mpc) are ascending, (Ndelays,).
     """
 
     length: np.ndarray
@@ -166,7 +161,7 @@ class SphericalSpectrum:
     Attributes
     ----------
     k, bin_edges
-        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc. A bin holds what is above its lower and not above its upper edge.
+        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc. A bin holds modes above its lower and not above its upper edge.
     power
         Mean over modes, (Nk,) complex; the real part estimates P(k).
     n_modes
@@ -177,7 +172,7 @@ class SphericalSpectrum:
     noise_error, sample_error
         Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.errors.with_errors`.
     wedge_excluded
-        Whether modes inside the wedge were left out.
+        True if modes inside the wedge were left out.
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})
@@ -200,8 +195,8 @@ class SphericalSpectrum:
     def difference_error(self) -> np.ndarray:
         """Standard deviation of P - P_S, (Nk,), where the EoR that P contains is the one whose power is P_S.
 
-        Of the variance of a mode (`calstudy.power.errors`) the sample variance is common to both. The noise is left,
-        and the product of signal and noise.
+        Both contain the sample variance of a mode (`calstudy.power.errors`). The noise remains, and the product of
+        signal and noise.
         """
         noise, sample = self.noise_error, self.sample_error
         modes = np.sqrt(2 * self.noise_modes * self.sample_modes)
@@ -218,20 +213,9 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
 def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:
     """Return the spectra of the units that all have in common, each averaged over the same pairs of baselines.
 
-    Baselines that are flagged altogether have no spectra. Those of an antenna without gains are missing in the spectra
-    of the residual, but not in those of the EoR.
-
-    Parameters
-    ----------
-    spectra
-        By name, of the same delays; their units are in the same order.
-
-    Raises
-    ------
-    InputError
-        If they have no unit in common.
-    ValueError
-        If their units are in different orders.
+    Baselines that are completely flagged have no spectra. Those of an antenna without gains are missing in the spectra
+    of the residual, but not in those of the EoR. The spectra, by name, have the same delays and their units in the same
+    order. Raise InputError if they have no unit in common, and ValueError if the order differs.
     """
     first, *others = keys = [one.pairs_of_units() for one in spectra.values()]
     if all(other == first for other in others):
@@ -253,20 +237,7 @@ def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpect
 
 
 def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelaySpectra:
-    """Return the mean of the spectra of several times.
-
-    Parameters
-    ----------
-    spectra
-        Of one time each, of the same units, pairs and delays.
-    independent
-        How many independent skies they see.
-
-    Raises
-    ------
-    ValueError
-        If units differ.
-    """
+    """Average the spectra of several times, which see `independent` skies; raise ValueError if the units differ."""
     first = spectra[0]
     if any(not np.array_equal(other.vectors, first.vectors) for other in spectra):
         raise ValueError("the spectra of several times are of different units, expected the same")
@@ -280,19 +251,10 @@ def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelayS
 
 
 def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
-    """Gather the pairs of a `UVPSpec` into units.
+    """Gather the pairs of a `UVPSpec` of `calstudy.power.estimate.estimate_power` into units.
 
-    Parameters
-    ----------
-    uvp
-        As `calstudy.power.estimate.estimate_power` makes it, one spectral window and one pair of times.
-    settings
-        Taper and cosmology with which `uvp` was made.
-
-    Raises
-    ------
-    ValueError
-        If `uvp` has several spectral windows or times.
+    `settings` hold the taper and cosmology with which `uvp` was made. Raise ValueError if it has several spectral
+    windows or times.
     """
     if uvp.Nspws != 1 or uvp.Nbltpairs != uvp.Nblpairs:
         raise ValueError(f"the spectra have {uvp.Nspws} spectral windows and {uvp.Ntpairs} times, expected 1 and 1")

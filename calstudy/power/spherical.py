@@ -18,7 +18,7 @@ def make_bin_edges(bins: KBins) -> np.ndarray:
 def modes_in_bins(
     spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
 ) -> np.ndarray:
-    """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those left out; parameters as `spherical_average`."""
+    """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those left out; parameters as in `spherical_average`."""
     edges = make_bin_edges(settings.bins)
     magnitude = np.hypot(spectra.k_perp[:, None], spectra.k_parallel)
     bins = np.searchsorted(edges, magnitude, side="left") - 1
@@ -33,22 +33,9 @@ def modes_in_bins(
 def spherical_average(
     spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
 ) -> SphericalSpectrum:
-    """Average over all modes in bins of |k|, with equal weights for all pairs of baselines.
+    """Average over all modes in bins of |k|, with equal weights for all pairs of baselines, without error bars.
 
-    Parameters
-    ----------
-    spectra
-        Delay spectra of units.
-    settings
-        Bins and wedge buffer.
-    exclude_wedge
-        Leave out modes with |tau| <= |b|/c + buffer.
-    only_wedge
-        Leave out all other modes instead.
-
-    Returns
-    -------
-    SphericalSpectrum without error bars.
+    `exclude_wedge` leaves out modes with |tau| <= |b|/c + buffer, `only_wedge` all others.
     """
     edges = make_bin_edges(settings.bins)
     n_bins = edges.size - 1

@@ -60,18 +60,12 @@ def save_spectrum(path: Path, spectrum: Spectrum) -> None:
 
 
 def load_spectrum(path: Path, kind: type[Spectrum]) -> Spectrum:
-    """Read what `save_spectrum` wrote.
-
-    Raises
-    ------
-    ValueError
-        If the file holds another kind of spectrum.
-    """
+    """Read a file of `save_spectrum`; raise ValueError if it holds another kind of spectrum."""
     with h5py.File(path, "r") as file:
         found = file.attrs.get("kind")
         if found != kind.__name__:
             raise ValueError(f"{path} holds {found!r}, expected {kind.__name__!r}")
-        # A file that is older than a field is what it was when the field had its default.
+        # A field that an older file lacks has its default.
         values = {item.name: _value(file[item.name]) for item in dataclasses.fields(kind) if item.name in file}
     return kind(**values)
 

@@ -30,7 +30,7 @@ known, and with them
 
     s^-2 = Re < r_even* r_odd >,   r = g_a g_b* / (ghat_a ghat_b*) averaged over the integrations,
 
-the mean over baselines and channels with the weights of the taper's square: calibration with these gains multiplies the
+the mean over baselines and channels weighted by the square of the taper: calibration with these gains multiplies the
 power of a white signal by that. T s^2 is the transfer function free of the flux scale. Where the true gains are not
 known, the *squared coherence* of response and signal,
 
@@ -38,7 +38,7 @@ known, the *squared coherence* of response and signal,
 
 does not depend on the scale either: it is 1 if only the scale was changed. If each baseline is crossed with itself, it
 is the fraction of the power that remains after an orthogonal projection of white S, and equals T s^2. Weights that are
-not flat make the projection oblique: it moves power between modes, which T has and <S* D> has not, and C^2 / T is
+not flat make the projection oblique: it moves power between modes, which is in T and not in <S* D>, and C^2 / T is
 smaller than T s^2. Between different baselines of a redundant group it is not such a fraction.
 
 Numerator and denominator contain the same sky, so that most of the sample variance cancels. The rest is estimated from
@@ -89,7 +89,7 @@ class TransferFunction:
     scale_free_transfer, scale_free_transfer_error
         T s^2, the transfer function free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     squared_coherence, squared_coherence_error
-        C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,). Of spectra of each
+        C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,). For spectra of each
         baseline with itself it is the fraction of the power that is retained.
     signal
         Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins.
@@ -127,7 +127,7 @@ class TransferMap:
     delay, k_parallel
         (Nd,) ascending, s and h/Mpc.
     transfer, transfer_error, cross_transfer, cross_transfer_error
-        As in `TransferFunction`, (Nb, Nd). A baseline's two signs of the delay are two samples.
+        As in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples.
     horizon_delay
         |b|/c, the edge of the wedge, (Nb,), s.
     """
@@ -146,17 +146,7 @@ class TransferMap:
 
 @dataclass(frozen=True)
 class Injection:
-    """Delay spectra of an injected signal and of what became of it, for the same units and delays.
-
-    Attributes
-    ----------
-    signal
-        S x S.
-    response
-        D x D.
-    cross
-        S x D.
-    """
+    """Delay spectra S x S of an injected signal, D x D of its response, and S x D, for the same units and delays."""
 
     signal: DelaySpectra
     response: DelaySpectra
@@ -174,15 +164,7 @@ class Injection:
 def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
     """Return D, the difference of two residuals of the same noise, with and without the signal in the data.
 
-    Parameters
-    ----------
-    with_signal, without_signal
-        Of the same baselines, times, channels and polarizations. Not mutated. What is flagged in either is flagged.
-
-    Raises
-    ------
-    ValueError
-        If they are of different shape.
+    Samples that are flagged in either are flagged. Raise ValueError if the shapes of the data differ.
     """
     if with_signal.data_array.shape != without_signal.data_array.shape:
         raise ValueError(
@@ -198,13 +180,8 @@ def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
 def gain_ratio(true: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """Return the mean over integrations of g_a g_b* / (ghat_a ghat_b*) for all pairs of antennas, (Npairs, Nfreqs).
 
-    Parameters
-    ----------
-    true
-        Gains of each integration, (Ntimes, Nants, Nfreqs), complex.
-    fitted
-        Likewise; NaN where there are none. Integrations without a gain are left out of the mean of its pairs, which is
-        NaN if all are.
+    Both gains are (Ntimes, Nants, Nfreqs), complex; fitted ones are NaN where there are none. Integrations without a
+    gain are left out of the mean of its pairs, which is NaN if all are.
     """
     first, second = np.triu_indices(true.shape[1], 1)
     total, count = np.zeros((first.size, true.shape[2]), complex), np.zeros((first.size, true.shape[2]))
@@ -219,18 +196,10 @@ def gain_ratio(true: np.ndarray, fitted: np.ndarray) -> np.ndarray:
 
 
 def flux_scale(even: np.ndarray, odd: np.ndarray, weights: np.ndarray) -> float:
-    """Return s, the flux scale of a calibration.
+    """Return s, the flux scale of a calibration; NaN if even and odd data have nothing in common, not even the sign.
 
-    Parameters
-    ----------
-    even, odd
-        True over fitted gain products of the two data sets (`gain_ratio`), (Npairs, Nfreqs), complex; NaN is left out.
-    weights
-        Of each channel, (Nfreqs,): the square of the taper.
-
-    Returns
-    -------
-    NaN if the two have nothing in common, not even the sign.
+    `even` and `odd` are true over fitted gain products (`gain_ratio`), (Npairs, Nfreqs), complex; NaN is left out. The
+    weights of the channels, (Nfreqs,), are the square of the taper.
     """
     power = (even.conj() * odd).real
     known = np.isfinite(power)
@@ -244,18 +213,8 @@ def spherical_transfer(
 ) -> TransferFunction:
     """Return T in bins of |k|, outside or inside the wedge.
 
-    Parameters
-    ----------
-    injection
-        Spectra of signal and response.
-    edges
-        Bin edges, ascending, h/Mpc; a bin holds what is above its lower and not above its upper edge.
-    buffer
-        Modes with |tau| <= |b|/c + buffer (s) are inside the wedge.
-    inside
-        Which modes to average.
-    flux_scale
-        s of the calibration; NaN if not known.
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with |tau| <=
+    |b|/c + `buffer` (s) are inside the wedge. `flux_scale` is s of the calibration; NaN if not known.
     """
     limits = np.asarray(edges, dtype=float)
     signal = injection.signal
@@ -326,12 +285,7 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
     """Return the transfer function of several injections together, such as EoR skies of different seeds.
 
     Each enters with its signal's power, as if its modes were further modes of one injection, and errors add up as those
-    of independent skies.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or their bins differ.
+    of independent skies. Raise ValueError if there is none, or if their bins differ.
     """
     if not transfers:
         raise ValueError("no transfer function to pool, expected at least one")
@@ -372,13 +326,8 @@ def _sum_present(values: np.ndarray) -> np.ndarray:
 def correct(spectrum: SphericalSpectrum, transfer: TransferFunction) -> tuple[np.ndarray, np.ndarray]:
     """Return P^R / T and its standard deviation, (Nk,) each, in the unit of the spectrum.
 
-    Errors of P^R and T are independent: (sigma / P)^2 adds. NaN where too little is left to be corrected, or what is
-    left is not the EoR at this k (`calstudy.power.correctable`).
-
-    Raises
-    ------
-    ValueError
-        If the bins differ.
+    Errors of P^R and T are independent: (sigma / P)^2 adds. NaN where too little is left to be corrected, or where most
+    of it is not the EoR at this k (`calstudy.power.correctable`). Raise ValueError if the bins differ.
     """
     if not np.array_equal(spectrum.bin_edges, transfer.bin_edges):
         raise ValueError("spectrum and transfer function have different bins, expected the same")

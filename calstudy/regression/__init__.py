@@ -1,1 +1,1 @@
-"""Regression: whether a study, made again, still gives the reference results that are kept of it."""
+"""Regression: check that a study, made again, still gives its reference results."""

@@ -14,7 +14,7 @@ from calstudy.verdicts.tolerances import ROUNDING, Arrays, Drawn, Fixed, Measure
 
 Status = Literal["same", "moved", "beyond"]
 CLAIM_SIGMAS = 3.0
-"""A verdict may change with a number that moved by no more than so many of its uncertainties."""
+"""Largest move of a number, in its uncertainties, with which a verdict may change."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,6 @@ class ArrayComparison:
 
     Attributes
     ----------
-    figure, name
-        Which.
     status
         "same" to rounding, "moved" within the tolerance, or "beyond" it.
     relative
@@ -32,9 +30,9 @@ class ArrayComparison:
     largest, rms, shift
         In σ, see `calstudy.verdicts.tolerances.Drawn`; None for arrays that are not drawn.
     tolerance, why
-        What was allowed, and why.
+        The tolerance, and its reason.
     problem
-        What is wrong besides numbers: another shape, an array that is missing or new; or empty.
+        A fault other than numbers: another shape, an array that is missing or new; or empty.
     """
 
     figure: str
@@ -63,16 +61,10 @@ class ClaimComparison:
 
 
 def rules_of(figure: str, declared: Mapping[str, Rules] | None = None) -> Rules:
-    """Return the tolerances that a figure declares.
+    """Return the tolerances of a figure by its label, the name of its files.
 
-    Parameters
-    ----------
-    figure
-        Its label: the name of its files.
-    declared
-        Tolerances by label, of the figures that the reference's experiment names; any other figure is looked for among
-        the built-in and installed ones, where its label may add a word to its name. None are known of one that is
-        nowhere.
+    `declared` are those of the figures that the reference's experiment names, by label. Any other figure is looked up
+    among the built-in and installed ones, where its label may add a word to its name. An unknown figure has none.
     """
     if declared and figure in declared:
         return declared[figure]
@@ -84,17 +76,10 @@ def rules_of(figure: str, declared: Mapping[str, Rules] | None = None) -> Rules:
 def compare_figures(
     reference: Mapping[str, Arrays], made: Mapping[str, Arrays], declared: Mapping[str, Rules] | None = None
 ) -> list[ArrayComparison]:
-    """Compare figures, each a mapping of arrays by name, with the reference of the same name.
+    """Compare figures, each a mapping of arrays by name, with the reference of the same label.
 
     A figure or array that only the reference has is beyond any tolerance; one that only the new results have, moved.
     `declared` is as for `rules_of`.
-
-    Parameters
-    ----------
-    reference, made
-        Arrays by name, by label of the figure.
-    declared
-        As for `rules_of`.
     """
     found = []
     for figure in dict.fromkeys([*reference, *made]):
@@ -117,18 +102,9 @@ def _without_numbers(figure: str, name: str, status: Status, problem: str) -> Ar
 def compare_array(
     figure: str, name: str, reference: Arrays, made: np.ndarray, rules: Rules | None = None
 ) -> ArrayComparison:
-    """Compare one array of a figure.
+    """Compare one array of a figure with all reference arrays of the figure, which give the error bars.
 
-    Parameters
-    ----------
-    figure, name
-        Which.
-    reference
-        All reference arrays of the figure, from which error bars are taken.
-    made
-        The array to compare.
-    rules
-        Tolerances of the figure; by default those of the figure of that name.
+    `rules` are by default those of the figure of that name.
     """
     old = reference[name]
     rule = tolerance(rules_of(figure) if rules is None else rules, name, reference)
@@ -193,16 +169,9 @@ def compare_claims(
 ) -> list[ClaimComparison]:
     """Compare claims by name.
 
-    Another verdict is beyond if the number moved by more than three of its uncertainties, or has none; nearer than
-    that another draw of the noise changes it as well. So is a claim that was evaluated, and is missing or not evaluated
-    any more.
-
-    Parameters
-    ----------
-    reference, made
-        Claims.
-    on_machines
-        Whether they are about run time and memory on a machine: their numbers are never beyond.
+    Another verdict is beyond if the number moved by more than three of its uncertainties, or has none; a smaller move
+    is within the scatter of the noise. A claim that was evaluated and now is missing or not evaluated is beyond as
+    well. Numbers of claims about run time and memory (`on_machines`) are never beyond.
     """
     old, new = ({claim.name: claim for claim in claims} for claims in (reference, made))
     names = dict.fromkeys([*old, *new])

@@ -1,4 +1,4 @@
-"""Reference results on disk: what is kept of a finished run, read and accepted."""
+"""Reference results on disk: the kept part of a finished run, its reading and acceptance."""
 
 from __future__ import annotations
 
@@ -23,25 +23,17 @@ from calstudy.verdicts.tolerances import Rules
 
 EXPERIMENT, MANIFEST = "experiment.yaml", "manifest.json"
 KEPT = ("png", "npz")
-"""Endings of a figure's files that are kept: the picture and its arrays."""
+"""Endings of the kept files of a figure: the picture and its arrays."""
 TABLES = ("realizations.md", "comparison.md")
-"""Tables for readers, which are kept beside the figures."""
+"""Tables for readers, kept beside the figures."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """Figures and claims of a run or of a reference.
+    """Figures (arrays by figure and name) and claims of a run or of a reference.
 
-    Attributes
-    ----------
-    figures
-        Arrays by figure and name.
-    claims
-        Empty if there are none.
-    tolerances
-        Of the figures that the experiment of a reference names, by their label.
-    on_machines
-        Whether a reference is of run times, which are those of a machine.
+    `tolerances` are those of the figures that the experiment of a reference names, by label. `on_machines` is true for
+    a reference of run times, which are those of a machine.
     """
 
     figures: dict[str, dict[str, np.ndarray]]
@@ -51,13 +43,7 @@ class Results:
 
 
 def find_references(folders: Sequence[Path]) -> list[Path]:
-    """Return the reference folders among these and directly below them.
-
-    Raises
-    ------
-    InputError
-        If a folder neither is one nor holds any.
-    """
+    """Return the reference folders among these and directly below; raise InputError for a folder without any."""
     found: list[Path] = []
     for folder in folders:
         inside = (
@@ -72,7 +58,7 @@ def find_references(folders: Sequence[Path]) -> list[Path]:
 
 
 def read_reference(folder: Path) -> Results:
-    """Read what is kept of a run; raises InputError if an array, claim or experiment file is not readable."""
+    """Read a reference; raise InputError if an array, claim or experiment file is not readable."""
     experiment = read_mapping(folder / EXPERIMENT)
     return replace(
         _read(folder, folder), tolerances=_tolerances(experiment, folder), on_machines="runtime" in experiment
@@ -82,7 +68,7 @@ def read_reference(folder: Path) -> Results:
 def _tolerances(experiment: Mapping[str, Any], folder: Path) -> dict[str, Rules]:
     """Return the tolerances of the figures that an experiment or a collection names; a collection has them on top.
 
-    A figure of one's own that is not there any more has none, so that its arrays may not move at all.
+    A user's figure that no longer exists has none, so that its arrays may not move at all.
     """
     named = experiment.get("figures", (experiment.get("outputs") or {}).get("figures", ()))
     found = {}
@@ -96,7 +82,7 @@ def _tolerances(experiment: Mapping[str, Any], folder: Path) -> dict[str, Rules]
 
 
 def read_run(folder: Path) -> Results:
-    """Read a finished run or collection; raises InputError if it is none."""
+    """Read a finished run or collection; raise InputError for another folder."""
     if not (folder / "figures").is_dir() or not (folder / MANIFEST).is_file():
         raise InputError(f"{folder}: is not the folder of a finished run; give one that 'calstudy run' printed")
     return _read(folder, folder / "figures")
@@ -119,28 +105,19 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def accept(run: Path, reference: Path) -> None:
-    """Make a finished run the reference: its pictures, arrays, tables, claims and description replace what is there.
+    """Make a finished run the reference: its pictures, arrays, tables, claims and description replace the old ones.
 
-    A collection keeps the experiments of its members as they are in the references beside it, by the members' names.
-
-    Parameters
-    ----------
-    run
-        Folder of a finished run of an experiment or a collection.
-    reference
-        Made if it does not exist. Pictures, arrays, tables and claims that the run does not have are removed.
-
-    Raises
-    ------
-    InputError
-        If the run is not readable, or the folder cannot be written; all of the run is read before anything is written.
+    The run may be of an experiment or a collection. Files that the run does not have are removed from the reference
+    folder, which is made if it does not exist. A collection keeps the experiments of its members as they are in the
+    references beside it, by the members' names. Raise InputError if the run is not readable, or the folder cannot be
+    written; the complete run is read before anything is written.
     """
     try:
         manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))
         paths = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
         paths |= {name: run / name for name in CLAIMS_FILES if (run / name).is_file()}
         paths |= {name: run / "tables" / name for name in TABLES if (run / "tables" / name).is_file()}
-        # With these a collection can be put together from references (`calstudy.studies.finished`).
+        # A collection can be assembled from references with these (`calstudy.studies.finished`).
         listed = {name for entry in manifest.get("products", []) for name in entry.get("files", ())}
         paths |= {f"tables/{name}": run / "tables" / name for name in sorted(listed)}
         contents = {name: path.read_bytes() for name, path in paths.items()}
@@ -174,7 +151,7 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def _experiment(run: Path) -> dict[str, Any]:
-    """Return what the run was of, without the folders of the machine where it was made."""
+    """Return the description of the run, without the folders of the machine where it was made."""
     if (run / EXPERIMENT).is_file():
         return _without_folders(read_mapping(run / EXPERIMENT))
     manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))

@@ -15,21 +15,9 @@ from calstudy.studies.sweep import Sweep
 
 
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
-    """Run the study of a reference folder, and return the run's folder.
+    """Run the study of a reference folder with ``path=value`` overrides, and return the run's folder.
 
-    Parameters
-    ----------
-    reference
-        Folder with ``experiment.yaml``.
-    overrides
-        ``path=value`` texts, such as ``outputs.store=DIR``.
-    budget, console
-        As for `calstudy.studies.study.run_study`.
-
-    Raises
-    ------
-    InputError
-        If the experiment is a sweep, or as the run raises it.
+    Raise InputError if the experiment is a sweep, or as the run raises it.
     """
     study = load_study(reference / EXPERIMENT, None, overrides)
     if isinstance(study, Sweep):

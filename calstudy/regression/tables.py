@@ -1,4 +1,4 @@
-"""What a regression found, as a table for the terminal and as JSON."""
+"""The result of a regression, as a table for the terminal and as JSON."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calstudy.verdicts.tables import Table, count
 REGRESSION_JSON = "regression.json"
 STATUSES = ("same", "moved", "beyond")
 LISTED = 20
-"""Arrays that moved within their tolerance are listed up to this number, the farthest first; all are in the JSON."""
+"""Largest number of listed arrays that moved within their tolerance, the farthest first; all are in the JSON."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Regression:
 
     @property
     def holds(self) -> bool:
-        """Whether nothing is beyond its tolerance."""
+        """True if nothing is beyond its tolerance."""
         statuses = [item.status for item in self.arrays] + [item.status for item in self.claims]
         return "beyond" not in statuses
 
@@ -41,7 +41,7 @@ def tally(items: Sequence[ArrayComparison | ClaimComparison]) -> str:
 
 
 def write_json(regression: Regression, folder: Path) -> Path:
-    """Write everything into ``regression.json`` in a folder; raises InputError if it cannot."""
+    """Write ``regression.json`` into a folder; raise InputError if it cannot be written."""
     path = folder / REGRESSION_JSON
     text = json.dumps({**asdict(regression), "holds": regression.holds}, indent=1, ensure_ascii=False)
     try:
@@ -52,7 +52,7 @@ def write_json(regression: Regression, folder: Path) -> Path:
 
 
 def show(regression: Regression, console: Console) -> None:
-    """Print the count per figure, what moved and by how much, and the claims that moved."""
+    """Print the count per figure, the arrays that moved and by how much, and the claims that moved."""
     console.print(f"{regression.reference} against {regression.run}", markup=False, highlight=False)
     for figure in dict.fromkeys(item.figure for item in regression.arrays):
         console.print(

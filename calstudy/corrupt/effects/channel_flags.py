@@ -46,12 +46,12 @@ class ChannelFlags(Effect):
         return f"band_edges: {self.band_edges / 1e6:g} MHz: {flagged}; {most / 1e6:g} MHz at most do not cover the band"
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
-        """Return which channels are flagged, (Nfreqs,)."""
+        """Return a mask of the flagged channels, (Nfreqs,)."""
         del random
         return {"channels": self._flagged(observation.frequencies)}
 
     def _flagged(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return which channels are flagged, bool, (Nfreqs,), of centres in Hz."""
+        """Return a mask of the flagged channels, bool, (Nfreqs,), from their centres in Hz."""
         # Half a channel lies between the outermost centres and the ends of the band. Frequencies are good to 1 Hz.
         half = (frequencies[-1] - frequencies[0]) / (len(frequencies) - 1) / 2
         low, high = frequencies[0] - half, frequencies[-1] + half

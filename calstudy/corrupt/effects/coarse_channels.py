@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 BRANCHES, TAPS, KAISER_BETA = 512, 8, 5.0
 STEPS = 6400
-"""Of the tabulated passband, in a coarse channel."""
+"""Number of steps of the tabulated passband in a coarse channel."""
 FEWEST = 3
-"""Channels in a coarse channel, with which it still has a centre and two edges."""
+"""Smallest number of channels in a coarse channel that has a centre and two edges."""
 
 
 class CoarseChannels(GainEffect):
@@ -61,7 +61,7 @@ class CoarseChannels(GainEffect):
     seed: int = Field(17, ge=0, description="Seed of levels and shapes.")
 
     def refusal(self, size: Size) -> str | None:
-        """Refuse channels that are too wide to show the passband."""
+        """Refuse channels that are too wide to resolve the passband."""
         held = self.width / size.channels.width
         # Frequencies are good to 1 Hz.
         if held > FEWEST * (1 - 1 / self.width):
@@ -81,7 +81,7 @@ class CoarseChannels(GainEffect):
         return np.moveaxis(gains, 2, 1)[:, :, None]
 
     def _powers(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return what each coarse channel contributes to the mean power in each channel, (Nfreqs, Ncoarse)."""
+        """Return the contribution of each coarse channel to the mean power in each channel, (Nfreqs, Ncoarse)."""
         half = (frequencies[-1] - frequencies[0]) / (len(frequencies) - 1) / 2
         # Coarse channels that the band only touches are left out. Frequencies are good to 1 Hz.
         lowest, highest = frequencies[0] - half + 1, frequencies[-1] + half - 1
@@ -102,7 +102,7 @@ def _integrated_passband() -> tuple[np.ndarray, np.ndarray]:
 
     prototype = firwin(TAPS * BRANCHES, 1 / BRANCHES, window=("kaiser", KAISER_BETA))
     power = np.abs(np.fft.rfft(prototype, BRANCHES * STEPS)) ** 2
-    # Of the coarse channel itself, and of both that are adjacent.
+    # The power of the coarse channel itself and of both adjacent ones.
     upper = np.arange(STEPS // 2 + 1)
     folded = power[upper] + power[STEPS + upper] + power[STEPS - upper]
     offsets = np.arange(-(STEPS // 2), STEPS // 2 + 1) / STEPS

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from calstudy.instrument.size import Size
 
 LEAST = 3
-"""Antennas that must be left: fewer do not tell the gains of each."""
+"""Smallest number of antennas left: fewer do not determine the gain of each."""
 
 
 class DeadAntennas(Effect):
@@ -31,11 +31,11 @@ class DeadAntennas(Effect):
     seed: int = Field(12, ge=0, description="Seed of the choice of `count` antennas.")
 
     def refusal(self, size: Size) -> str | None:
-        """Refuse antennas that are not there, and to leave fewer than three."""
+        """Refuse antennas that do not exist, and to leave fewer than three."""
         return self._refusal(size.antennas)
 
     def _refusal(self, count: int) -> str | None:
-        """Return why this cannot happen to so many antennas, or None."""
+        """Return why the effect cannot be applied to `count` antennas, or None."""
         if self.antennas and max(self.antennas) >= count:
             return f"antennas: names antenna {max(self.antennas)}, but there are {count} antennas, counted from 0"
         field, dead = ("antennas", len(set(self.antennas))) if self.antennas else ("count", self.count)
@@ -47,13 +47,7 @@ class DeadAntennas(Effect):
         return None
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
-        """Return the antenna numbers, ascending.
-
-        Raises
-        ------
-        InputError
-            As `refusal`.
-        """
+        """Return the antenna numbers, ascending; raise InputError with the sentence of `refusal`."""
         numbers = np.asarray(observation.uvd.telescope.antenna_numbers)
         if (reason := self._refusal(len(numbers))) is not None:
             raise InputError(f"corruption.effects: dead-antennas: {reason}")

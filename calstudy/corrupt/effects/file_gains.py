@@ -28,11 +28,8 @@ class FileGains(GainEffect):
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols).
 
-        Raises
-        ------
-        InputError
-            If the file cannot be read, lacks antennas, channels or polarizations of the observation, or has another
-            number of times.
+        Raise InputError if the file cannot be read, lacks antennas, channels or polarizations of the observation, or
+        has another number of times.
         """
         del random
         template = observation.uvd

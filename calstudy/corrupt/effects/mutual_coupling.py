@@ -48,10 +48,7 @@ class MutualCoupling(Effect):
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
         """Return moduli, delays (s) and phases (rad) of the coefficients, symmetric, (Nants, Nants), zero for itself.
 
-        Raises
-        ------
-        InputError
-            If two antennas are at the same place.
+        Raise InputError if two antennas are at the same place.
         """
         separations = observation.positions[:, None] - observation.positions
         distances = np.linalg.norm(separations, axis=-1)
@@ -66,10 +63,7 @@ class MutualCoupling(Effect):
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
         """Return V + e V + V e^H for the matrix V of all pairs of antennas, and the matrix e of the coefficients.
 
-        Raises
-        ------
-        InputError
-            If the data lack baselines.
+        Raise InputError if the data lack baselines.
         """
         first, second = observation.antennas.T
         count = observation.n_antennas

@@ -26,10 +26,7 @@ class ReflectionGains(GainEffect):
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1, Npols), with an independent draw for every polarization.
 
-        Raises
-        ------
-        InputError
-            If a drawn amplitude is not below one: such a reflection does not decay.
+        Raise InputError if a drawn amplitude is not below one: such a reflection does not decay.
         """
         shape = (observation.n_polarizations, observation.n_antennas)
         amplitudes = random.exponential(self.amplitude, shape)
@@ -49,11 +46,6 @@ def reflection_gain(
 ) -> np.ndarray:
     """Evaluate g = 1 / (1 + r exp[-i (2 pi nu tau + phi)]) (paper Eq. REFGAIN).
 
-    Parameters
-    ----------
-    frequencies
-        In Hz, any shape.
-    amplitude, delay, phase
-        r (below 1), tau in seconds, and phi in radian; numbers, or arrays that broadcast with the frequencies.
+    Frequencies are in Hz; r is below 1, tau in s and phi in rad, numbers or arrays that broadcast with the frequencies.
     """
     return 1 / (1 + amplitude * np.exp(-1j * (2 * np.pi * frequencies * delay + phase)))

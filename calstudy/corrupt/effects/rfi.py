@@ -1,4 +1,4 @@
-"""Radio-frequency interference, and the flags that it leads to."""
+"""Radio-frequency interference, and its flags."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Rfi(Effect):
 
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
         """Return V + S exp(2 pi i nu b.s / c), with the baseline b and the direction s of the transmitter."""
-        # Unlike the sky, it is in few samples; one after the other needs no array of the size of the data.
+        # Few samples are occupied; adding them one by one needs no array of the size of the data.
         for time, channel in np.argwhere(truth["flux"] > 0):
             azimuth = truth["azimuth"][time, channel]
             path = observation.vectors[:, 0] * np.cos(azimuth) + observation.vectors[:, 1] * np.sin(azimuth)
