@@ -1,4 +1,4 @@
-"""Kinds of plug-ins: calibrators, effects, estimators, figures, papers, engines.
+"""Kinds of plug-ins: calibrators, effects, layouts, beams, estimators, figures, papers, engines.
 
 A plug-in is a class: its fields are its settings, and its methods are its behaviour. The built-in ones are modules of
 one package, a file each. Others are found by an entry point of an installed package, or by the path of a Python file,
