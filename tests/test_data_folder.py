@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calstudy.instrument.array_layouts.mwa import MwaLayout
 from calstudy.instrument.beam_file import FILE, SHA256
 from calstudy.instrument.layouts import make_layout
-from calstudy.instrument.settings import MwaLayout
 from calstudy.sky import counts
 from calstudy.sky.catalogue import read_gleam_table
 

@@ -1,4 +1,4 @@
-"""Kinds of plug-ins: calibrators, effects, estimators, figures, papers, engines.
+"""Kinds of plug-ins: calibrators, effects, layouts, beams, estimators, figures, papers, engines.
 
 A plug-in is a class: its fields are its settings, and its methods are its behaviour. The built-in ones are modules of
 one package, a file each. Others are found by an entry point of an installed package, or by the path of a Python file,
@@ -80,6 +80,11 @@ class Plugin(Section):
         file = FILE_REFERENCE.fullmatch(self.reference)
         return self.reference if file is None else file["name"] or Path(file["path"]).stem
 
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the names of a built-in class that has several; empty for one that is named after its module."""
+        return ()
+
     @property
     def is_built_in(self) -> bool:
         """Whether the plug-in is one of calstudy's own."""
@@ -136,10 +141,12 @@ class Registry(Generic[P]):
         ``module:class`` of the base class of the kind.
     tag
         The field of an experiment file that contains the name.
+    families
+        Whether a class may have several names (`Plugin.names`). Its modules are then imported to know them.
     """
 
-    def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind") -> None:
-        self.noun, self.package, self.base_path, self.tag = noun, package, base_path, tag
+    def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:
+        self.noun, self.package, self.base_path, self.tag, self.families = noun, package, base_path, tag, families
         self.group = f"calstudy.{noun}s"
         # Classes of built-in plug-ins, because plans of comparisons look them up ten thousand times.
         self._found: dict[str, type[P]] = {}
@@ -160,7 +167,10 @@ class Registry(Generic[P]):
         """The modules of the built-in plug-ins, by name."""
         found = [module.name for module in pkgutil.iter_modules(import_module(self.package).__path__)]
         names = {name.replace("_", "-"): f"{self.package}.{name}" for name in found if not name.startswith("_")}
-        return dict(sorted(names.items()))
+        if not self.families:
+            return dict(sorted(names.items()))
+        classes = {name: (module, self._in(import_module(module), name)) for name, module in names.items()}
+        return {name: module for own, (module, found) in classes.items() for name in found.names() or (own,)}
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""
@@ -193,7 +203,7 @@ class Registry(Generic[P]):
         """Return the name or path by which `find` finds a class, or its bare name if it is in no file."""
         package, _, name = thing.__module__.rpartition(".")
         if package == self.package:
-            return name.replace("_", "-")
+            return next(iter(thing.names()), name.replace("_", "-"))
         for point in self.installed().values():
             if point.module == thing.__module__ and point.attr in ("", thing.__name__):
                 return point.name

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, SerializeAsAny, model_validator
 
@@ -35,136 +33,11 @@ class Coordinates(Section):
 Location = Annotated[Site | Coordinates, Field(discriminator="kind"), choice("kind", "coordinates")]
 
 
-class ArrayLayout(Section):
-    """Positions of antennas; `site` is the site of the array unless `instrument.location` is given."""
-
-    site: ClassVar[Literal["mwa", "hera"]] = "mwa"
-    kind: str
-
-
-class NamedLayout(ArrayLayout):
-    """Antennas of an existing array, or a part of it."""
-
-    sizes: ClassVar[Mapping[str, int]]
-    """Number of antennas of each kind."""
-
-    count: int | None = Field(None, ge=2, description="Keep only the first `count` antennas (all by default).")
-
-    @property
-    def antennas(self) -> int:
-        """Number of antennas."""
-        return self.count or self.sizes[self.kind]
-
-    @model_validator(mode="after")
-    def _enough_antennas(self) -> Self:
-        size = self.sizes[self.kind]
-        if self.count is not None and self.count > size:
-            raise fault("count", f"{self.count} is more than the {size} antennas of {self.kind}")
-        return self
-
-
-class MwaLayout(NamedLayout):
-    """Tiles of the MWA: Phase II compact (paper §Simulations), Phase II extended, or Phase I (Wayth et al. 2018)."""
-
-    sizes: ClassVar[Mapping[str, int]] = {
-        "mwa-compact-minredundant": 36,
-        "mwa-compact-hex-east": 36,
-        "mwa-compact-hex-south": 36,
-        "mwa-compact": 128,
-        "mwa-extended": 128,
-        "mwa-phase1": 128,
-    }
-    kind: Literal[
-        "mwa-compact-minredundant",
-        "mwa-compact-hex-east",
-        "mwa-compact-hex-south",
-        "mwa-compact",
-        "mwa-extended",
-        "mwa-phase1",
-    ] = Field(
-        "mwa-compact-minredundant",
-        description="The first 36 tiles of the core, one of the two 36-tile hexagons, or all 128 tiles of a "
-        "configuration.",
-    )
-
-
-class HeraLayout(NamedLayout):
-    """HERA at its own site: antennas 14.6 m apart, flat, as designed (DeBoer et al. 2017; Dillon & Parsons 2016).
-
-    `hera-19` and `hera-37` are filled hexagons. `hera-320` is the core, a hexagon in three sectors that are displaced
-    relative to each other by a third of the unit cell; `hera-350` has the 30 outriggers as well. `hera-128` is the
-    first 128 antennas of the core. Antennas of the last three have HERA's numbers, from the south.
-    """
-
-    site: ClassVar[Literal["mwa", "hera"]] = "hera"
-    sizes: ClassVar[Mapping[str, int]] = {
-        "hera-19": 19,
-        "hera-37": 37,
-        "hera-128": 128,
-        "hera-320": 320,
-        "hera-350": 350,
-    }
-    kind: Literal["hera-19", "hera-37", "hera-128", "hera-320", "hera-350"]
-
-
-class HexLayout(ArrayLayout):
-    """A filled regular hexagon, flat."""
-
-    kind: Literal["hex"]
-    side: int = Field(4, ge=2, le=26, description="Antennas along one side; 4 gives 37 antennas.")
-    spacing: Length = Field(14.0, ge=0.01, description="Distance between neighbours.")
-
-
-class LinearLayout(ArrayLayout):
-    """An east-west line of equally spaced antennas (paper Fig. MAXBL_RUNTIME)."""
-
-    kind: Literal["linear"]
-    count: int = Field(10, ge=2, le=2000)
-    spacing: Length = Field(14.0, ge=0.01)
-
-
-class RectangularLayout(ArrayLayout):
-    """Rows of eight antennas, spread so that the longest baseline is `max_baseline` (paper Fig. ANTPOS_RUNTIME)."""
-
-    kind: Literal["rectangular"]
-    count: int = Field(16, ge=9, le=2000, description="Number of antennas; at least nine, so that there are two rows.")
-    spacing: Length = Field(2.0, ge=0.01, description="Distance between neighbours in a row.")
-    max_baseline: Length = Field(100.0, gt=0)
-
-    @model_validator(mode="after")
-    def _rows_fit(self) -> RectangularLayout:
-        if self.max_baseline <= 7 * self.spacing:
-            raise fault(
-                "max_baseline",
-                f"{self.max_baseline:g} m must exceed the length of a row, 7 x spacing = {7 * self.spacing:g} m",
-            )
-        return self
-
-
-class GolombLayout(ArrayLayout):
-    """An east-west line at the marks of an optimal Golomb ruler: every baseline is unique."""
-
-    kind: Literal["golomb"]
-    count: int = Field(8, ge=2, le=16, description="Number of antennas (marks of the ruler).")
-    spacing: Length = Field(4.0, ge=0.01, description="Length of one unit of the ruler.")
-
-
-class CsvLayout(ArrayLayout):
-    """Positions from a CSV file with columns east_m, north_m, up_m and, optionally, name and number.
-
-    It requires `instrument.location`, because the file does not contain the position of the array.
-    """
-
-    kind: Literal["csv"]
-    path: Path = Field(strict=False, description="CSV file, relative to the experiment file or absolute.")
-
-
-Layout = Annotated[
-    MwaLayout | HeraLayout | HexLayout | LinearLayout | RectangularLayout | GolombLayout | CsvLayout,
-    Field(discriminator="kind"),
-    choice("kind", "mwa-compact-minredundant"),
-]
-
+LAYOUTS: Registry[Any] = Registry(
+    "layout", "calstudy.instrument.array_layouts", "calstudy.instrument.layouts:ArrayLayout", families=True
+)
+DEFAULT_LAYOUT = "mwa-compact-minredundant"
+Layout = Annotated[SerializeAsAny[Plugin], LAYOUTS.field(DEFAULT_LAYOUT)]
 
 BEAMS: Registry[Any] = Registry("beam", "calstudy.instrument.beam_models", "calstudy.instrument.interface:BeamModel")
 DEFAULT_BEAM = "mwa-embedded-element"
@@ -216,7 +89,7 @@ class Times(Section):
 class InstrumentSettings(Section):
     """Positions and beams of the antennas, and times and frequencies of the observation."""
 
-    layout: Layout = MwaLayout()
+    layout: Layout = Field(default_factory=lambda: LAYOUTS.make(DEFAULT_LAYOUT))
     location: Location | None = Field(
         None,
         description="Where the array is: the name of a site, or coordinates; null: the site of the layout, HERA's for "
@@ -236,9 +109,14 @@ class InstrumentSettings(Section):
     as_built: AsBuilt = AsBuilt()
 
     @property
+    def _own_site(self) -> Any:
+        # `ArrayLayout` has it, which this module cannot import.
+        return getattr(self.layout, "site", None)
+
+    @property
     def site(self) -> Site | Coordinates:
         """The site of the array."""
-        return Site(kind=self.layout.site) if self.location is None else self.location
+        return Site(kind=self._own_site) if self.location is None else self.location
 
     def nominal(self) -> InstrumentSettings:
         """Return the instrument as designed, which calibrators and figures assume."""
@@ -250,11 +128,11 @@ class InstrumentSettings(Section):
 
     @model_validator(mode="after")
     def _positions_of_a_file_have_a_place(self) -> InstrumentSettings:
-        if isinstance(self.layout, CsvLayout) and self.location is None:
+        if self._own_site is None and self.location is None:
             sites = ", ".join(get_args(Site.model_fields["kind"].annotation))
             raise fault(
                 "location",
-                "is required where instrument.layout is a CSV file: the name of a site "
+                f"is required for instrument.layout {self.layout.label!r}, which is at no site: the name of a site "
                 f"({sites}), or coordinates (latitude and longitude)",
             )
         return self

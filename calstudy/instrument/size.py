@@ -2,43 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import math
 from dataclasses import dataclass
-from pathlib import Path
+from functools import lru_cache
 
 import numpy as np
 
+from calstudy.base.identity import digest_json, identity
 from calstudy.base.observation import Frame
-from calstudy.instrument.settings import (
-    Channels,
-    CsvLayout,
-    GolombLayout,
-    HexLayout,
-    InstrumentSettings,
-    Layout,
-    LinearLayout,
-    NamedLayout,
-    RectangularLayout,
-)
-
-NAMED_LENGTHS = {
-    "mwa-compact-minredundant": (176.2, 54.1),
-    "mwa-compact-hex-east": (84.1, 41.9),
-    "mwa-compact-hex-south": (84.1, 41.9),
-    "mwa-compact": (740.8, 154.9),
-    "mwa-extended": (5302.9, 1878.7),
-    "mwa-phase1": (2873.6, 680.0),
-    "hera-19": (58.4, 31.2),
-    "hera-37": (87.6, 43.0),
-    "hera-128": (263.4, 91.0),
-    "hera-320": (292.2, 127.3),
-    "hera-350": (876.1, 165.6),
-}
-"""Longest and mean baseline, m."""
-MEAN_OVER_LONGEST = 0.45
-# Length of an optimal ruler over the square of the number of its marks.
-GOLOMB_LENGTH = 0.55
+from calstudy.base.plugins import Plugin
+from calstudy.instrument.layouts import make_layout
+from calstudy.instrument.settings import Channels, InstrumentSettings
 
 
 @dataclass(frozen=True)
@@ -55,14 +28,14 @@ class Size:
     @classmethod
     def of(cls, instrument: InstrumentSettings) -> Size:
         """Return the size of an instrument's data."""
-        longest, mean = baseline_lengths(instrument.layout)
+        extent = _extent(instrument.layout)
         return cls(
-            antennas=antenna_count(instrument.layout),
+            antennas=extent.antennas,
             times=instrument.times.count,
             channels=instrument.channels,
             polarizations=len(instrument.polarizations),
-            longest=longest,
-            mean=mean,
+            longest=extent.longest,
+            mean=extent.mean,
         )
 
     @classmethod
@@ -92,43 +65,29 @@ class Size:
         return self.baselines * self.times * self.channels.count * self.polarizations
 
 
-def antenna_count(layout: Layout) -> int:
-    """Return the number of antennas of a layout, without making it where that is possible."""
-    if isinstance(layout, HexLayout):
-        return 3 * layout.side * (layout.side - 1) + 1
-    if isinstance(layout, CsvLayout):
-        lines = layout.path.read_text(encoding="utf-8", errors="replace").splitlines()
-        return max(sum(1 for line in lines if line.strip() and not line.startswith("#")) - 1, 2)
-    return layout.antennas if isinstance(layout, NamedLayout) else layout.count
+@dataclass(frozen=True)
+class _Extent:
+    """Number of antennas, longest and mean baseline (m)."""
+
+    antennas: int
+    longest: float
+    mean: float
 
 
-def baseline_lengths(layout: Layout) -> tuple[float, float]:
-    """Estimate the longest and the mean baseline of a layout, m, without making it."""
-    if isinstance(layout, HexLayout):
-        longest = 2 * (layout.side - 1) * layout.spacing
-    elif isinstance(layout, LinearLayout):
-        longest = (layout.count - 1) * layout.spacing
-    elif isinstance(layout, RectangularLayout):
-        longest = layout.max_baseline
-    elif isinstance(layout, GolombLayout):
-        longest = GOLOMB_LENGTH * layout.count**2 * layout.spacing
-    elif isinstance(layout, CsvLayout):
-        longest = _extent(layout.path)
-    else:
-        return NAMED_LENGTHS[layout.kind]
-    return longest, MEAN_OVER_LONGEST * longest
+def _extent(layout: Plugin) -> _Extent:
+    return _extent_of(layout, digest_json(identity(layout)))
 
 
-def _extent(path: Path) -> float:
-    """Return the diagonal of the bounding box of the antennas of a layout file, m; zero if the file is invalid.
+@lru_cache(maxsize=256)
+def _extent_of(layout: Plugin, content: str) -> _Extent:
+    """Return the extent of a layout; `content` is a digest that changes with its files."""
+    del content
+    enu = make_layout(layout).enu
+    first, second = np.triu_indices(len(enu), 1)
+    lengths = np.linalg.norm(enu[first] - enu[second], axis=1)
+    return _Extent(len(enu), float(lengths.max()), float(lengths.mean()))
 
-    The file is checked when the layout is made.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as table:
-            rows = list(csv.DictReader(table))
-        axes = [[float(row[name]) for row in rows] for name in ("east_m", "north_m")]
-        extent = float(sum((max(axis) - min(axis)) ** 2 for axis in axes) ** 0.5)
-    except (csv.Error, KeyError, TypeError, ValueError, OverflowError):
-        return 0.0
-    return extent if math.isfinite(extent) else 0.0
+
+def antenna_count(layout: Plugin) -> int:
+    """Return the number of antennas of a layout. Raises InputError as `make_layout`."""
+    return _extent(layout).antennas

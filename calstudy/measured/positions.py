@@ -9,8 +9,8 @@ from astropy import units
 from pyuvdata import UVData, utils
 
 from calstudy.base.errors import InputError
+from calstudy.instrument.array_layouts.csv import CsvLayout
 from calstudy.instrument.layouts import make_layout
-from calstudy.instrument.settings import CsvLayout
 
 
 def place_antennas(data: UVData, path: Path) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.instrument.distinct_beams import beam_count
-from calstudy.instrument.settings import HeraLayout, HexLayout, RectangularLayout
+from calstudy.instrument.layouts import layout_of
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, once
@@ -255,8 +255,7 @@ def _node_counts(
 
 def _is_regular(instrument: InstrumentSettings) -> bool:
     """Return whether antennas are on a flat lattice."""
-    regular = isinstance(instrument.layout, HeraLayout | HexLayout | RectangularLayout)
-    return regular and not instrument.as_built.positions.scatter
+    return layout_of(instrument.layout).regular and not instrument.as_built.positions.scatter
 
 
 def _pieces(simulation: SimulationSettings, sky: Foregrounds | Eor, instrument: InstrumentSettings) -> int:

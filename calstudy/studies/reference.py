@@ -133,12 +133,15 @@ def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iter
     yield from (f"`{registry.tag}` is the name of {registry.a_noun}, or the path of a Python file that holds one.", "")
     shared: dict[str, FieldInfo] = {}
     for name in registry.names():
-        yield from (f"### `{path}: {{{registry.tag}: {name}}}`", "")
         try:
             found = registry.find(name)
         except InputError as error:
-            yield from (f"Cannot be used here: {error}", "")
+            yield from (f"### `{path}: {{{registry.tag}: {name}}}`", "", f"Cannot be used here: {error}", "")
             continue
+        names = found.names() if name in registry.built_in() else ()
+        if names and name != names[0]:
+            continue
+        yield from (f"### `{path}: {{{registry.tag}: {' | '.join(names or (name,))}}}`", "")
         yield from _plain_section(found)
         blocks = {key: info for key, info in found.model_fields.items() if _blocks(info.annotation)}
         if blocks:

@@ -24,7 +24,9 @@ from calstudy.experiment.files import apply_scale, override, parse_override
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import FIGURES, PAPERS, StudyName
 from calstudy.figures import DRAW
-from calstudy.instrument.settings import Channels, LinearLayout, RectangularLayout
+from calstudy.instrument.array_layouts.linear import LinearLayout
+from calstudy.instrument.array_layouts.rectangular import RectangularLayout
+from calstudy.instrument.settings import Channels
 from calstudy.products.run_times import COUNT_STEPS, SUMMARIZE, TIME_STEPS, TimedArray
 from calstudy.run.provenance import machine, package_versions
 from calstudy.run.task import Task

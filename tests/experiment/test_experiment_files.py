@@ -85,7 +85,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
             "{name: a, instrument: {channels: {width: -80 kHz}}}",
             "instrument.channels.width = '-80 kHz': must be at least 100 Hz",
         ),
-        ("{name: a, instrument: {layout: hexa}}", "instrument.layout: 'hexa' is not a choice, did you mean 'hex'?"),
+        ("{name: a, instrument: {layout: hexa}}", "instrument.layout: 'hexa' is not a layout, did you mean 'hex'?"),
         (
             "{name: a, instrument: {layout: {kind: hex, side: '3'}}}",
             "instrument.layout.side = '3': must be a whole number",

@@ -29,8 +29,8 @@ def sections() -> dict[str, dict[str, str]]:
 
 
 def merged(base: dict | str, changes: dict) -> dict:
-    """Return a block of settings with changes, block by block; a name alone is replaced."""
-    base = {} if isinstance(base, str) else base
+    """Return a block with changes, block by block; a name alone and a block of another kind are replaced."""
+    base = {} if isinstance(base, str) or base.get("kind") != changes.get("kind", base.get("kind")) else base
     return {
         **base,
         **{

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from gain_projection import projector, random
 
-from calstudy.instrument.layouts import make_layout, redundant_groups
-from calstudy.instrument.settings import ArrayLayout, HexLayout, MwaLayout
+from calstudy.instrument.array_layouts.hex import HexLayout
+from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.layouts import ArrayLayout, make_layout, redundant_groups
 
 
 @pytest.mark.parametrize("antennas", [10, 36])

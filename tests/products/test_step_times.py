@@ -15,7 +15,8 @@ from calstudy.calibrate.settings import BasisSettings
 from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
-from calstudy.instrument.settings import Channels, LinearLayout
+from calstudy.instrument.array_layouts.linear import LinearLayout
+from calstudy.instrument.settings import Channels
 from calstudy.products.paper_step import PaperStep
 from calstudy.products.step_times import Descent, Samples, descend, make_simulation, time_steps, time_steps_apart
 

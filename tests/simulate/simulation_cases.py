@@ -10,6 +10,7 @@ from astropy.time import Time
 from pyradiosky import SkyModel
 
 from calstudy.instrument import settings as instrument
+from calstudy.instrument.array_layouts.mwa import MwaLayout
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate.arguments import OPTIONAL, missing_package
 from calstudy.simulate.engines.dense import DenseEngine
@@ -31,7 +32,7 @@ def observe(count=5, channels=3, width="4 MHz", times=3, integration="56 s", pol
     """Return the template of a few MWA tiles, at their real heights, over the paper's band and time."""
     template = make_template(
         instrument.InstrumentSettings(
-            layout=instrument.MwaLayout(count=count),
+            layout=MwaLayout(count=count),
             channels=instrument.Channels(first="170 MHz", width=width, count=max(8, channels)),
             times=instrument.Times(count=times, integration=integration),
             polarizations=polarizations,

@@ -10,8 +10,9 @@ from pyradiosky import SkyModel
 from simulation_cases import observe, random_sky, relative_error
 
 from calstudy.base.visibilities import baseline_vectors
+from calstudy.instrument.array_layouts.csv import CsvLayout
 from calstudy.instrument.beam_models.gaussian import GaussianBeam
-from calstudy.instrument.settings import Channels, CsvLayout, InstrumentSettings, Site, Times
+from calstudy.instrument.settings import Channels, InstrumentSettings, Site, Times
 from calstudy.simulate.chunks import simulate_visibilities
 from calstudy.simulate.component import Component
 from calstudy.simulate.engines.dense import DenseEngine

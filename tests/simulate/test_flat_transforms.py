@@ -8,6 +8,9 @@ from simulation_cases import healpix_sky, random_sky
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.instrument import settings as instrument
+from calstudy.instrument.array_layouts.csv import CsvLayout
+from calstudy.instrument.array_layouts.hera import HeraLayout
+from calstudy.instrument.array_layouts.hex import HexLayout
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate import patches
@@ -31,7 +34,7 @@ def scattered(count=12, extent=150.0, seed=2):
 
 def thirds():
     """Return the antennas of a hexagon and some that are a third of its steps off its lattice."""
-    hexagon = make_layout(instrument.HexLayout(kind="hex", side=3, spacing="14.6 m")).enu
+    hexagon = make_layout(HexLayout(kind="hex", side=3, spacing="14.6 m")).enu
     return np.concatenate([hexagon, hexagon[:4] + np.array([60 + 14.6 / 3, 0.0, 0.0])])
 
 
@@ -91,7 +94,7 @@ def test_an_array_with_heights_is_not_flat():
 
 
 def test_the_three_sectors_of_hera_have_one_lattice():
-    vectors = baselines(make_layout(instrument.HeraLayout(kind="hera-350")).enu)
+    vectors = baselines(make_layout(HeraLayout(kind="hera-350")).enu)
     basis = lattice_basis(vectors)
     assert np.linalg.norm(basis, axis=1) == pytest.approx(14.6 / np.sqrt(3))
     steps = vectors @ np.linalg.inv(basis)
@@ -117,7 +120,7 @@ def test_vectors_on_no_lattice_have_none():
 def test_a_flat_array_agrees_with_pyuvsim(antennas, embedded_beam, monkeypatch, tmp_path):
     table = tmp_path / "antennas.csv"
     np.savetxt(table, antennas, delimiter=",", header="east_m,north_m,up_m", comments="")
-    layout = instrument.CsvLayout(kind="csv", path=table)
+    layout = CsvLayout(kind="csv", path=table)
     monkeypatch.setattr(patches, "product_seconds", lambda antennas, sources: np.inf)
     monkeypatch.setattr(PairSums, "at", None)
     template = observe_flat(layout)
@@ -130,7 +133,7 @@ def test_a_flat_array_agrees_with_pyuvsim(antennas, embedded_beam, monkeypatch, 
 @pytest.fixture(scope="module")
 def many():
     """128 antennas of HERA for 112 s."""
-    return observe_flat(instrument.HeraLayout(kind="hera-128"), times=15, channels=1)
+    return observe_flat(HeraLayout(kind="hera-128"), times=15, channels=1)
 
 
 def kind_of_sums(template, beam, dtype=np.float32, accuracy=EOR):
@@ -146,7 +149,7 @@ def test_many_antennas_in_a_plane_take_transforms(many, embedded_beam):
     assert nside < 8
     assert kind is FlatSums
     assert kind_of_sums(many, embedded_beam, np.float64) == (8, PairSums)
-    few = observe_flat(instrument.HexLayout(kind="hex", side=3))
+    few = observe_flat(HexLayout(kind="hex", side=3))
     assert kind_of_sums(few, embedded_beam) == (8, PairSums)
 
 

@@ -1,4 +1,4 @@
-"""The antennas of HERA as designed: a core in three displaced sectors, and outriggers (Dillon & Parsons 2016).
+"""HERA as designed: a core in three displaced sectors, and outriggers (Dillon & Parsons 2016).
 
 The core is a hexagonal lattice cut into three rhombi, 11 x 10, 10 x 10 and 11 x 10 antennas. The eastern and the
 northern rhombus are displaced by vectors that join a lattice point to the centre of a triangle of the lattice, so that
@@ -9,9 +9,16 @@ times the spacing and displaced likewise. Positions here are in units of the spa
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
+from calstudy.instrument.array_layouts.hex import hexagon
+from calstudy.instrument.layouts import Layout, NamedLayout
+
 SPACING = 14.6
+SIDES = {"hera-19": 3, "hera-37": 4}
 LATTICE = SPACING * np.array([[1.0, 0.0], [0.5, np.sqrt(3) / 2]])
 """East and north of the two basis vectors, m."""
 
@@ -66,3 +73,30 @@ def _displacement(offset: np.ndarray) -> np.ndarray:
     if -120 < angle <= 0:
         return EAST_SHIFT
     return NORTH_SHIFT if 0 < angle <= 120 else np.zeros(2)
+
+
+class HeraLayout(NamedLayout):
+    """HERA at its own site: antennas 14.6 m apart, flat, as designed (DeBoer et al. 2017; Dillon & Parsons 2016).
+
+    `hera-19` and `hera-37` are filled hexagons. `hera-320` is the core, a hexagon in three sectors that are displaced
+    against each other by a third of the unit cell; `hera-350` has the 30 outriggers as well. `hera-128` is the first
+    128 antennas of the core. Antennas of the last three are numbered as HERA numbers them, from the south.
+    """
+
+    site: ClassVar[str | None] = "hera"
+    regular: ClassVar[bool] = True
+    sizes: ClassVar[Mapping[str, int]] = {
+        "hera-19": 19,
+        "hera-37": 37,
+        "hera-128": 128,
+        "hera-320": 320,
+        "hera-350": 350,
+    }
+
+    def make(self) -> Layout:
+        """Return the antennas in the order of their numbers."""
+        if self.kind in SIDES:
+            positions = SPACING * hexagon(SIDES[self.kind])
+        else:
+            positions = np.concatenate([core_positions(), outrigger_positions()])[: self.sizes[self.kind]]
+        return self.flat(positions[: self.count], prefix="HH")
