@@ -52,7 +52,6 @@ def read_calibrator(
 
 
 def _changed(path: Path | None, changes: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the content of a file with changes."""
     content = _content(path)
     for field, value in changes:
         content = override(content, field, value)

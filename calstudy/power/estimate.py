@@ -90,9 +90,9 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
 def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_convention: str | None) -> np.ndarray:
     """Return the beam-weighted mean brightness temperature of a visibility of 1 Jy, in K/Jy, shape (Nfreqs,).
 
-    A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2, and half of that in the convention V_xx
-    = 1/2 int A I (`pol_convention` None or "sum", as in `pyuvdata.UVData`; "avg" otherwise). Frequencies in Hz and the
-    solid angle of the power beam in sr are (Nfreqs,).
+    A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2 for the `pol_convention` "avg" of
+    pyuvdata, and half of that, V_xx = 1/2 int A I, for "sum" or None. `frequencies` are in Hz, `omega_p` is the solid
+    angle of the power beam in sr, (Nfreqs,) each. Raise ValueError for another convention.
     """
     halves = {None: 2.0, "sum": 2.0, "avg": 1.0}
     if pol_convention not in halves:
