@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 class Levels:
     """Amplitudes of the components, in Jy.
 
-    `foreground_rms` and `eor_rms` are of the visibilities as simulated, over baselines other than autocorrelations,
+    `foreground_rms` and `eor_rms` are rms of the visibilities as simulated, over baselines other than autocorrelations,
     times and channels; `eor_factor` multiplies the EoR. `noise_std` is the standard deviation of the complex noise per
-    baseline, channel, integration and realization; its rms over channels where they differ. `noise_spectrum`, (Nfreqs,
-    Npols), is then the same for every channel and polarization.
+    baseline, channel, integration and realization; its rms over channels where they differ. `noise_spectrum`,
+    (Nfreqs, Npols), then holds it for every channel and polarization.
     """
 
     foreground_rms: float
