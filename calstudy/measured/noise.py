@@ -75,7 +75,8 @@ def sample_noise(data: UVData) -> float | None:
 def half_difference(even: UVData, odd: UVData) -> UVData:
     """Return the difference of two averages, with the power P_N of the noise of their product.
 
-    Both have one integration of the same baselines, phased to the same point. Samples flagged in either are flagged.
+    Both have one integration of the same baselines, phased to the same point, and are not changed. Samples flagged in
+    either are flagged.
     """
     found = even.copy()
     n_even, n_odd = (_weights(uvd) for uvd in (even, odd))

@@ -116,10 +116,10 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     identity weighting. The beam is divided out channel by channel (Omega_p to temperature, Omega_pp / Omega_p^2 in the
     normalization), so its frequency dependence is accounted for; X and Y are taken over the band likewise.
 
-    `even` and `odd` have one integration each, in Jy. The result has one spectrum per baseline pair and polarization,
-    complex, in mK^2 h^-3 Mpc^3, unfolded, without window functions; it can be written to HDF5 and read back. It has
-    hera_pspec's conventions: conj(even) times odd, with the kernel exp(-2 pi i tau nu), so that its delay axis is the
-    paper's, reversed.
+    `even` and `odd` have one integration each, in Jy, and are not changed. The result has one spectrum per baseline
+    pair and polarization, complex, in mK^2 h^-3 Mpc^3, unfolded, without window functions; it can be written to HDF5
+    and read back. It has hera_pspec's conventions: conj(even) times odd, with the kernel exp(-2 pi i tau nu), so that
+    its delay axis is the paper's, reversed.
 
     Baselines that are completely flagged are left out. Raise ValueError if the data sets differ in anything but data,
     have more than one integration, are not in Jy, or leave no unflagged pair.

@@ -164,7 +164,7 @@ class Injection:
 def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
     """Return D, the difference of two residuals of the same noise, with and without the signal in the data.
 
-    Samples that are flagged in either are flagged. Raise ValueError if the shapes of the data differ.
+    Samples that are flagged in either are flagged; the inputs are not changed. Raise ValueError if the shapes differ.
     """
     if with_signal.data_array.shape != without_signal.data_array.shape:
         raise ValueError(
