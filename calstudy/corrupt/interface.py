@@ -49,8 +49,8 @@ class Effect(Plugin, ABC):
     def refusal(self, size: Size) -> str | None:
         """Return in one sentence why the effect cannot be applied to data of this size, or None if it can.
 
-        Plans ask before there are data. A sentence about a setting starts with its path and a colon, such as ``count:
-        must be ...``.
+        Plans ask before there are data. A sentence about a setting starts with its path and a colon, such as
+        ``count: must be ...``.
         """
         del size
         return None

@@ -17,17 +17,10 @@ if TYPE_CHECKING:
 class Levels:
     """Amplitudes of the components, in Jy.
 
-    Attributes
-    ----------
-    foreground_rms, eor_rms
-        rms of the visibilities as simulated, over baselines other than autocorrelations, times and channels.
-    eor_factor
-        Factor of the EoR visibilities.
-    noise_std
-        Standard deviation of the complex noise per baseline, channel, integration and realization; its rms over
-        channels where they differ.
-    noise_spectrum
-        The same for every channel and polarization, (Nfreqs, Npols), where they differ.
+    `foreground_rms` and `eor_rms` are rms of the visibilities as simulated, over baselines other than autocorrelations,
+    times and channels; `eor_factor` multiplies the EoR. `noise_std` is the standard deviation of the complex noise per
+    baseline, channel, integration and realization; its rms over channels where they differ. `noise_spectrum`,
+    (Nfreqs, Npols), then holds it for every channel and polarization.
     """
 
     foreground_rms: float

@@ -29,20 +29,9 @@ if TYPE_CHECKING:
 class BaselineSpectra:
     """RMS over integrations of one baseline's delay transforms, each (Ndelays,) real, Jy Hz.
 
-    Attributes
-    ----------
-    baseline_length
-        |b| in m.
-    delay
-        Ascending delays, (Ndelays,), s.
-    data
-        Uncalibrated visibilities V.
-    model
-        Fitted foregrounds times gains, ĝ_a ĝ_b* F̂.
-    residual
-        Calibrated residuals R.
-    uncorrupted
-        Visibilities S+F+N without gain errors, if they are to be drawn.
+    `data` are the uncalibrated visibilities V, `model` the fitted foregrounds times gains, ĝ_a ĝ_b* F̂, `residual` the
+    calibrated residuals R, and `uncorrupted` S+F+N without gain errors, if they are to be drawn. `baseline_length` is
+    |b| in m; delays are ascending, s.
     """
 
     antennas: tuple[int, int]

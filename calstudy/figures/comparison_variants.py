@@ -37,7 +37,6 @@ def variants(labels: Sequence[str]) -> dict[str, dict[str, str]]:
 
 
 def _names(groups: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Return the variants of all groups, each once, in order."""
     return list(dict.fromkeys(variant for group in groups.values() for variant in group))
 
 

@@ -38,16 +38,9 @@ TOTAL = r"$P^{R}/P^{S}$, EoR in the data"
 class ConvergencePath:
     """Power common to even and odd residuals after a number of steps of a solver, over the power of the EoR.
 
-    Attributes
-    ----------
-    steps
-        (Ncheckpoints,) ascending.
-    bias, bias_error
-        Without EoR in the data, and its standard deviation, (Ncheckpoints,).
-    with_eor, with_eor_error
-        The same with EoR in the data.
-    predicted
-        The power that corresponds to the solver's own distance from the minimum, (Ncheckpoints,).
+    All arrays are (Ncheckpoints,), `steps` ascending. `bias` is without EoR in the data, and `with_eor` with it, each
+    with its standard deviation; `predicted` is the power that corresponds to the solver's own distance from the
+    minimum.
     """
 
     solver: str

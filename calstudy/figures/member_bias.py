@@ -24,16 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MemberBias:
-    """Bias of a calibration outside the wedge.
+    """Bias of a calibration outside the wedge, s^2 P^R0 / P^S, (Nk,), free of the flux scale s.
 
-    Attributes
-    ----------
-    k
-        Centres of the bins, h/Mpc, (Nk,).
-    bias
-        s^2 P^R0 / P^S, (Nk,): the residual without EoR over the EoR, free of the flux scale s.
-    bias_error
-        Its standard deviation by leaving out antennas, (Nk,); NaN in bins of one baseline or group.
+    The error is by leaving out antennas; NaN in bins of one baseline or group. `k` are the centres of the bins, h/Mpc.
     """
 
     k: np.ndarray

@@ -160,7 +160,6 @@ def _legend_above(axes: Axes, columns: int) -> None:
 
 
 def _quoted(arrays: Arrays, name: str) -> np.ndarray:
-    """Return the quoted errors of the values of a quantity."""
     return arrays[name.replace(".values.", ".quoted.")]
 
 

@@ -38,16 +38,10 @@ MOST = 2 * len(COLOURS)
 
 @dataclass(frozen=True)
 class RuntimeSeries:
-    """Run times of one machine or solver.
+    """Run times of one machine or solver: median and ends of the central 95 %, (Nsizes,), s.
 
-    Attributes
-    ----------
-    size
-        Number of antennas, or longest baseline in m, (Nsizes,), increasing.
-    median, low, high
-        Median and ends of the central 95 % of the run times, (Nsizes,), s.
-    fit
-        The medians as a power of the size.
+    `size` is the number of antennas, or the longest baseline in m, increasing; `fit` gives the medians as a power of
+    it.
     """
 
     label: str

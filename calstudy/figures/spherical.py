@@ -31,20 +31,9 @@ SIGMAS_95 = 1.96
 class SphericalColumn:
     """The spherical spectra of one column: one array, one choice of Fourier modes.
 
-    Attributes
-    ----------
-    eor
-        P^S with the sample variance as its error: the grey band.
-    uncorrupted
-        P^{S+F+N}, perfect gains.
-    uncalibrated
-        P^V, corrupted by gain errors.
-    residual
-        P^R, the calibrated residual.
-    residual_without_eor
-        P^R of a simulation of foregrounds and noise only.
-    noise
-        P^N, thermal noise only.
+    `eor` is P^S with the sample variance as its error (the grey band), `uncorrupted` P^{S+F+N} with perfect gains,
+    `uncalibrated` P^V with gain errors, `residual` P^R, `residual_without_eor` P^R of a simulation of foregrounds and
+    noise only, and `noise` P^N.
     """
 
     title: str

@@ -34,18 +34,8 @@ EMPTY = "0.8"
 class WedgePanels:
     """The five cylindrical spectra, of the same delays.
 
-    Attributes
-    ----------
-    uncorrupted
-        P^{S+N+F}, EoR, noise and foregrounds with perfect gains.
-    uncalibrated
-        P^V, the same corrupted by gain errors.
-    residual
-        P^R, the calibrated residual.
-    eor
-        P^S, EoR alone.
-    noise
-        P^N, thermal noise alone.
+    `uncorrupted` is P^{S+N+F} with perfect gains, `uncalibrated` P^V with gain errors, `residual` the calibrated P^R,
+    `eor` P^S alone, and `noise` P^N alone.
     """
 
     uncorrupted: CylindricalSpectrum

@@ -31,16 +31,9 @@ SECONDS_PER_DAY = 86400.0
 class Facts:
     """Properties of measured data from their metadata.
 
-    Attributes
-    ----------
-    frame
-        Antennas, baselines, autocorrelations among them, and channels, ascending.
-    times, sidereal_times
-        Julian dates and rad of the integrations, (Ntimes,).
-    integration
-        Duration of the shortest, s.
-    autos
-        True if there are autocorrelations of all antennas.
+    `frame` has antennas, baselines (autocorrelations among them) and channels, ascending. `times` (Julian dates) and
+    `sidereal_times` (rad) are (Ntimes,); `integration` is the duration of the shortest one, s. `autos` is true if there
+    are autocorrelations of all antennas.
     """
 
     unit: str
@@ -225,7 +218,7 @@ def _require_even(frequencies: np.ndarray) -> None:
 
 
 def require_same_sky(even: Facts, odd: Facts) -> None:
-    """Raise InputError unless two data sets can be crossed: the same array, channels and sidereal times."""
+    """Raise InputError unless two data sets can be crossed: the same channels and sidereal times."""
     if even.frequencies.shape != odd.frequencies.shape or not np.allclose(
         even.frequencies, odd.frequencies, rtol=0, atol=0.01 * even.channels.width
     ):

@@ -74,7 +74,7 @@ def _cells(amplitudes: np.ndarray, known: np.ndarray, settings: Interference) ->
             continue
         values = _filled(amplitudes[:, baseline][part].astype(float), seen[part])
         with warnings.catch_warnings(), np.errstate(all="ignore"):
-            # It warns of fewer integrations than its box holds.
+            # hera_qm warns of fewer integrations than its box holds.
             warnings.simplefilter("ignore")
             stand_out = xrfi_waterfall(values, nsig_init=settings.significance, nsig_adj=settings.adjacent_significance)
         hits[:, baseline][part] = stand_out & seen[part]

@@ -9,9 +9,9 @@ follows from the power P_N of
 
 the real part of one product has the variance P_N^2 / 2.
 
-The autocorrelations give the same by the radiometer equation, sigma^2 = V_aa V_bb / (channel width x time), over |g_a
-g_b|^2 for calibrated data. The mean of the delay power of visibilities of known moduli does not depend on their phases
-(Parseval), so that it is that of real visibilities sigma(nu).
+The autocorrelations give the same by the radiometer equation, sigma^2 = V_aa V_bb / (channel width x time), over
+|g_a g_b|^2 for calibrated data. The mean of the delay power of visibilities of known moduli does not depend on their
+phases (Parseval), so that it is that of real visibilities sigma(nu).
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ def sample_noise(data: UVData) -> float | None:
 def half_difference(even: UVData, odd: UVData) -> UVData:
     """Return the difference of two averages, with the power P_N of the noise of their product.
 
-    Both have one integration of the same baselines, phased to the same point. Samples flagged in either are flagged.
+    Both have one integration of the same baselines, phased to the same point, and are not changed. Samples flagged in
+    either are flagged.
     """
     found = even.copy()
     n_even, n_odd = (_weights(uvd) for uvd in (even, odd))

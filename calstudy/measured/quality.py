@@ -29,10 +29,8 @@ class Quality:
 
     Attributes
     ----------
-    antennas
-        Names of the antennas with solutions, (Nants,).
-    frequency
-        Hz, (Nfreqs,).
+    antennas, frequency
+        Names of the antennas with solutions, (Nants,), and channels in Hz, (Nfreqs,).
     gain_by_channel
         |g| over the antenna's median, median over integrations, (Nants, Nfreqs).
     gain_by_antenna

@@ -22,10 +22,10 @@ def read_calibrator(
 ) -> Calibrator:
     """Return the calibrator of a YAML file, or the default one, with changes; a value of None changes nothing.
 
-    The file is a `calibration` section, or has one. `changes`, by dotted path, apply first. `defaults` likewise, but
-    only where the calibrator has such a field and the user has not set it. `overrides`, ``path=value`` texts, apply
-    last; relative paths in them start at the working directory. Raise InputError if the file cannot be read, there is
-    no such calibrator, or a field has an invalid value.
+    The file is a `calibration` section, or has one. `changes`, by dotted path, apply first, then `defaults`, which
+    apply only where the calibrator has such a field, and last `overrides`, ``path=value`` texts. Relative paths in the
+    latter start at the working directory. Raise InputError if the file cannot be read, there is no such calibrator, or
+    a field has an invalid value.
     """
     # Overrides may use the path of the field in an experiment file.
     typed = [(field.removeprefix("calibration."), value) for field, value in map(parse_override, overrides)]
@@ -52,7 +52,6 @@ def read_calibrator(
 
 
 def _changed(path: Path | None, changes: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the content of a file with changes."""
     content = _content(path)
     for field, value in changes:
         content = override(content, field, value)

@@ -182,7 +182,7 @@ def _number(groups: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, tuple[np
 
 
 def _combinations(group: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the groups and labels, none negative, of all combinations, and the combination's number of each entry."""
+    """Return group and label, none negative, of each combination, and the number of the combination of each entry."""
     count = int(label.max(initial=0)) + 1
     found, index = np.unique(group * count + label, return_inverse=True)
     return found // count, found % count, index
@@ -196,8 +196,8 @@ def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
 def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
     """Return the clusters of the modes in bins of |k|, outside or inside the wedge; each unit is a sample.
 
-    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with |tau| <=
-    |b|/c + `buffer` (s) are inside the wedge.
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with
+    |tau| <= |b|/c + `buffer` (s) are inside the wedge.
     """
     bins = np.searchsorted(edges, np.hypot(spectra.k_perp[:, None], spectra.k_parallel), side="left") - 1
     bins[(bins >= edges.size - 1) | (outside_wedge(spectra, buffer) == inside)] = -1

@@ -86,8 +86,8 @@ def mode_correlation(taper: str, n_channels: int) -> np.ndarray:
     """Return the correlation of the powers of two delays of one baseline, for white Gaussian data.
 
     A taper T mixes neighbouring delays: V~(tau) and V~(tau + m/B) have the correlation sum T^2 exp(2 pi i m n / N) over
-    sum T^2, and the powers, quadratic in Gaussian variables, the square of its modulus. The coefficients, (n_channels
-    // 2 + 1,), are for separations of 0, 1, ... n_channels // 2 delay bins; they are periodic in n_channels.
+    sum T^2, and the powers, quadratic in Gaussian variables, the square of its modulus. The coefficients are for
+    separations of 0, 1, ... n_channels // 2 delay bins, shape (n_channels // 2 + 1,); they are periodic in n_channels.
     """
     amplitude = np.abs(np.fft.rfft(make_taper(taper, n_channels) ** 2))
     return (amplitude / amplitude[0]) ** 2

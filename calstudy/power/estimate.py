@@ -90,9 +90,9 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
 def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_convention: str | None) -> np.ndarray:
     """Return the beam-weighted mean brightness temperature of a visibility of 1 Jy, in K/Jy, shape (Nfreqs,).
 
-    A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2, and half of that in the convention V_xx
-    = 1/2 int A I (`pol_convention` None or "sum", as in `pyuvdata.UVData`; "avg" otherwise). Frequencies in Hz and the
-    solid angle of the power beam in sr are (Nfreqs,).
+    A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2 for the `pol_convention` "avg" of
+    pyuvdata, and half of that, V_xx = 1/2 int A I, for "sum" or None. `frequencies` are in Hz, `omega_p` is the solid
+    angle of the power beam in sr, (Nfreqs,) each. Raise ValueError for another convention.
     """
     halves = {None: 2.0, "sum": 2.0, "avg": 1.0}
     if pol_convention not in halves:
@@ -116,10 +116,10 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     identity weighting. The beam is divided out channel by channel (Omega_p to temperature, Omega_pp / Omega_p^2 in the
     normalization), so its frequency dependence is accounted for; X and Y are taken over the band likewise.
 
-    `even` and `odd` have one integration each, in Jy. The result has one spectrum per baseline pair and polarization,
-    complex, in mK^2 h^-3 Mpc^3, unfolded, without window functions; it can be written to HDF5 and read back. It has
-    hera_pspec's conventions: conj(even) times odd, with the kernel exp(-2 pi i tau nu), so that its delay axis is the
-    paper's, reversed.
+    `even` and `odd` have one integration each, in Jy, and are not changed. The result has one spectrum per baseline
+    pair and polarization, complex, in mK^2 h^-3 Mpc^3, unfolded, without window functions; it can be written to HDF5
+    and read back. It has hera_pspec's conventions: conj(even) times odd, with the kernel exp(-2 pi i tau nu), so that
+    its delay axis is the paper's, reversed.
 
     Baselines that are completely flagged are left out. Raise ValueError if the data sets differ in anything but data,
     have more than one integration, are not in Jy, or leave no unflagged pair.

@@ -47,8 +47,8 @@ def bin_expected(
 ) -> ExpectedBins:
     """Average the expected transfer function, (Nbls, Ndelays), and its error over bins; NaN without data.
 
-    `edges` of |k| are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with
-    |tau| <= |b|/c + `buffer` (s) are inside the wedge. `length_bin` is the width of the bins of baseline length, m.
+    `edges` and `buffer` are as in `calstudy.power.clusters.clusters_in_k`. `length_bin` is the width of the bins of
+    baseline length, m.
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(transfer)
@@ -80,8 +80,8 @@ def bin_response(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return T = P^D / P^S and C = Re <S* D> / P^S outside the wedge, (Nk,) each; NaN in bins without signal.
 
-    `signal` holds the amplitudes of the signal S, and `response` those of the part D that is left of it, (Nbls,
-    Ndelays), complex; `edges` and `buffer` are as in `bin_expected`.
+    `signal` holds the amplitudes of the signal S, and `response` those of the part D that is left of it,
+    (Nbls, Ndelays), complex; `edges` and `buffer` are as in `bin_expected`.
     """
     limits = np.asarray(edges, float)
     bins, used = _bins_outside(modes, limits, buffer)

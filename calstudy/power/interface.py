@@ -41,8 +41,8 @@ class Estimator(Plugin, ABC):
         Parameters
         ----------
         even, odd
-            One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy with V_xx
-            = 1/2 int A I. They share the sky but not the noise, and must not be changed. `odd` is `even` where the
+            One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy with
+            V_xx = 1/2 int A I. They share the sky but not the noise, and must not be changed. `odd` is `even` where the
             power of one data set is computed.
         beam
             Of the array.

@@ -99,12 +99,8 @@ TRANSFER_QUANTITIES = {
 class Design:
     """The draws of each realization.
 
-    Attributes
-    ----------
-    draws
-        Number of the draw of each part, for each of K realizations.
-    blocks
-        Parts that each block draws, and the realizations that belong to it; the first belongs to all.
+    `draws` holds the number of the draw of each part, for each of K realizations; `blocks` the parts that each block
+    draws, and the realizations that belong to it, of which the first belongs to all.
     """
 
     draws: Sequence[Mapping[str, int]]
@@ -186,9 +182,8 @@ def coverage(inside: np.ndarray, independent: bool) -> Finding:
     """Return the part of 95 % bars that cover, and its uncertainty, from `inside_bars`, (K, Nk).
 
     The uncertainty is the larger of the one from the scatter over realizations, which includes correlated bins, and the
-    binomial one for 95 % of independent bins. If the quantity that the bars should cover is not drawn in every
-    realization (`independent`), the realizations repeat the same trials, and the number of bins of one realization
-    decides.
+    binomial one for 95 % of independent bins. `independent` is true if the quantity that the bars should cover is drawn
+    in every realization; otherwise the realizations repeat the same trials, and only the bins of one realization count.
     """
     known = np.isfinite(inside)
     if not known.any():

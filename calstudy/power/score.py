@@ -83,10 +83,9 @@ class Score:
 
 
 def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
-    """Return the scores in bins of |k| outside the wedge.
+    """Return the scores in bins of |k| outside the wedge; `edges` and `buffer` are as in `clusters_in_k`.
 
-    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with |tau| <=
-    |b|/c + `buffer` (s) are left out. `flux_scale` is s of the calibration; NaN if not known.
+    `flux_scale` is s of the calibration; NaN if not known.
     """
     limits, signal = np.asarray(edges, dtype=float), spectra.signal
     clusters = clusters_in_k(signal, limits, buffer, inside=False)

@@ -113,7 +113,7 @@ class DelaySpectra:
 
 @dataclass(frozen=True)
 class BaselineModes:
-    """The modes of baselines of a length (m) and k_perp (h/Mpc), (Nbls,).
+    """The modes of baselines, with `length` (m) and `k_perp` (h/Mpc), (Nbls,).
 
     `delay` (s) and `k_parallel` (h/Mpc) are ascending, (Ndelays,).
     """

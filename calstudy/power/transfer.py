@@ -164,7 +164,7 @@ class Injection:
 def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
     """Return D, the difference of two residuals of the same noise, with and without the signal in the data.
 
-    Samples that are flagged in either are flagged. Raise ValueError if the shapes of the data differ.
+    Samples that are flagged in either are flagged; the inputs are not changed. Raise ValueError if the shapes differ.
     """
     if with_signal.data_array.shape != without_signal.data_array.shape:
         raise ValueError(
@@ -211,10 +211,9 @@ def flux_scale(even: np.ndarray, odd: np.ndarray, weights: np.ndarray) -> float:
 def spherical_transfer(
     injection: Injection, edges: ArrayLike, buffer: float, inside: bool, flux_scale: float = np.nan
 ) -> TransferFunction:
-    """Return T in bins of |k|, outside or inside the wedge.
+    """Return T in bins of |k|, outside or inside the wedge; `edges` and `buffer` are as in `clusters_in_k`.
 
-    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with |tau| <=
-    |b|/c + `buffer` (s) are inside the wedge. `flux_scale` is s of the calibration; NaN if not known.
+    `flux_scale` is s of the calibration; NaN if not known.
     """
     limits = np.asarray(edges, dtype=float)
     signal = injection.signal

@@ -21,18 +21,10 @@ CLAIM_SIGMAS = 3.0
 class ArrayComparison:
     """One array of a figure against its reference.
 
-    Attributes
-    ----------
-    status
-        "same" to rounding, "moved" within the tolerance, or "beyond" it.
-    relative
-        Largest difference over the largest magnitude of the reference; None if there is none.
-    largest, rms, shift
-        In σ, see `calstudy.verdicts.tolerances.Drawn`; None for arrays that are not drawn.
-    tolerance, why
-        The tolerance, and its reason.
-    problem
-        A fault other than numbers: another shape, an array that is missing or new; or empty.
+    `status` is "same" to rounding, "moved" within the tolerance, or "beyond" it. `relative` is the largest difference
+    over the largest magnitude of the reference, None if there is none; `largest`, `rms` and `shift` are in σ, None for
+    arrays that are not drawn (`calstudy.verdicts.tolerances.Drawn`). `why` is the reason of the tolerance. `problem`
+    names a fault other than numbers (another shape, an array that is missing or new), or is empty.
     """
 
     figure: str
