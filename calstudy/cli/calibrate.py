@@ -102,10 +102,8 @@ def calibrate(
         "calibrator": _calibrator(redundant, gains_only),
         "weights": _weights(weights),
     }
-    usual = defaults(sky_model is not None)
-    if solver is not None or settings_file is not None:
-        del usual["solver"]
-    assumed = {"initial_gains": None if gains is None else {"kind": "file", "path": str(gains)}, **usual}
+    start = None if gains is None else {"kind": "file", "path": str(gains)}
+    assumed = {"initial_gains": start, **defaults(sky_model is not None)}
     calibrator = read_calibrator(settings_file, changes, assumed, overrides or [])
     budget = None if max_memory is None else parse_memory(max_memory)
     extras = [name for name, wanted in ((CALFITS, calfits), (EXPECTED, expected_loss)) if wanted]

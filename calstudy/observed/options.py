@@ -22,21 +22,20 @@ def read_calibrator(
 ) -> Calibrator:
     """Return the calibrator of a YAML file, or the default one, with changes; a value of None changes nothing.
 
-    The file is a `calibration` section, or has one. `changes`, by dotted path, apply first, then `defaults`, which
-    apply only where the calibrator has such a field, and last `overrides`, ``path=value`` texts. Relative paths in the
-    latter start at the working directory. Raise InputError if the file cannot be read, there is no such calibrator, or
-    a field has an invalid value.
+    The file is a `calibration` section, or has one. `changes`, by dotted path, apply first, then `defaults` of fields
+    that neither the file nor a change sets, and last `overrides`, ``path=value`` texts. Relative paths in the latter
+    start at the working directory. Raise InputError if the file cannot be read, there is no such calibrator, or a field
+    has an invalid value.
     """
     # Overrides may use the path of the field in an experiment file.
     typed = [(field.removeprefix("calibration."), value) for field, value in map(parse_override, overrides)]
-    asked = [(field, value) for field, value in changes.items() if value is not None]
-    wanted = _changed(path, [*asked, *typed])
+    asked = _changed(_content(path), [(field, value) for field, value in changes.items() if value is not None])
     try:
-        found, _ = CALIBRATORS.class_of(wanted, DEFAULT, None)
+        found, _ = CALIBRATORS.class_of(_changed(asked, typed), DEFAULT, None)
     except InputError as error:
         raise InputError(f"calibration.calibrator: {error}") from None
-    assumed = [(key, value) for key, value in defaults.items() if value is not None and key in found.model_fields]
-    content = _changed(path, [*asked, *assumed, *typed])
+    usual = {key: value for key, value in defaults.items() if value is not None and key in found.model_fields}
+    content = _changed({**usual, **asked}, typed)
     try:
         calibrator = CALIBRATORS.make(content, DEFAULT)
     except ValidationError as error:
@@ -51,8 +50,7 @@ def read_calibrator(
     return calibrator
 
 
-def _changed(path: Path | None, changes: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    content = _content(path)
+def _changed(content: dict[str, Any], changes: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     for field, value in changes:
         content = override(content, field, value)
     return content

@@ -15,6 +15,8 @@ from test_calamity import make_uvdata
 
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
+from calstudy.measured.defaults import defaults
+from calstudy.observed.options import read_calibrator
 from calstudy.observed.output import FIGURE_FILES
 from calstudy.power.tables import load_spectrum
 
@@ -205,3 +207,14 @@ def test_a_disk_that_is_full_is_told_in_a_sentence(command, data, monkeypatch):
     code, error = command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
     assert code == 2
     assert "--output out: cannot be written (No space left on device); make room or choose another folder" in error
+
+
+@pytest.mark.parametrize("text", ["prior: none\n", "calibration: {prior: none, solver: {max_steps: 7}}\n", "{}\n"])
+def test_a_settings_file_is_stronger_than_the_defaults_for_measured_data(tmp_path, text):
+    path = tmp_path / "settings.yaml"
+    path.write_text(text)
+    usual = defaults(has_sky_model=False)
+    found = read_calibrator(path, {"solver": None}, usual, ["solver.tolerance=1e-4"])
+    assert found.prior == ("none" if "prior" in text else "gains")
+    assert found.solver.max_steps == (7 if "solver" in text else usual["solver"]["max_steps"])
+    assert found.solver.tolerance == 1e-4
