@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.visibilities import antenna_pairs
 
 CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
@@ -31,8 +32,8 @@ def read_gains(path: Path, where: str) -> UVCal:
     Raises
     ------
     InputError
-        If it does not exist, is none of them, or a CASA table without the package that reads it; `where` says who
-        asked for it.
+        If it does not exist, is none of them, takes data from other files, or is a CASA table without the package that
+        reads it; `where` says who asked for it.
     """
     from pyuvdata import UVCal
 
@@ -40,6 +41,7 @@ def read_gains(path: Path, where: str) -> UVCal:
         raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
     if not path.exists():
         raise InputError(f"{where} = {str(path)!r}: no such file or folder")
+    require_self_contained(path)
     try:
         return UVCal.from_file(str(path))
     # The readers raise whatever their libraries do; a file that cannot be read is the user's to mend.

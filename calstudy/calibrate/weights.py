@@ -14,6 +14,7 @@ import numpy as np
 from pyuvdata import UVFlag
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.observation import Observation
 from calstudy.calibrate.settings import NOISE_UNKNOWN, FileWeights, ForegroundFit, Weights
 
@@ -141,6 +142,7 @@ def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
 
 
 def _read_uvflag(path: Path, where: str) -> UVFlag:
+    require_self_contained(path)
     try:
         file = UVFlag(str(path))
     except (OSError, ValueError, KeyError) as error:

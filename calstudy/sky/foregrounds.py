@@ -15,6 +15,7 @@ from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.plugins import load_function, user_code
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
@@ -273,6 +274,7 @@ def _read(settings: section.FileSources) -> SkyModel:
     path = settings.path
     if not path.is_file():
         raise InputError(f"sky.foregrounds.path: there is no file {path}")
+    require_self_contained(path)
     try:
         if path.suffix == ".sav":
             _require_idl(path)
