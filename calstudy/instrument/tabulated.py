@@ -15,9 +15,9 @@ from scipy.interpolate import interp1d
 
 from calstudy.base.errors import InputError
 from calstudy.base.kept_arrays import kept_arrays
+from calstudy.base.mwa_files import BEAM
 from calstudy.base.plugins import digest_file
 from calstudy.instrument import beam_frequencies
-from calstudy.instrument.beam_file import find_beam
 from calstudy.instrument.beam_frequencies import FIT_BAND, choose_frequencies, fit_range, megahertz
 
 PIXELS_PER_DEGREE = 1
@@ -39,7 +39,7 @@ def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpola
     Parameters
     ----------
     path
-        Beam file (HDF5), by default the one that `calstudy.instrument.beam_file.find_beam` finds.
+        Beam file (HDF5), by default the one that `calstudy.base.mwa_files.BEAM` finds.
     band
         Lowest and highest frequency of interest in Hz; the margin that a fit needs is read, too.
     interpolation
@@ -50,7 +50,7 @@ def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpola
     InputError
         If the file is missing or is not an MWA beam file of this band.
     """
-    path = find_beam() if path is None else path
+    path = BEAM.find() if path is None else path
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
     return _mwa_embedded_element(path, digest_file(path), band, interpolation)
