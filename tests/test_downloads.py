@@ -63,7 +63,7 @@ def test_a_fetched_beam_is_the_file_and_is_fetched_once(served, tmp_path):
 
 def test_another_file_is_not_kept(served, tmp_path):
     served.write_bytes(b"something else")
-    with pytest.raises(InputError, match=r"its SHA-256 is another; set instrument\.beam\.path to your own copy"):
+    with pytest.raises(InputError, match=r"its SHA-256 is another; install mwa_pb 1\.1, or set instrument\.beam\.path"):
         MWA_FILES["beam"].fetch(tmp_path / "kept", progress=False)
     assert list((tmp_path / "kept").iterdir()) == []
 

@@ -174,7 +174,7 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
         Row(
             world=case.world,
             calibrator=case.calibrator,
-            digest=Contents.of(case.experiment).digest,
+            digest=Contents.of(case.experiment, study.file.salt).digest,
             scoring=scoring_of(case.experiment),
             scores=read_json(made.products[task.key].path / SUMMARY),
         )
