@@ -31,7 +31,7 @@ def run_command(capsys, *arguments: object) -> tuple[int, str]:
     before = sys.argv
     sys.argv = ["calstudy", *map(str, arguments)]
     try:
-        cli.main()
+        cli.main(leave=sys.exit)
         status = 0
     except SystemExit as end:
         status = int(end.code or 0)

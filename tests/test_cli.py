@@ -120,7 +120,7 @@ def test_all_faults_of_a_file_are_told_on_standard_error(tmp_path):
             ["plan", "tiny.yaml", "--set", "calibration.basis.buffer=10 us"],
             "calibration.basis: a delay half-width",
         ),
-        (["data", "fetch", "gleem"], "nothing that can be fetched (allowed: gleam, beam)"),
+        (["data", "fetch", "gleem"], "nothing that can be fetched (allowed: gleam, beam, g4jy, haslam)"),
     ],
 )
 def test_a_mistake_is_one_clear_sentence(tmp_path, monkeypatch, capsys, arguments, told):

@@ -6,14 +6,13 @@ import csv
 import hashlib
 import re
 from importlib.metadata import distribution, version
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calstudy.base.mwa_files import G4JY, MWA_FILES
 from calstudy.instrument.array_layouts.mwa import MwaLayout
-from calstudy.instrument.beam_file import FILE, SHA256
 from calstudy.instrument.layouts import make_layout
 from calstudy.sky import counts
 from calstudy.sky.catalogue import read_gleam_table
@@ -62,7 +61,7 @@ def test_tiles_are_the_antennas_of_the_layouts():
 
 
 def test_the_excerpt_holds_the_brightest_sources_of_the_catalogue():
-    catalogue = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))
+    catalogue = read_gleam_table(G4JY.find())
     brightest = catalogue.select(np.argsort(-catalogue.flux, kind="stable")[:20])
     rows = rows_of("catalogue_excerpt.csv")
     assert [row["name"] for row in rows] == brightest.names.tolist()
@@ -92,8 +91,9 @@ def test_versions_are_the_pinned_ones():
         assert pins[row["distribution"].replace("_", "-")] == row["version"]
 
 
-def test_the_hash_of_the_beam_is_the_one_in_the_code():
-    assert [row["sha256"] for row in FILES if Path(row["path"]).name == FILE] == [SHA256]
+def test_the_hashes_of_the_files_of_mwa_pb_are_those_in_the_code():
+    listed = {Path(row["path"]).name: row["sha256"] for row in FILES if row["distribution"] == "mwa_pb"}
+    assert listed == {file.name: file.sha256 for file in MWA_FILES.values()}
 
 
 def test_every_ingredient_has_a_source_and_a_licence():

@@ -37,6 +37,22 @@ class ExperimentError(InputError):
         return type(self), (self.faults,)
 
 
+class DiskError(InputError):
+    """A file could not be written; files of HDF5 that were open cannot be closed any more, and crash at exit."""
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end by SIGTERM, as batch systems do."""
+
+
+def exit_status(error: BaseException | None) -> int:
+    """Return the exit status of a command that ends with an error, or without one."""
+    kinds = {Terminated: 143, KeyboardInterrupt: 130, InputError: 2, BaseException: 1}
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
+    return 0 if error is None else next(status for kind, status in kinds.items() if isinstance(error, kind))
+
+
 def refusal_of_disk(error: OSError | RuntimeError) -> str | None:
     """Return the reason why a file could not be read or written, or None if the file system did not refuse it.
 

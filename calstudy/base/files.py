@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
+from uuid import uuid4
 
 
 def sha256(path: Path) -> str:
@@ -20,14 +20,12 @@ def sha256(path: Path) -> str:
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Open a stream whose content replaces `path` when the block ends without error."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    partial_file = Path(name)
+    partial_file = path.with_name(f".{path.name}-{uuid4().hex}")
     try:
-        with os.fdopen(handle, "wb") as stream:
+        with partial_file.open("xb") as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        partial_file.chmod(0o644)
         partial_file.replace(path)
     finally:
         partial_file.unlink(missing_ok=True)

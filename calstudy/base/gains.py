@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.visibilities import antenna_pairs
 
 CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 def read_gains(path: Path, where: str) -> UVCal:
     """Read a CalH5 or calfits file, or a CASA table (a folder); `where` names the source of the path in errors.
 
-    Raises InputError if it does not exist, has none of these formats, or is a CASA table and the package that reads it
-    is missing.
+    Raises InputError if it does not exist, has none of these formats, takes data from other files, or is a CASA table
+    and the package that reads it is missing.
     """
     from pyuvdata import UVCal
 
@@ -37,6 +38,7 @@ def read_gains(path: Path, where: str) -> UVCal:
         raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
     if not path.exists():
         raise InputError(f"{where} = {str(path)!r}: no such file or folder")
+    require_self_contained(path)
     try:
         return UVCal.from_file(str(path))
     # The readers raise the errors of their libraries; the user must correct a file that cannot be read.

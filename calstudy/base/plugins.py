@@ -18,6 +18,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -318,12 +319,27 @@ def _digest_of(path: str, modified: int, size: int) -> str:
     return sha256(Path(path))
 
 
+_REFUSED: ContextVar[str] = ContextVar("refused", default="")
+
+
+@contextmanager
+def without_code_of_files(instead: str) -> Iterator[None]:
+    """Refuse to run Python files in the block, with an InputError that says what can be done instead."""
+    token = _REFUSED.set(instead)
+    try:
+        yield
+    finally:
+        _REFUSED.reset(token)
+
+
 def load_file(path: Path) -> ModuleType:
     """Run a Python file as a module, once for each version of its content, and return the module.
 
-    Raises InputError if the file cannot be read or is not valid Python, or if running it raises an error; the message
-    names the line.
+    Raises InputError if the file cannot be read or is not valid Python, if running it raises an error (the message
+    names the line), or if code of files is refused.
     """
+    if instead := _REFUSED.get():
+        raise InputError(f"{str(path)!r} is code, which is not run here; {instead}")
     try:
         text = path.read_text(encoding="utf-8")
         ast.parse(text)

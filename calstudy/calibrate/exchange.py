@@ -7,12 +7,14 @@ order say nothing. Worlds that differ in what is assumed alone have the same dat
 
 from __future__ import annotations
 
+import hmac
 from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import Field, ValidationError
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import FileName, require_inside
 from calstudy.base.schema import Section
 
 MANIFEST = "manifest.json"
@@ -24,8 +26,8 @@ MODEL_SUFFIXES = (".model.uvh5", ".model.uvfits", ".model.ms")
 class DataSet(Section):
     """One set of data, and by what it is told."""
 
-    name: str
-    file: str
+    name: FileName
+    file: FileName
     digest: str = Field(description="Of all that the data were made from.")
 
 
@@ -51,9 +53,14 @@ class Manifest(Section):
     calstudy: str
     digest: str
     data: tuple[DataSet, ...]
-    sky_model: str | None = None
+    sky_model: FileName | None = None
     sky_model_digest: str | None = None
     noise: float | None = None
+
+
+def salted(digest: str, salt: str) -> str:
+    """Return a digest as a manifest has it: of a blind challenge, one from which nobody finds what was digested."""
+    return hmac.new(salt.encode(), digest.encode(), "sha256").hexdigest()[:32] if salt else digest
 
 
 @dataclass(frozen=True)
@@ -91,17 +98,19 @@ def find_returned(folder: Path, digest: str, sky_model: str | None) -> Returned:
     Raises
     ------
     InputError
-        If there is no manifest, none that has these data and this sky model, no gains for them, or several files.
+        If there is no manifest, none that has these data and this sky model, no gains for them, or several files; or if
+        one of them is a link that leads out of the folder.
     """
     manifests = [folder / MANIFEST] if (folder / MANIFEST).exists() else sorted(folder.glob(f"*/{MANIFEST}"))
     if not manifests:
         raise InputError(f"{folder}: has no {MANIFEST}, nor has a folder in it; copy it from the export")
     others = []
     for path in manifests:
+        require_inside(path, folder)
         manifest = read_manifest(path)
         for data in manifest.data:
             if data.digest == digest and manifest.sky_model_digest == sky_model:
-                return _returned_for(path.parent, data.name)
+                return _returned_for(folder, path.parent, data.name)
             if data.digest == digest:
                 others.append(path)
     if others:
@@ -115,12 +124,16 @@ def find_returned(folder: Path, digest: str, sky_model: str | None) -> Returned:
     )
 
 
-def _returned_for(folder: Path, name: str) -> Returned:
+def _returned_for(root: Path, folder: Path, name: str) -> Returned:
     gains = _only([folder / f"{name}{suffix}" for suffix in GAINS_SUFFIXES])
     if gains is None:
         allowed = ", ".join(f"{name}{suffix}" for suffix in GAINS_SUFFIXES)
         raise InputError(f"{folder}: there are no gains for {name} (allowed: {allowed})")
-    return Returned(gains, _only([folder / f"{name}{suffix}" for suffix in MODEL_SUFFIXES]))
+    model = _only([folder / f"{name}{suffix}" for suffix in MODEL_SUFFIXES])
+    for path in (gains, model):
+        if path is not None:
+            require_inside(path, root)
+    return Returned(gains, model)
 
 
 def _only(paths: list[Path]) -> Path | None:

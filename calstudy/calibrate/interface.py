@@ -236,7 +236,11 @@ class Calibrator(Plugin):
         1, ge=1, description="Consecutive integrations that are solved together and share their gains."
     )
     chunks: int = Field(
-        4, ge=1, description="Pieces of consecutive integrations; the unit of resuming and of work sharing."
+        4,
+        ge=1,
+        description="Pieces of consecutive integrations; the unit of resuming and of work sharing. In a piece a solve "
+        "starts from the one before (`solver.warm_start`), and the first starts anew: where solves converge, results "
+        "change by less than the solver's tolerance leaves; where they stall, as much as from another start.",
     )
     assumed: dict[str, Any] = Field(
         default_factory=dict,

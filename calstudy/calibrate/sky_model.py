@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.visibilities import from_cube, to_cube
 
 if TYPE_CHECKING:
@@ -33,11 +34,12 @@ def read_sky_model(path: Path, template: UVData) -> UVData:
     Raises
     ------
     InputError
-        If the file cannot be read, lacks baselines, integrations, channels or polarizations of the observation, or has
-        flagged samples or values that are not finite among them.
+        If the file cannot be read or takes data from other files, lacks baselines, integrations, channels or
+        polarizations of the observation, or has flagged samples or values that are not finite among them.
     """
     from pyuvdata import UVData
 
+    require_self_contained(path)
     try:
         sky = UVData.from_file(str(path))
     # Readers of eight formats raise whatever their libraries do; a file that cannot be read is the user's to mend.

@@ -14,7 +14,9 @@ import numpy as np
 from pyuvdata import UVFlag
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.observation import Observation
+from calstudy.calibrate.amplitudes import dead_samples
 from calstudy.calibrate.settings import NOISE_UNKNOWN, FileWeights, ForegroundFit, Weights
 
 # Times of weights and data agree within this, in days.
@@ -22,7 +24,7 @@ TIME_TOLERANCE = 1e-6
 
 
 def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np.ndarray:
-    """Return the weight of every sample, zero where flagged.
+    """Return the weight of every sample, zero where flagged or where an antenna was off (`dead_samples`).
 
     In each integration and polarization their mean over unflagged samples is that of the paper, 1 / (Nbls Nfreqs).
 
@@ -42,12 +44,18 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     Raises
     ------
     InputError
-        If autocorrelations are asked for and missing, or a file does not fit the data or holds weights that are
-        complex, negative or not finite.
+        If sample counts are negative or not finite, autocorrelations are asked for and missing, or a file does not fit
+        the data or holds weights that are complex, negative or not finite.
     """
-    used = ~data.flags[:, fitted]
+    used = ~data.flags[:, fitted] & ~dead_samples(data, fitted)
     if settings.kind == "nsamples":
-        weights = data.nsamples[:, fitted] * used
+        counts = np.where(used, data.nsamples[:, fitted], 0)
+        if (bad := ~np.isfinite(counts) | (counts < 0)).any():
+            raise InputError(
+                f"weights: 'nsamples' needs counts that are finite and not negative, and {bad.sum()} unflagged samples "
+                "have others; flag them, or use weights: gains"
+            )
+        weights = counts * used
     elif settings.kind == "autos":
         weights = _from_autos(data, fitted) * used
     elif settings.kind == "file":
@@ -141,6 +149,7 @@ def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
 
 
 def _read_uvflag(path: Path, where: str) -> UVFlag:
+    require_self_contained(path)
     try:
         file = UVFlag(str(path))
     except (OSError, ValueError, KeyError) as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from calstudy.base.errors import InputError
+from calstudy.base.plugins import without_code_of_files
 from calstudy.claims.evaluation import (
+    Evaluation,
     evaluate_by_solver,
     evaluate_members,
     evaluate_run,
@@ -29,6 +32,7 @@ from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import write_claims, write_claims_by_solver
 
 MANIFEST, EXPERIMENT = "manifest.json", "experiment.yaml"
+INSTEAD = "name a paper by --paper, or use --run-code if you trust who wrote the folder"
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class EvaluatedRun:
     without_role: tuple[str, ...] = ()
 
 
-def evaluate_folder(folder: Path, papers: Sequence[str] = ()) -> EvaluatedRun:
+def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> EvaluatedRun:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
     If members of a collection are the same but for the paper's own solver, also claims-by-solver.json and .md.
@@ -51,27 +55,20 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = ()) -> EvaluatedRun:
         Of a run (``experiment.yaml``, ``tables/``), or of a collection, whose members' folders are beside it.
     papers
         Names of papers, or files, in place of those that the run names.
+    run_code
+        Whether Python files that the folder's experiments name may be run; those of `papers` are.
 
     Raises
     ------
     InputError
-        If it is neither, names no paper, or cannot be written.
+        If it is neither, names no paper or code that may not be run, or cannot be written.
     """
     manifest = _manifest(folder)
     if "points" in manifest:
         raise InputError(f"{folder}: is the folder of a sweep; give that of one of its points, below {folder}/points")
     named = [_paper(name) for name in papers]
-    by_solver: Mapping[str, list[Verdict]] = {}
-    if manifest.get("kind") == "runtime":
-        study = read_mapping(folder / EXPERIMENT)
-        times = RunTimes.of(manifest["name"], _tables(folder))
-        found = evaluate_run_times(_named(named, study.get("papers", ()), folder), times)
-    elif "members" in manifest:
-        held_to, runs = _played(folder, manifest, named)
-        found, by_solver = evaluate_members(held_to, runs), evaluate_by_solver(held_to, runs)
-    else:
-        run = _results(folder)
-        found = evaluate_run(_named(named, run.experiment.papers, folder), run)
+    with nullcontext() if run_code else without_code_of_files(INSTEAD):
+        found, by_solver = _evaluated(folder, manifest, named)
     evaluated = EvaluatedRun(manifest["name"], found.verdicts, found.without_role)
     try:
         write_claims(found.verdicts, folder, evaluated.title, manifest["stand_ins"], found.without_role)
@@ -82,11 +79,26 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = ()) -> EvaluatedRun:
     return evaluated
 
 
+def _evaluated(
+    folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]
+) -> tuple[Evaluation, Mapping[str, list[Verdict]]]:
+    """Return the verdicts of a folder, and those by solver of a collection."""
+    if manifest.get("kind") == "runtime":
+        study = read_mapping(folder / EXPERIMENT)
+        times = RunTimes.of(manifest["name"], _tables(folder))
+        return evaluate_run_times(_named(named, study.get("papers", ()), folder), times), {}
+    if "members" in manifest:
+        held_to, runs = _played(folder, manifest, named)
+        return evaluate_members(held_to, runs), evaluate_by_solver(held_to, runs)
+    run = _results(folder, named)
+    return evaluate_run(_named(named, run.experiment.papers, folder), run), {}
+
+
 def _played(
     folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]
 ) -> tuple[list[Paper], dict[str, RunResults]]:
     """Return the papers of a collection, and its members by the role that they play."""
-    members = {name: _results(folder.resolve().parent / place) for name, place in manifest["members"].items()}
+    members = {name: _results(folder.resolve().parent / place, named) for name, place in manifest["members"].items()}
     own = {paper.reference: paper for run in members.values() for paper in run.experiment.papers}
     chosen = _named(named, list(own.values()), folder)
     experiments = {name: run.experiment for name, run in members.items()}
@@ -126,8 +138,11 @@ def _tables(folder: Path) -> Path:
     return folder / "tables"
 
 
-def _results(folder: Path) -> RunResults:
-    experiment = validate(read_mapping(folder / EXPERIMENT), folder)
+def _results(folder: Path, named: Sequence[Paper]) -> RunResults:
+    content = dict(read_mapping(folder / EXPERIMENT))
+    if named:
+        content.pop("papers", None)
+    experiment = validate(content, folder)
     if experiment.realizations:
         raise InputError(f"{folder}: pools realizations, and claims are about single runs; give the folder of one")
     return RunResults(experiment, (_tables(folder),))

@@ -225,6 +225,7 @@ def _plan(
     from calstudy.base.observation import Observation
     from calstudy.base.plugins import guarded
     from calstudy.base.resources import free_memory
+    from calstudy.calibrate.amplitudes import conspicuous
     from calstudy.calibrate.execution import require_calibratable
 
     frame = Observation(data)
@@ -234,7 +235,7 @@ def _plan(
         outline = calibrator.outline(frame)
         while outline.cost.memory + results > available and (leaner := calibrator.leaner()) is not None:
             calibrator, outline = leaner, leaner.outline(frame)
-    notes += outline.notes
+    notes += [*conspicuous(frame), *outline.notes]
     cross = frame.n_baselines - int(frame.autos.sum())
     needed = outline.cost.memory + results
     if needed > available:

@@ -25,6 +25,10 @@ MaxMemory = Annotated[
     typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier export.")]
+Blind = Annotated[
+    Path | None,
+    typer.Option(metavar="RECIPE.yaml", help="Draw secret seeds, write them with the file to a new one, export that."),
+]
 
 
 def export(
@@ -36,19 +40,26 @@ def export(
     workers: Workers = None,
     max_memory: MaxMemory = None,
     overwrite: Overwrite = False,
+    blind: Blind = None,
 ) -> None:
     """Write what a calibrator may know: data, nominal telescope, sky model; nothing of the truth.
 
     Four data sets, of both realizations of the noise, with the EoR and without, under names that do not tell, and a
-    README that says what to return. `calstudy score` takes the gains back.
+    README that says what to return. `calstudy score` takes the gains back. With --blind, the SHA-256 that is printed is
+    to be published at once, and the recipe at the end.
     """
     from calstudy.products.files import quiet_libraries
+    from calstudy.studies.blind import write_recipe
     from calstudy.studies.export import CARRIER
     from calstudy.studies.export import export as write
     from calstudy.studies.study import Budget
     from calstudy.studies.worlds import load_worlds
 
     console = Console(soft_wrap=True, highlight=False)
+    if blind is not None:
+        digest = write_recipe(load_worlds(file, scale, overrides or (), None), blind)
+        console.print(f"SHA-256 of {blind}, to be published: {digest}", markup=False)
+        file, scale, overrides = blind, None, None
     worlds = load_worlds(file, scale, overrides or (), CARRIER)
     with quiet_libraries():
         folders = write(worlds, output, file_format, overwrite, Budget(workers, max_memory), console)

@@ -9,16 +9,20 @@ import faulthandler
 import json
 import logging
 import os
+import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from types import FrameType
+from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base import ranks
-from calstudy.base.errors import ExperimentError, InputError, refusal_of_disk
+from calstudy.base.errors import DiskError, ExperimentError, InputError, Terminated, exit_status, refusal_of_disk
+from calstudy.base.mwa_files import MWA_FILES
 from calstudy.cli.calibrate import calibrate
 from calstudy.cli.check import check_app
 from calstudy.cli.compare_gains import compare_gains
@@ -162,6 +166,9 @@ def claims(
     paper: Annotated[
         list[str] | None, typer.Option(help="Name of a paper, or a file.py, in place of those that the run names.")
     ] = None,
+    run_code: Annotated[
+        bool, typer.Option("--run-code", help="Run Python files that the folder's experiment names.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare a finished run with published statements: the measured number, its threshold, PASS or FAIL.
@@ -172,7 +179,7 @@ def claims(
     from calstudy.claims.folders import evaluate_folder
     from calstudy.verdicts.tables import show_verdicts, to_json
 
-    console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or ())
+    console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or (), run_code)
     if as_json:
         typer.echo(to_json(evaluated.claims))
         return
@@ -218,21 +225,44 @@ def fields(
 
 @data_app.command()
 def fetch(
-    name: Annotated[str, typer.Argument(help="What to fetch: gleam or beam.")],
+    name: Annotated[str, typer.Argument(help="What to fetch: gleam, beam, g4jy or haslam.")],
     directory: Annotated[Path | None, typer.Option(help="Where to put it; by default the user's data folder.")] = None,
 ) -> None:
-    """Download the GLEAM catalogue or the MWA's beam, check it, and keep it for later runs."""
-    if name not in ("gleam", "beam"):
-        raise InputError(f"calstudy data fetch {name}: nothing that can be fetched (allowed: gleam, beam)")
-    from calstudy.instrument.beam_file import fetch_beam
+    """Download the GLEAM catalogue, or a file of the package mwa_pb, check it, and keep it for later runs."""
+    names = ["gleam", *MWA_FILES]
+    if name not in names:
+        raise InputError(f"calstudy data fetch {name}: nothing that can be fetched (allowed: {', '.join(names)})")
     from calstudy.sky.gleam import fetch_gleam
 
-    path = fetch_gleam(directory) if name == "gleam" else fetch_beam(directory)
+    path = fetch_gleam(directory) if name == "gleam" else MWA_FILES[name].fetch(directory)
     typer.echo(f"{path}")
 
 
-def main() -> None:
-    """Run the command line; a user's mistake ends with sentences on standard error and exit status 2."""
+class _Termination:
+    """SIGTERM as an interrupt of the main thread; Typer does not tell it from Ctrl-C."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        signal.signal(signal.SIGTERM, self._ask)
+
+    def _ask(self, number: int, frame: FrameType | None) -> NoReturn:
+        self.asked = True
+        raise Terminated("SIGTERM")
+
+
+def _flush() -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+
+
+def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
+    """Run the command line; a user's mistake ends with sentences on standard error and exit status 2.
+
+    Parameters
+    ----------
+    leave
+        Ends the process where a file could not be written, without the clean-up of libraries: HDF5 would crash there.
+    """
     logging.getLogger().addHandler(logging.NullHandler())
     if not faulthandler.is_enabled():
         # Where a crash of a library was, on the terminal: a run writes standard error itself to a file.
@@ -240,25 +270,28 @@ def main() -> None:
     if ranks.is_helper():
         ranks.serve()
         return
+    termination = _Termination()
     try:
         with ranks.leading():
             app()
-    except ExperimentError as error:
-        for sentence in error.faults:
-            typer.echo(f"calstudy: {sentence}", err=True)
-        sys.exit(EXIT_INPUT)
     except InputError as error:
-        typer.echo(f"calstudy: {error}", err=True)
+        for sentence in error.faults if isinstance(error, ExperimentError) else [str(error)]:
+            typer.echo(f"calstudy: {sentence}", err=True)
+        if isinstance(error, DiskError):
+            _flush()
+            leave(EXIT_INPUT)
         sys.exit(EXIT_INPUT)
-    except OSError as error:
-        reason = refusal_of_disk(error)
-        if reason is None or error.filename is None:
+    except (OSError, RuntimeError) as error:
+        reason, name = refusal_of_disk(error), getattr(error, "filename", None)
+        if reason is None:
             raise
-        typer.echo(f"calstudy: {error.filename}: cannot be read or written ({reason})", err=True)
-        sys.exit(EXIT_INPUT)
+        typer.echo(f"calstudy: {name or 'a file'}: cannot be read or written ({reason})", err=True)
+        _flush()
+        leave(EXIT_INPUT)
     except (KeyboardInterrupt, SystemExit) as end:
         # Typer ends an interrupted command with this status, and says nothing.
         if isinstance(end, SystemExit) and end.code != EXIT_INTERRUPTED:
             raise
-        typer.echo("calstudy: interrupted; what is in the store is kept, and a run goes on from there", err=True)
-        sys.exit(EXIT_INTERRUPTED)
+        how = "terminated" if termination.asked else "interrupted"
+        typer.echo(f"calstudy: {how}; what is in the store is kept, and a run goes on from there", err=True)
+        sys.exit(exit_status(Terminated()) if termination.asked else EXIT_INTERRUPTED)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,11 +54,12 @@ def store(
 ) -> None:
     """Show what is in a store by stage, or delete chosen products.
 
-    A deleted product is made again by the next run that needs it. Without --delete nothing is changed; with it, at
+    A deleted product is made again by the next run that needs it. Folders that killed runs left are listed too, and
+    deleted with --older-than. Without --delete nothing is changed; with it, at
     least one of --older-than, --larger-than and --unreferenced must say which products are meant. Do not delete
     during a run.
     """
-    from calstudy.run.inventory import age_of, list_runs, products
+    from calstudy.run.inventory import age_of, leftovers, list_runs, products
     from calstudy.run.inventory import unreferenced as without_run
     from calstudy.run.store import Store
 
@@ -72,8 +74,15 @@ def store(
     chosen = [product for product in chosen if age_of(product) >= oldest and product.size >= smallest]
     console = Console(highlight=False)
     _show(chosen, folder, console)
+    left = [item for item in leftovers(where) if item.age >= oldest]
+    for item in left:
+        console.print(f"leftover of a run: {item.path}, {_size(item.size)}, {_days(item.age)}", markup=False)
     if not delete:
         return
+    if older_than is not None:
+        for item in left:
+            shutil.rmtree(item.path, ignore_errors=True)
+            console.print(f"deleted: {item.path}", markup=False)
     for product in chosen:
         stage, key = str(product.record["stage"]), str(product.record["key"])
         with where.lock(stage, key):
@@ -98,6 +107,10 @@ def _show(chosen: list[Product], folder: Path, console: Console) -> None:
 
 def _size(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.2f} MB"
+
+
+def _days(seconds: float) -> str:
+    return f"{seconds / SECONDS['d']:.1f} d"
 
 
 def _age(text: str | None) -> float:

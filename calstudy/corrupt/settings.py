@@ -28,12 +28,20 @@ Seeds = Annotated[
 ]
 
 
+OF_TWINS = Field(
+    None,
+    description="Seeds of data without the EoR; null: the noise of the data with it, so that their difference is the "
+    "EoR alone. Blind challenges need noise of its own.",
+)
+
+
 class NoiseRelativeToEor(Section):
     """Thermal noise with a standard deviation of `factor` times the rms of the EoR visibilities (paper: 10)."""
 
     kind: Literal["times-eor"] = "times-eor"
     factor: float = Field(10.0, gt=0)
     seeds: Seeds = (3, 4)
+    seeds_without_eor: Seeds | None = OF_TWINS
 
 
 class NoiseRelativeToForegrounds(Section):
@@ -42,6 +50,7 @@ class NoiseRelativeToForegrounds(Section):
     kind: Literal["times-foregrounds"]
     factor: float = Field(0.1, gt=0)
     seeds: Seeds = (3, 4)
+    seeds_without_eor: Seeds | None = OF_TWINS
 
 
 class RadiometerNoise(SystemTemperature):
@@ -58,6 +67,7 @@ class RadiometerNoise(SystemTemperature):
     )
     nights: int = Field(1, ge=1, description="Nights at the same sidereal time that are averaged coherently.")
     seeds: Seeds = (3, 4)
+    seeds_without_eor: Seeds | None = OF_TWINS
 
 
 class NoNoise(Section):

@@ -88,8 +88,12 @@ def _drawn(experiment: Experiment, draws: Mapping[str, int]) -> Experiment:
         )
     }
     if not isinstance(corruption.noise, NoNoise):
-        seeds = tuple(seed + SEED_STEP * draws["noise"] for seed in corruption.noise.seeds)
-        changes["noise"] = corruption.noise.model_copy(update={"seeds": seeds})
+        noise = corruption.noise
+        seeds = {"seeds": noise.seeds, "seeds_without_eor": noise.seeds_without_eor}
+        moved = {
+            name: tuple(seed + SEED_STEP * draws["noise"] for seed in found) for name, found in seeds.items() if found
+        }
+        changes["noise"] = noise.model_copy(update=moved)
     update = {"sky": sky.model_copy(update={"eor": eor}), "corruption": corruption.model_copy(update=changes)}
     return experiment.model_copy(update=update)
 
@@ -126,7 +130,10 @@ def _coinciding_seeds(experiment: Experiment) -> list[str]:
     bases: list[tuple[str, int]] = [
         ("gains", seed) for effect in experiment.corruption.effects if (seed := _gain_seed(effect)) is not None
     ]
-    bases += [("noise", seed) for seed in (() if isinstance(noise, NoNoise) else noise.seeds)]
+    bases += [
+        ("noise", seed)
+        for seed in (() if isinstance(noise, NoNoise) else (*noise.seeds, *(noise.seeds_without_eor or ())))
+    ]
     seen: dict[int, str] = {}
     for part, base in bases:
         for number in range(counts.get(part, 1)):

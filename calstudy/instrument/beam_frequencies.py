@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.instrument.beam_file import find_beam
+from calstudy.base.mwa_files import BEAM
 
 # The tabulated MWA beam scatters from frequency to frequency by 2.4e-5 rms of the zenith value. A polynomial of order 8
 # over 36 MHz is the lowest that leaves no more than that; a higher one would follow the scatter. Narrower observations
@@ -54,11 +54,11 @@ def choose_frequencies(available: np.ndarray, band: tuple[float, float], interpo
 
 
 def mwa_frequencies(path: Path | None) -> np.ndarray:
-    """Return the frequencies (Hz, ascending) of an MWA beam file, by default that of `find_beam`.
+    """Return the frequencies (Hz, ascending) of an MWA beam file, by default that of `BEAM`.
 
     Raises InputError if the file is missing, or has no frequencies of dipoles.
     """
-    path = find_beam() if path is None else path
+    path = BEAM.find() if path is None else path
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
     return _mwa_frequencies(path, path.stat().st_mtime_ns)

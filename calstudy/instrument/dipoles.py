@@ -15,8 +15,8 @@ from pyuvdata import UVBeam
 from pyuvdata.uvbeam.mwa_beam import MWABeam
 
 from calstudy.base.errors import InputError
+from calstudy.base.mwa_files import BEAM
 from calstudy.instrument.as_built import FEEDS
-from calstudy.instrument.beam_file import find_beam
 from calstudy.instrument.beam_frequencies import fit_range
 from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_element, tabulate, zenith_normalized
 
@@ -33,7 +33,7 @@ class DipoleFields:
         feeds = list(self.whole.description["feed_array"])
         if feeds != list(FEEDS):
             raise InputError(f"instrument.beam.path: {path} has feeds {', '.join(feeds)}, not x and y")
-        fields = _single_fields(find_beam() if path is None else path, *fit_range(band))
+        fields = _single_fields(BEAM.find() if path is None else path, *fit_range(band))
         # Shape (Ndipoles, Nreduced, 2, Nfeeds, Nza, Naz).
         self._reduced = np.stack([self.whole.interpolation.reduce(field) for field in fields])
 

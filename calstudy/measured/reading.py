@@ -17,6 +17,7 @@ import numpy as np
 from pyuvdata import UVData
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gains import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.calibrate.standard_formats import PARALLEL_HANDS
@@ -76,7 +77,7 @@ def read_metadata(paths: Sequence[Path]) -> UVData:
 
 
 def _require_readable(paths: Sequence[Path]) -> None:
-    """Raise InputError unless all paths exist, and measurement sets have the package that reads them."""
+    """Raise InputError unless all paths exist, can be read with what is installed, and hold their own data."""
     for path in paths:
         try:
             found = path.exists()
@@ -87,6 +88,7 @@ def _require_readable(paths: Sequence[Path]) -> None:
         # All CASA tables have this file.
         if (path / "table.dat").is_file() and find_spec("casacore") is None:
             raise InputError(f"{path}: reading a measurement set takes {CASACORE}")
+        require_self_contained(path)
 
 
 def _require_plausible(data: UVData, names: str) -> None:

@@ -148,16 +148,19 @@ def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
 
 def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     """Calibrate a run of consecutive integrations."""
+    from calstudy.base.observation import Observation
+    from calstudy.calibrate.amplitudes import conspicuous
     from calstudy.calibrate.execution import run_calibrator
 
     index, count, settings = (job.settings[name] for name in ("index", "count", "calibration"))
     times = _times_of_chunk(job.inputs["data"] / DATA, index, count, settings.integrations_per_solve)
     data, sky, noise = read_calibrated(job.inputs, times)
+    told = conspicuous(Observation(data))
     result = run_calibrator(settings, data, sky, noise=noise)
     result.gains.write_calh5(job.output / GAINS)
     for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
         write_visibilities(uvd, job.output / name, single=True)
-    summary = result.summary()
+    summary = {**result.summary(), "told": told}
     write_json(job.output / SOLUTION, summary)
     return {"by_status": summary["by_status"]}
 
@@ -174,7 +177,9 @@ def assemble(job: Job) -> Mapping[str, Any]:
         parts = [read_visibilities(folder / name) for folder in folders]
         joined = parts[0].fast_concat(parts[1:], "blt", inplace=False) if len(parts) > 1 else parts[0]
         write_visibilities(joined, job.output / name, single=True)
-    records = [record for folder in folders for record in read_json(folder / SOLUTION)["records"]]
+    solutions = [read_json(folder / SOLUTION) for folder in folders]
+    records = [record for solution in solutions for record in solution["records"]]
+    told = list(dict.fromkeys(text for solution in solutions for text in solution.get("told", [])))
     records.sort(key=lambda record: (record["polarization"], record["time"]))
     by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
     for record in records:
@@ -187,7 +192,7 @@ def assemble(job: Job) -> Mapping[str, Any]:
         "by_status": by_status,
         **({"median_steps": float(np.median(steps))} if steps else {}),
         "median_seconds_per_solve": float(np.median(seconds)),
-        "warnings": _warnings(by_status, records),
+        "warnings": told + _warnings(by_status, records),
     }
 
 
@@ -196,7 +201,11 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
     if not unconverged:
         return []
     example = unconverged[0]
-    return [
+    stalled = [
+        "where solves stall, results depend on where they start: T is not determined better than by the spread of two "
+        "starts, which another 'calibration.chunks' shows"
+    ]
+    return (stalled if "stalled" in by_status else []) + [
         f"{len(unconverged)} of {len(records)} solves did not converge "
         f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
         f"{example['integration']}: {example['message']}"
@@ -216,5 +225,5 @@ def _cost(task: Task) -> Cost:
     return Cost(0.7 + disk * 5e-9, LIBRARIES_MEMORY + 3 * disk, disk)
 
 
-CALIBRATE_CHUNK = Stage(name="calibrate-chunk", version=5, make=calibrate_chunk, cost=_cost_of_chunk)
+CALIBRATE_CHUNK = Stage(name="calibrate-chunk", version=6, make=calibrate_chunk, cost=_cost_of_chunk)
 CALIBRATE = Stage(name="calibrate", version=2, make=assemble, cost=_cost)

@@ -108,7 +108,8 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         noise = experiment.corruption.noise
         if isinstance(noise, NoNoise):
             raise LookupError(f"{label}: corruption.noise is 'none'")
-        settings["noise_seed"] = noise.seeds[PARITIES.index(parity)]
+        own = None if "eor" in variant.components else noise.seeds_without_eor
+        settings["noise_seed"] = (own or noise.seeds)[PARITIES.index(parity)]
         label = f"{label} {parity}"
     if "foregrounds" in variant.components and (foregrounds := simulation.foregrounds(graph)) is not None:
         inputs["foregrounds"] = foregrounds

@@ -12,7 +12,7 @@ from typing import Any
 from calstudy.base.errors import InputError
 from calstudy.report import measured
 from calstudy.report.charts import Chart, read_charts
-from calstudy.report.headline import Number, read_excess, read_headline
+from calstudy.report.headline import Number, read_claims, read_excess, read_headline
 from calstudy.run.progress import duration
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
@@ -228,7 +228,7 @@ def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None
     path = folder / CLAIMS
     if not path.is_file():
         return None
-    claims = json.loads(path.read_text(encoding="utf-8"))
+    claims = read_claims(path)
     evaluated = [claim for claim in claims if claim["measured"] is not None]
     if not evaluated:
         reasons = [text for item in products for text in item.get("notes", {}).get("without_role", [])]

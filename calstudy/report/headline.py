@@ -8,6 +8,9 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from calstudy.base.errors import InputError
 
 BAND = (0.2, 0.5)
 """Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""
@@ -134,10 +137,22 @@ def _sums(rows: list[dict[str, float]], low: float, high: float) -> tuple[float,
     return total, math.sqrt(variance)
 
 
+def read_claims(path: Path) -> list[dict[str, Any]]:
+    """Return what a claims.json says of each statement; raises InputError if it is damaged."""
+    try:
+        claims = json.loads(path.read_text(encoding="utf-8"))
+        whole = isinstance(claims, list) and all({"verdict", "measured", "uncertainty"} <= set(item) for item in claims)
+    except (OSError, ValueError, TypeError):
+        whole = False
+    if not whole:
+        raise InputError(f"{path}: is damaged; write it again: calstudy claims {path.parent}")
+    return claims
+
+
 def _verdicts(path: Path) -> Number | None:
     if not path.is_file():
         return None
-    counts = Counter(claim["verdict"] for claim in json.loads(path.read_text(encoding="utf-8")))
+    counts = Counter(claim["verdict"] for claim in read_claims(path))
     if not counts["PASS"] + counts["FAIL"]:
         return None
     text = f"{counts['PASS']} PASS, {counts['FAIL']} FAIL"

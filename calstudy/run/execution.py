@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-BEGUN = "begun"
-"""Topic under which workers report to the scheduler what they begin to make."""
+BEGUN, WAITS = "begun", "waits"
+"""Topics under which workers report to the scheduler what they begin to make, and for whose lock they wait."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def _announce_and_perform(order: WorkOrder) -> Product:
 
     worker = get_worker()
     worker.log_event(BEGUN, {"worker": worker.address, "product": f"{order.stage.name} ({order.label})"})
-    return perform(order)
+    return perform(order, lambda text: worker.log_event(WAITS, text))
 
 
 def _last_begun(client: Client, worker: str) -> str | None:
@@ -245,6 +245,7 @@ def execute(
     store: Store,
     workers: Workers,
     done: Callable[[Task, Product], None] = lambda task, product: None,
+    told: Callable[[str], None] = logger.warning,
 ) -> dict[str, Product]:
     """Make the products of `tasks`, which are in an order that respects their inputs.
 
@@ -258,6 +259,8 @@ def execute(
         Who does the work.
     done
         Called after each product.
+    told
+        Called with a sentence for each wait for the lock of another run.
 
     Returns
     -------
@@ -267,16 +270,17 @@ def execute(
     Raises
     ------
     InputError
-        If the scheduler cannot be reached, a worker dies repeatedly, or a stage refuses its input.
+        If the scheduler cannot be reached or is lost, a worker dies repeatedly, or a stage refuses its input.
     """
     products: dict[str, Product] = {}
     if not tasks:
         return products
     if ranks.count() > 1:
         return _execute_here(tasks, store, done)
-    from distributed import KilledWorker, as_completed
+    from distributed import CancelledError, KilledWorker, as_completed
 
     with _client(workers) as client:
+        client.subscribe_topic(WAITS, lambda event: told(event[1]))
         queue = _Queue(tasks, store, client)
         futures = queue.first()
         completed = as_completed(futures)
@@ -290,6 +294,12 @@ def execute(
                 raise InputError(
                     f"{begun}: its worker process died repeatedly, for want of memory or by a crash of code that it "
                     "runs; use fewer --workers, or smaller chunks, and run again: finished products are kept"
+                ) from None
+            except CancelledError:
+                where = "" if workers.scheduler is None else f"--scheduler {workers.scheduler}: "
+                raise InputError(
+                    f"{where}the dask scheduler was lost before {task.stage.name} ({task.label}) was made; run again: "
+                    "finished products are kept"
                 ) from None
             # The client would have a result that it holds computed again if its worker dies.
             future.release()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import InputError
-from calstudy.run.store import RECORD, Product, Store
+from calstudy.run.store import PLAIN, RECORD, Product, Store
 
 MANIFEST = "manifest.json"
 
@@ -66,9 +68,41 @@ def list_runs(folder: Path) -> list[RunEntry]:
 def products(store: Store) -> Iterator[Product]:
     """Yield all complete products of a store."""
     for record in sorted(store.root.glob(f"*/*/{RECORD}")):
+        if not all(PLAIN.fullmatch(folder.name) for folder in (record.parent, record.parent.parent)):
+            continue
         product = store.find(record.parent.parent.name, record.parent.name)
         if product is not None:
             yield product
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """A folder that a run was filling or removing when it was killed, or is filling now.
+
+    Attributes
+    ----------
+    path
+        In the store.
+    size
+        Bytes of its files.
+    age
+        Seconds since it changed.
+    """
+
+    path: Path
+    size: int
+    age: float
+
+
+def leftovers(store: Store) -> list[Leftover]:
+    """Return the folders of a store that are no products."""
+    found = []
+    for path in sorted([*store.root.glob("*/.building-*"), *store.root.glob("*/.discarded-*")]):
+        with suppress(OSError):  # A run that goes on may have renamed it.
+            files = [file.stat() for file in (path, *path.rglob("*"))]
+            size, changed = sum(file.st_size for file in files[1:]), max(file.st_mtime for file in files)
+            found.append(Leftover(path, size, max(0.0, time.time() - changed)))
+    return found
 
 
 def age_of(product: Product) -> float:

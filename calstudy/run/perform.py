@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import socket
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from calstudy import __version__
-from calstudy.base.errors import InputError, refusal_of_disk
+from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.resources import Usage
 from calstudy.base.schema import plain
 from calstudy.run.store import Product, Store
@@ -45,7 +46,7 @@ class WorkOrder:
         )
 
 
-def perform(order: WorkOrder) -> Product:
+def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> Product:
     """Make the ordered product, or return it if another run has made it meanwhile.
 
     Raises
@@ -55,8 +56,13 @@ def perform(order: WorkOrder) -> Product:
         of a stage is a bug, and passes with its traceback.
     """
     store = Store(order.store)
+    if not store.root.is_dir():
+        raise InputError(
+            f"outputs.store = {str(store.root)!r}: {order.stage.name} ({order.label}): the worker on "
+            f"{socket.gethostname()} has no such folder; all workers must see the store under this path"
+        )
     try:
-        with store.lock(order.stage.name, order.key):
+        with store.lock(order.stage.name, order.key, told):
             existing = store.verify(order.stage.name, order.key)
             return existing if existing is not None else _make(order, store)
     except InputError:
@@ -68,7 +74,7 @@ def perform(order: WorkOrder) -> Product:
         reason = _unwritable(error, store.root)
         if reason is None:
             raise
-        raise InputError(
+        raise DiskError(
             f"outputs.store = {str(store.root)!r}: {order.stage.name} ({order.label}) could not be written ({reason}); "
             "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
         ) from None

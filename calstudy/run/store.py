@@ -7,24 +7,28 @@ and renamed; a folder whose files no longer match its record is damaged, and is 
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
 import shutil
+import socket
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 from uuid import uuid4
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, error_number
 from calstudy.base.files import sha256
 
 RECORD = "product.json"
+SILENT_WAIT, LONGEST_WAIT = 5.0, 24 * 3600.0
+"""Seconds after which a wait for a lock is told, and after which it ends."""
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Stages and keys: names of folders, and of nothing above or below."""
 
@@ -40,6 +44,13 @@ class Product:
     def size(self) -> int:
         """Bytes of all its files."""
         return sum(entry["bytes"] for entry in self.record["files"].values())
+
+
+def _holder(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8") or "a process that does not say"
+    except OSError:
+        return "a process that does not say"
 
 
 def _inside(name: str) -> bool:
@@ -152,12 +163,52 @@ class Store:
             shutil.rmtree(grave, ignore_errors=True)
 
     @contextmanager
-    def lock(self, stage: str, key: str) -> Iterator[None]:
-        """Hold the right to make this product; another run that wants it waits, and then finds it made."""
+    def lock(self, stage: str, key: str, told: Callable[[str], None] = lambda text: None) -> Iterator[None]:
+        """Hold the right to make this product; another run that wants it waits, and then finds it made.
+
+        Parameters
+        ----------
+        stage, key
+            Of the product.
+        told
+            Called with a sentence that names the holder, if there is a wait of more than `SILENT_WAIT`.
+
+        Raises
+        ------
+        InputError
+            If another process holds it for `LONGEST_WAIT`, or the file system has no locks.
+        """
         locks = self.root / ".locks"
         locks.mkdir(exist_ok=True)
-        with FileLock(locks / f"{stage}-{key}.lock"):
+        path, holder = locks / f"{stage}-{key}.lock", locks / f"{stage}-{key}.holder"
+        # Without flock, a marker of a process that died on another host would be waited for in vain.
+        lock = FileLock(path, fallback_to_soft=False)
+        try:
+            try:
+                lock.acquire(timeout=SILENT_WAIT)
+            except Timeout:
+                told(f"{stage} {key}: waits for the lock {path}, held by {_holder(holder)}")
+                lock.acquire(timeout=LONGEST_WAIT)
+        except Timeout:
+            raise InputError(
+                f"{stage} {key}: the lock {path} was held for {LONGEST_WAIT / 3600:g} h by {_holder(holder)}; end that "
+                "process, and run again"
+            ) from None
+        except OSError as error:
+            if error_number(error) not in (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK):
+                raise
+            raise InputError(
+                f"outputs.store = {str(self.root)!r}: its file system has no locks (flock), which keep two runs from "
+                "making the same product at the same time; choose another folder with --set outputs.store=DIR"
+            ) from None
+        try:
+            with suppress(OSError):
+                holder.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
             yield
+        finally:
+            with suppress(OSError):
+                holder.unlink()
+            lock.release()
 
     @contextmanager
     def building(self, stage: str, key: str) -> Iterator[Path]:

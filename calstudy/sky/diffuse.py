@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from importlib.resources import files
 from pathlib import Path
 
 import healpy
@@ -14,11 +13,10 @@ from astropy.io import fits
 from pyradiosky import SkyModel
 from scipy.interpolate import RectBivariateSpline
 
-from calstudy.base.errors import InputError
+from calstudy.base.mwa_files import HASLAM
 from calstudy.sky import settings as section
 
 HASLAM_FREQUENCY = 408e6
-HASLAM_FILE = files("mwa_pb") / "data" / "radio408.RaDec.fits"
 # The map is in tenths of a kelvin, on a grid of 20 arcmin in B1950 coordinates, its middle at (0, 0).
 HASLAM_UNIT, HASLAM_STEP = 0.1, np.deg2rad(1 / 3)
 # The cosmic microwave background (Fixsen 2009, K) is in the map, and does not follow the power law of the Galaxy.
@@ -30,21 +28,16 @@ FINEST_NSIDE = 256
 def brightness_temperature(settings: section.HaslamMap | section.SyntheticDiffuse) -> np.ndarray:
     """Return the brightness temperature of all pixels at the map's frequency, K, (Npixels,), RING order, ICRS.
 
-    Raises InputError if the installed mwa_pb lacks its copy of the Haslam map.
+    Raises InputError if the Haslam map is missing.
     """
     if isinstance(settings, section.HaslamMap):
-        return healpy.ud_grade(_haslam(Path(str(HASLAM_FILE))), settings.nside)
+        return healpy.ud_grade(_haslam(HASLAM.find()), settings.nside)
     return _synthetic(settings)
 
 
 @lru_cache(maxsize=1)
 def _haslam(path: Path) -> np.ndarray:
     """Return the 408 MHz survey without the microwave background, sampled at the centres of fine pixels, K."""
-    if not path.is_file():
-        raise InputError(
-            f"sky.diffuse: the installed mwa_pb is without the Haslam map ({path}); install mwa_pb 1.1, or use kind: "
-            "synthetic"
-        )
     with fits.open(path) as file:
         grid = HASLAM_UNIT * np.asarray(file[0].data[0], float) - MICROWAVE_BACKGROUND
     # Right ascension decreases with the column, from 180 to -180 degrees, both included.

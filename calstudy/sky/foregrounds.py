@@ -6,7 +6,6 @@ import logging
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,8 @@ from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
+from calstudy.base.mwa_files import G4JY
 from calstudy.base.plugins import load_function, user_code
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
@@ -126,7 +127,7 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
 @lru_cache(maxsize=1)
 def _components(faintest: float, seed: int, index_scatter: float) -> tuple[Catalogue, int]:
     """Return G4Jy components followed by synthetic sources, down to a flux in Jy, and the number of G4Jy components."""
-    real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))
+    real = read_gleam_table(G4JY.find())
     synthetic = _population(faintest, seed, index_scatter)
     covered = _in_g4jy_area(synthetic)
     synthetic = synthetic.select(~covered | (synthetic.flux < COMPLETE_FLUX))
@@ -256,6 +257,7 @@ def _read(settings: section.FileSources) -> SkyModel:
     path = settings.path
     if not path.is_file():
         raise InputError(f"sky.foregrounds.path: there is no file {path}")
+    require_self_contained(path)
     try:
         if path.suffix == ".sav":
             _require_idl(path)

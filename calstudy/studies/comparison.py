@@ -38,7 +38,7 @@ KEY = "calibrators"
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 """Keys of the experiment that the cases do not take from it."""
-OWN = ("name", "description", KEY, "worlds", "figures")
+OWN = ("name", "description", KEY, "worlds", "figures", "salt")
 """Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
 VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
@@ -73,6 +73,9 @@ class ComparisonFile(Section):
     figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] = Field(
         default_factory=lambda: tuple(FIGURES.make(name) for name in ("comparison-matrix", "comparison-spectra")),
         description="Figures of all cases: comparison-matrix, comparison-spectra, comparison-curves.",
+    )
+    salt: str = Field(
+        "", description="Of a blind challenge (`calstudy export --blind`): digests of its data are made with it."
     )
     scales: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="Named sets of changes to this file; the experiment's own come first."
@@ -307,7 +310,12 @@ def load_comparison(
             raise ExperimentError([f"figures.{place}: {figure.label!r} {hint}; ask for it in an experiment"])
     base, origin = _base(file, folder, scale, optional=own is not None)
     worlds = {world: {**fields, **changes} for world, fields in file.worlds.items()}
-    cases = _make_cases(file.calibrators, worlds, base, origin)
+    salted = {"salt": file.salt} if file.salt else {}
+    blocks = {
+        label: {**block, **(salted if block.get(CALIBRATORS.tag) == "by-file" else {})}
+        for label, block in file.calibrators.items()
+    }
+    cases = _make_cases(blocks, worlds, base, origin)
     figures = [figure.model_dump(mode="json") for figure in _shown(file)]
     said = {"name": file.name, "description": file.description, "experiment": _complete(base, origin), "worlds": worlds}
     return Comparison(file, cases, {**said, "calibrators": dict(file.calibrators), "figures": figures})

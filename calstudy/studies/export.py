@@ -15,7 +15,7 @@ from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.gains import CASACORE
 from calstudy.base.identity import digest_json
-from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest
+from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.standard_formats import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
@@ -89,20 +89,23 @@ class Contents:
     experiment
         Validated; it calibrates data with the EoR and without.
     data
-        The data sets, in the order of their keys, which says nothing of them.
+        The data sets, in the order of their digests, which says nothing of them.
     sky_model
         None if nothing is assumed of the sky.
     levels
         For the level of the noise; None if there is none.
+    salt
+        Of a blind challenge; empty for none.
     """
 
     experiment: Experiment
     data: tuple[Task, ...]
     sky_model: Task | None
     levels: Task | None
+    salt: str = ""
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Contents:
+    def of(cls, experiment: Experiment, salt: str = "") -> Contents:
         """Return what is exported of an experiment."""
         graph = Graph(experiment)
         variants = [experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS[:2]]
@@ -113,15 +116,17 @@ class Contents:
         noisy = any("noise" in variant.components for variant in variants)
         return cls(
             experiment,
-            tuple(data[key] for key in sorted(data)),
+            tuple(data[key] for key in sorted(data, key=lambda key: salted(key, salt))),
             sky_model.sky_model(graph),
             corruption.levels(graph) if noisy else None,
+            salt,
         )
 
     @property
     def digest(self) -> str:
         """Of all data sets and the sky model."""
-        return digest_json([*(task.key for task in self.data), self.sky_model and self.sky_model.key])
+        whole = digest_json([*(task.key for task in self.data), self.sky_model and self.sky_model.key])
+        return salted(whole, self.salt)
 
     @property
     def tasks(self) -> list[Task]:
@@ -164,7 +169,7 @@ def export(
     folders = [folder / f"world-{place + 1}" if several else folder for place in range(len(worlds.cases))]
     _require_free(folders, overwrite)
     fits = [fit(case.experiment, budget, lambda wanted: Contents.of(wanted).tasks) for case in worlds.cases]
-    contents = [Contents.of(experiment) for experiment, _ in fits]
+    contents = [Contents.of(experiment, worlds.file.salt) for experiment, _ in fits]
     runs = worlds.outputs.runs.expanduser()
     runs.mkdir(parents=True, exist_ok=True)
     with log_to(runs / LOG):
@@ -196,7 +201,7 @@ def _write_world(content: Contents, products: Mapping[str, Product], folder: Pat
     for number, task in enumerate(content.data, start=1):
         file = f"data-{number}.{file_format}"
         _write(_at(template, read_visibilities(products[task.key].path / DATA)), folder / file, single=True)
-        sets.append(DataSet(name=f"data-{number}", file=file, digest=task.key))
+        sets.append(DataSet(name=f"data-{number}", file=file, digest=salted(task.key, content.salt)))
     model = content.sky_model
     if model is not None:
         sky = read_visibilities(products[model.key].path / VISIBILITIES)
@@ -207,7 +212,7 @@ def _write_world(content: Contents, products: Mapping[str, Product], folder: Pat
         digest=content.digest,
         data=tuple(sets),
         sky_model=None if model is None else f"{SKY_MODEL}.{file_format}",
-        sky_model_digest=None if model is None else model.key,
+        sky_model_digest=None if model is None else salted(model.key, content.salt),
         noise=None if levels is None else read_json(products[levels.key].path / LEVELS)["noise_std"],
     )
     write(folder / README, _readme(manifest, template, file_format))

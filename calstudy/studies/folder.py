@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -12,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, exit_status
 from calstudy.base.identity import digest_json
 from calstudy.run.provenance import git_commit, machine, package_versions
 from calstudy.run.store import Product
@@ -20,6 +22,7 @@ from calstudy.run.task import Task
 from calstudy.verdicts.tables import CLAIMS_FILES
 
 MANIFEST, EXPERIMENT, LOG = "manifest.json", "experiment.yaml", "run.log"
+LEFTOVER = re.compile(r"\..+-[0-9a-f]{32}")
 POINTS, CASES = "points", "cases"
 """Folders of the run folders of a sweep's points, and of the experiments of a comparison's cases."""
 
@@ -49,6 +52,7 @@ def open_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in folder.iterdir() if path.name not in known and path.name[0] != ".")
         (folder / LOG).touch()
+        _remove_leftovers(folder)
     except OSError as error:
         raise InputError(f"outputs.runs = {str(folder.parent)!r}: cannot be written ({error.strerror})") from None
     if strangers:
@@ -57,23 +61,45 @@ def open_folder(folder: Path) -> None:
         )
 
 
+class _LogFile(logging.FileHandler):
+    """A log whose disk may be full: the run says so itself, and not with a traceback for each line."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Leave the line out."""
+
+
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """Append what calstudy logs, and warnings, to a file."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    """Append what calstudy logs, and warnings, to a file; and at the end how the block ended, with the exit status."""
+    handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root, package = logging.getLogger(), logging.getLogger("calstudy")
     level = package.level
     root.addHandler(handler)
     package.setLevel(logging.INFO)
     logging.captureWarnings(True)
+    ended: BaseException | None = None
     try:
         yield
+    except BaseException as error:
+        ended = error
+        raise
     finally:
+        why = "" if ended is None else f": {str(ended) or type(ended).__name__}"
+        text = f"ended with status {exit_status(ended)}{why}"
+        how = logging.INFO if ended is None else logging.ERROR
+        handler.handle(package.makeRecord(__name__, how, __file__, 0, text, (), None))
         logging.captureWarnings(False)
         package.setLevel(level)
         root.removeHandler(handler)
         handler.close()
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove files that a killed run was writing; those of the last minute may be those of another run."""
+    for path in folder.rglob(".*"):
+        if LEFTOVER.fullmatch(path.name) and time.time() - path.stat().st_mtime > 60:
+            path.unlink(missing_ok=True)
 
 
 def write(path: Path, text: str) -> None:
@@ -114,6 +140,7 @@ def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
         **fields,
     }
     write(folder / MANIFEST, _as_json(manifest))
+    _remove_leftovers(folder)
 
 
 def _as_json(manifest: Mapping[str, Any]) -> str:

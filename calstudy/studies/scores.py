@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ValidationError, field_validator
+from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError, field_validator
 from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
 from calstudy.base.identity import digest_json, identity
 from calstudy.base.schema import Section
+from calstudy.calibrate.interface import Status
 from calstudy.experiment.model import Experiment
+from calstudy.power.score import BANDS
 from calstudy.products.comparison import score_table
 from calstudy.products.files import read_json
 from calstudy.products.graph import Graph, required
@@ -27,11 +32,61 @@ from calstudy.studies.comparison import Comparison
 from calstudy.studies.export import Contents
 from calstudy.studies.folder import log_to
 from calstudy.studies.study import Budget, make
-from calstudy.verdicts.tables import Table
+from calstudy.verdicts.tables import Table, one_line, plain_text
 
 LOG = "score.log"
+VERIFIED = "verified.txt"
+"""Lines of a SHA-256 of a file of scores, and who scored its gains or program again; kept by who keeps the page."""
 LIMIT = 1.0
 """A band of k counts if the upper limit of the bias is below this part of the EoR."""
+Label = Annotated[str, StringConstraints(pattern=r"^[\w(][\w.,:;()+\-−±%=°'² ]*$", max_length=80)]
+"""Letters, digits, spaces and common signs in one line, which mean nothing in Markdown or HTML."""
+Measured = Annotated[float, Field(ge=-1e30, le=1e30)] | None
+Positive = Annotated[float, Field(ge=0, le=1e30)] | None
+
+
+class _Band(Section):
+    """Scores in a band of k, h/Mpc; None where they are not known. What else a file says of it is left out."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    k: list[float]
+    transfer: Measured
+    transfer_error: Positive
+    bias: Measured
+    bias_error: Positive
+    recovered: Measured = None
+    recovered_error: Positive = None
+
+    @field_validator("k")
+    @classmethod
+    def _is_a_band(cls, value: list[float]) -> list[float]:
+        if value not in (list(pair) for pair in pairwise(BANDS)):
+            raise ValueError(f"must be one of the bands between {', '.join(map(str, BANDS))} h/Mpc")
+        return value
+
+
+class _Summary(Section):
+    """The numbers of score.json that a page shows."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    bands: list[_Band] = Field(min_length=1)
+    flux_scale: Measured
+    sky_model_error: Positive = None
+    gain_error_aligned: Positive
+    gain_error_as_fitted: Positive
+    held_out_chi_squared: Positive
+    by_status: dict[Status, Annotated[int, Field(ge=0, le=10**9)]]
+    cpu_seconds_per_integration: Positive = None
+    peak_memory: Positive
+
+    @field_validator("bands")
+    @classmethod
+    def _have_each_band_once(cls, value: list[_Band]) -> list[_Band]:
+        if len({tuple(band.k) for band in value}) != len(value):
+            raise ValueError("has a band of k twice")
+        return value
 
 
 class Row(Section):
@@ -49,20 +104,24 @@ class Row(Section):
         As in score.json.
     """
 
-    world: str
-    calibrator: str
+    world: Label
+    calibrator: Label
     digest: str
     scoring: str
     scores: dict[str, Any]
 
     @field_validator("scores")
     @classmethod
-    def _has_bands(cls, value: dict[str, Any]) -> dict[str, Any]:
-        needed = {"transfer", "bias", "bias_error"}
-        bands = value.get("bands")
-        if not isinstance(bands, list) or not bands or any(not needed <= set(band) for band in bands):
-            raise ValueError("has no bands of k with transfer, bias and bias_error")
-        return value
+    def _are_numbers(cls, value: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return _Summary.model_validate(value).model_dump()
+        except ValidationError as error:
+            raise ValueError(_first(error)) from None
+
+    @property
+    def k(self) -> list[list[float]]:
+        """The bands of k, h/Mpc."""
+        return [band["k"] for band in self.scores["bands"]]
 
 
 class Scores(Section):
@@ -81,9 +140,9 @@ class Scores(Section):
     """
 
     calstudy: str
-    name: str
+    name: Label
     rows: tuple[Row, ...]
-    refusals: tuple[tuple[str, str, str], ...] = ()
+    refusals: tuple[tuple[Label, Label, str], ...] = ()
 
 
 def scoring_of(experiment: Experiment) -> str:
@@ -101,6 +160,8 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
     budget, console
         As for `calstudy.studies.study.run_study`.
     """
+    for label in {study.name, *(label for case in study.cases for label in (case.world, case.calibrator))}:
+        _require_label(label)
     study, count = study.fitted(budget)
     runs = study.outputs.runs.expanduser()
     runs.mkdir(parents=True, exist_ok=True)
@@ -113,7 +174,7 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
         Row(
             world=case.world,
             calibrator=case.calibrator,
-            digest=Contents.of(case.experiment).digest,
+            digest=Contents.of(case.experiment, study.file.salt).digest,
             scoring=scoring_of(case.experiment),
             scores=read_json(made.products[task.key].path / SUMMARY),
         )
@@ -121,6 +182,15 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
     ]
     refusals = tuple((case.world, case.calibrator, case.refusal) for case in study.cases if case.refusal)
     return Scores(calstudy=__version__, name=study.name, rows=tuple(rows), refusals=refusals)
+
+
+def _require_label(label: str) -> None:
+    try:
+        TypeAdapter(Label).validate_python(label)
+    except ValidationError:
+        raise InputError(
+            f"{label!r}: cannot label a row of scores; use at most 80 letters, digits, spaces and . , : ; ( ) + - % = '"
+        ) from None
 
 
 def tables(scores: Scores) -> dict[str, Table]:
@@ -139,9 +209,12 @@ def read_scores(path: Path) -> Scores:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "its content"
-        raise InputError(f"{path}: is not a file of 'calstudy score --output' ({where}: {first['msg']})") from None
+        raise InputError(f"{path}: is not a file of 'calstudy score --output' ({_first(error)})") from None
+
+
+def _first(error: ValidationError) -> str:
+    first = error.errors()[0]
+    return plain_text(f"{'.'.join(map(str, first['loc'])) or 'its content'}: {first['msg']}")
 
 
 @dataclass(frozen=True)
@@ -157,16 +230,17 @@ class _Standing:
     def of(cls, row: Row) -> _Standing:
         limits, kept = [], []
         for band in row.scores["bands"]:
-            known = band["bias"] is not None and band["bias_error"] is not None and band["transfer"] is not None
+            known = None not in (band["bias"], band["bias_error"], band["transfer"], band["transfer_error"])
             limit = upper_limit(band["bias"], band["bias_error"]) if known else float("inf")
             limits.append(limit)
-            if limit < LIMIT:
+            # No calibration leaves more than all of the signal, or less than none.
+            if limit < LIMIT and -band["transfer_error"] <= band["transfer"] <= 1 + band["transfer_error"]:
                 kept.append(band["transfer"])
         return cls(len(kept), len(limits), sum(kept) / len(kept) if kept else 0.0, min(limits))
 
     @property
     def order(self) -> tuple[float, ...]:
-        return -self.clean, -self.transfer, self.worst
+        return -self.clean, -min(self.transfer, 1.0), self.worst
 
     @property
     def text(self) -> str:
@@ -194,15 +268,18 @@ def leaderboard(folder: Path) -> str:
         raise InputError(f"{folder}: has no files of scores (*.json, from 'calstudy score --output')")
     found = {path: read_scores(path) for path in paths}
     worlds: dict[str, dict[str, Row]] = {}
+    known, verified = _read_verified(folder / VERIFIED), dict[str, str]()
     for path, scores in found.items():
+        who = known.get(sha256(path), "")
         for row in scores.rows:
             rows = worlds.setdefault(row.world, {})
             _require_fitting(path, row, rows)
             rows[row.calibrator] = row
+            verified[row.calibrator] = who if verified.get(row.calibrator, who) == who else ""
     if not worlds:
         raise InputError(f"{folder}: its files of scores have no rows")
     names = ", ".join(dict.fromkeys(scores.name for scores in found.values()))
-    lines = [f"# Leaderboard: {names}", "", *_explanation(), "", _overview(worlds).markdown()]
+    lines = [f"# Leaderboard: {names}", "", *_explanation(), "", _overview(worlds, verified).markdown()]
     for world, rows in worlds.items():
         ranked = sorted(rows.values(), key=lambda row: _Standing.of(row).order)
         lines += [f"## {world}", "", score_table({row.calibrator: row.scores for row in ranked}).markdown()]
@@ -212,7 +289,9 @@ def leaderboard(folder: Path) -> str:
             for place, calibrator, why in scores.refusals
             if place == world
         ]
-        lines += [f"- {calibrator} cannot work here: {why}" for calibrator, why in refused] + ([""] if refused else [])
+        lines += [f"- {calibrator} cannot work here: {one_line(why)}" for calibrator, why in refused] + (
+            [""] if refused else []
+        )
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -221,11 +300,24 @@ def _explanation() -> list[str]:
         "Each cell: in how many bands of k the bias is below the EoR with two standard deviations, |bias| + 2σ < 1, "
         "and the mean of T in these bands. Rows are ordered by these two, added up over worlds. T is the part of the "
         "EoR's power that is left, the bias the power of the residual without EoR over that of the EoR; both are free "
-        "of the flux scale. All columns of the tables are explained in the [guide](guide.md#comparisons).",
+        "of the flux scale. A band in which T is below 0 or above 1 by more than its error does not count. All columns "
+        "of the tables are explained in the [guide](guide.md#comparisons).",
+        "",
+        "Numbers are the word of a row's author, unless the column `verified` says who scored the gains or the program "
+        "again.",
         "",
         "Built-in calibrators have the weights of their own gains unless `weights` says otherwise "
         "([weights](weights.md)).",
     ]
+
+
+def _read_verified(path: Path) -> dict[str, str]:
+    if not path.exists():
+        return {}
+    lines = [line.split(maxsplit=1) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    if any(len(line) != 2 or not re.fullmatch("[0-9a-f]{64}", line[0]) for line in lines):
+        raise InputError(f"{path}: lines must be a SHA-256 of a file of scores, and who scored it again")
+    return {digest: one_line(who) for digest, who in lines}
 
 
 def _require_fitting(path: Path, row: Row, rows: Mapping[str, Row]) -> None:
@@ -235,16 +327,16 @@ def _require_fitting(path: Path, row: Row, rows: Mapping[str, Row]) -> None:
             f"{path}: {row.calibrator!r} was scored on other data than {others[0].calibrator!r} in the world "
             f"{row.world!r} (their digests differ); score it again with the same experiment and version"
         )
-    if any(other.scoring != row.scoring for other in rows.values()):
+    if any(other.scoring != row.scoring or other.k != row.k for other in rows.values()):
         raise InputError(
-            f"{path}: {row.calibrator!r} was measured otherwise than others in the world {row.world!r} (settings of "
-            "'power', or another version of scores); score it again with the same experiment and version"
+            f"{path}: {row.calibrator!r} was measured otherwise than others in the world {row.world!r} (bands of k, "
+            "settings of 'power', or another version of scores); score it again with the same experiment and version"
         )
     if row.calibrator in rows:
         raise InputError(f"{path}: {row.calibrator!r} has scores in the world {row.world!r} twice; use another --name")
 
 
-def _overview(worlds: Mapping[str, Mapping[str, Row]]) -> Table:
+def _overview(worlds: Mapping[str, Mapping[str, Row]], verified: Mapping[str, str]) -> Table:
     standings = {
         name: {world: _Standing.of(rows[name]) for world, rows in worlds.items() if name in rows}
         for name in dict.fromkeys(name for rows in worlds.values() for name in rows)
@@ -252,10 +344,14 @@ def _overview(worlds: Mapping[str, Mapping[str, Row]]) -> Table:
 
     def order(name: str) -> tuple[float, ...]:
         found = standings[name].values()
-        return -sum(item.clean for item in found), -sum(item.clean * item.transfer for item in found)
+        return -sum(item.clean for item in found), -sum(item.clean * min(item.transfer, 1.0) for item in found)
 
     rows: Sequence[Sequence[str]] = [
-        (name, *(standings[name][world].text if world in standings[name] else "-" for world in worlds))
+        (
+            name,
+            *(standings[name][world].text if world in standings[name] else "-" for world in worlds),
+            verified[name] or "-",
+        )
         for name in sorted(standings, key=order)
     ]
-    return Table(("calibrator", *worlds), rows)
+    return Table(("calibrator", *worlds, "verified"), rows)

@@ -224,7 +224,11 @@ def make(targets: Sequence[Task], store: Store, workers: Workers, console: Conso
             show(task, product)
             drop(lifetimes.after(task), store)
 
-        products = execute(plan.todo, store, workers, done)
+        def told(text: str) -> None:
+            logger.warning(text)
+            console.print(text, markup=False)
+
+        products = execute(plan.todo, store, workers, done, told)
     products |= plan.ready
     for task in unique(targets):
         if task.key not in products and (found := store.find(task.stage.name, task.key)) is not None:

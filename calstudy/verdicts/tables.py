@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -62,8 +63,19 @@ class Table:
     def markdown(self, numbers: bool = True) -> str:
         """Return it in Markdown; with `numbers`, all columns but the first are aligned to the right."""
         marks = ["---", *["--:" if numbers else "---"] * (len(self.headings) - 1)]
-        rows = ([cell.replace("|", "\\|") for cell in row] for row in (self.headings, marks, *self.rows))
+        rows = ([plain_text(cell).replace("|", "\\|") for cell in row] for row in (self.headings, marks, *self.rows))
         return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def plain_text(text: str) -> str:
+    """Return a text in one line, without tags and entities of HTML; its Markdown is left."""
+    text = "".join(letter if letter.isprintable() else " " for letter in text)
+    return re.sub(r"&(?=#?\w+;)", "&amp;", re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text))
+
+
+def one_line(text: str) -> str:
+    """Return a text of others for a page: one line, at most 1000 characters, nothing that Markdown or HTML reads."""
+    return re.sub(r"([\\`*_\[\]|!#~]|:(?=//))", r"\\\1", plain_text(text[:1000])).strip()
 
 
 def coloured(text: str) -> str:
@@ -75,7 +87,7 @@ def number(value: float, uncertainty: float | None = None) -> str:
     """Write a number with three digits, or with its uncertainty and as many digits as that leaves meaning to."""
     if not uncertainty:
         return f"{value:.3g}"
-    places = max(0, 1 - math.floor(math.log10(uncertainty)))
+    places = min(15, max(0, 1 - math.floor(math.log10(uncertainty))))
     size = f"{value:.3g}" if abs(value) >= LARGE else f"{value:.{places}f}"
     plain = uncertainty >= 100 and abs(value) < LARGE
     return f"{size} ± {uncertainty:.0f}" if plain else f"{size} ± {uncertainty:.2g}"

@@ -156,7 +156,7 @@ COMMANDS = [
     (["validate", "0.1", "--scale", "tiny"], "tiny"),
     (["validate", "0.1", "--ladder", "nowhere"], "nowhere"),
     (["fields", "nowhere.py"], "nowhere.py"),
-    (["data", "fetch", "banana"], "nothing that can be fetched (allowed: gleam, beam)"),
+    (["data", "fetch", "banana"], "nothing that can be fetched (allowed: gleam, beam, g4jy, haslam)"),
     (["check", "engine", "file.yaml", "--reference", "banana"], "--reference 'banana' is not an engine"),
     (["calibrate"], "Missing argument"),
     (["calibrate", "nowhere.uvh5"], "nowhere.uvh5: no such file or folder"),

@@ -14,10 +14,10 @@ from scipy.stats import binom
 
 from calstudy.base.errors import InputError
 from calstudy.base.identity import identity
+from calstudy.base.mwa_files import BEAM
 from calstudy.instrument import as_built as section
 from calstudy.instrument.antenna_beams import AntennaBeams, make_beams
 from calstudy.instrument.as_built import Misalignment, dipole_amplitudes, misalignments, position_offsets
-from calstudy.instrument.beam_file import find_beam
 from calstudy.instrument.beam_frequencies import MWA_GROUP
 from calstudy.instrument.beams import ExactBeam, MwaTile, make_beam
 from calstudy.instrument.dipoles import dipole_fields
@@ -100,7 +100,7 @@ def test_antennas_are_where_they_are_built():
 def beam_file(tmp_path_factory):
     """What the beam file has at three frequencies: to combine dipoles at one of them needs no other."""
     path = tmp_path_factory.mktemp("beam") / "three-frequencies.h5"
-    with h5py.File(find_beam()) as whole, h5py.File(path, "w") as file:
+    with h5py.File(BEAM.find()) as whole, h5py.File(path, "w") as file:
         for name in whole:
             if not (match := MWA_GROUP.fullmatch(name)) or abs(float(match[1]) - FREQUENCY[0]) < 1.5e6:
                 whole.copy(name, file)

@@ -15,9 +15,9 @@ from scipy.signal.windows import blackmanharris
 from scipy.special import j1
 
 from calstudy.base.errors import InputError
+from calstudy.base.mwa_files import BEAM
 from calstudy.instrument import settings as section
 from calstudy.instrument import tabulated
-from calstudy.instrument.beam_file import find_beam
 from calstudy.instrument.beam_models.airy import AiryBeam
 from calstudy.instrument.beam_models.beamfits import FileBeam
 from calstudy.instrument.beam_models.gaussian import GaussianBeam
@@ -112,7 +112,7 @@ def test_ideal_tile_is_a_dipole_times_a_sum_over_its_sixteen_dipoles_and_their_i
 @pytest.fixture(scope="module")
 def mwa_table():
     """What is read of the beam file for the default band."""
-    return tabulated._read_mwa(find_beam(), section.Channels().band)
+    return tabulated._read_mwa(BEAM.find(), section.Channels().band)
 
 
 @pytest.mark.parametrize("interpolation", ["chebyshev", "linear"])
@@ -123,7 +123,7 @@ def test_the_kept_fit_of_the_embedded_element_is_the_fit(monkeypatch, tmp_path, 
 
     def counted(path, wanted):
         reads.append((path, wanted))
-        return mwa_table.copy() if (path, wanted) == (find_beam(), band) else read(path, wanted)
+        return mwa_table.copy() if (path, wanted) == (BEAM.find(), band) else read(path, wanted)
 
     monkeypatch.setattr(tabulated, "_read_mwa", counted)
     beams = []

@@ -490,8 +490,8 @@ def test_the_leaderboard_is_up_to_date_and_its_scores_are_of_the_challenge():
 
 def row(world, calibrator, bias, error, transfer, digest="d", scoring="y"):
     bands = [
-        {"k": [0.1, 0.2], "transfer": kept, "transfer_error": 0.1, "bias": off, "bias_error": error}
-        for kept, off in zip(transfer, bias, strict=True)
+        {"k": k, "transfer": kept, "transfer_error": 0.1, "bias": off, "bias_error": error}
+        for k, kept, off in zip(([0.1, 0.2], [0.2, 0.5]), transfer, bias, strict=True)
     ]
     scores = {
         "bands": bands,
@@ -530,7 +530,7 @@ def test_a_leaderboard_ranks_by_what_is_unbiased_first_and_then_by_what_is_left(
     content = Scores(calstudy="0", name="c", rows=(row("1", "other", (0, 0), 0.1, (0.9, 0.9)),)).model_dump()
     content["rows"][0]["scores"] = {}
     (tmp_path / "c.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="has no bands of k with transfer, bias and bias_error"):
+    with pytest.raises(InputError, match="scores: Value error, bands: Field required"):
         leaderboard(tmp_path)
     (tmp_path / "c.json").write_text("{}")
     with pytest.raises(InputError, match="is not a file of 'calstudy score --output'"):

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from calstudy.base.errors import InputError
 from calstudy.base.gains import read_gains, require_solutions, solutions
 from calstudy.base.observation import Frame, Observation
-from calstudy.base.schema import FOLDER, fault
-from calstudy.calibrate.exchange import find_returned
+from calstudy.base.schema import FOLDER, UNKEYED, fault
+from calstudy.calibrate.exchange import find_returned, salted
 from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Outcome, Progress
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ class ByFile(Calibrator):
         None, strict=False, description="Visibilities of the foregrounds, Jy, besides `gains`; null: the sky model."
     )
 
+    salt: str = Field("", description="Of the blind challenge that the data are of.", json_schema_extra=UNKEYED)
+
     @model_validator(mode="after")
     def _says_where(self) -> Self:
         if (self.folder is None) == (self.gains is None):
@@ -55,7 +57,8 @@ class ByFile(Calibrator):
         """Return the calibrator with the files of one data set; raises InputError if the folder has none for it."""
         if self.folder is None:
             return self
-        found = find_returned(self.folder, digest, sky_model)
+        sky_model = sky_model and salted(sky_model, self.salt)
+        found = find_returned(self.folder, salted(digest, self.salt), sky_model)
         return self.model_copy(update={"folder": None, "gains": found.gains, "model": found.model})
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:

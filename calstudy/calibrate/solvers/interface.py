@@ -18,6 +18,9 @@ logger = logging.getLogger(__name__)
 
 # A loss that stands still while more of it than this could go has not converged: fixed learning rates jitter in place.
 STILL = 0.01
+# Power of a baseline over that of the strongest of either of its antennas, below which Gauss-Newton steps in single
+# precision do not see it; and what of it may be left then, which is rounding.
+HIDDEN, ROUNDING = 1e-8, 1e-10
 
 
 class Estimate(NamedTuple):
@@ -113,6 +116,8 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
         if verdict.status == "converged" and newton_decrement > max(STILL, solver.tolerance):
             message = f"{verdict.message}, but a Gauss-Newton step would lower it by {newton_decrement:.1e} of itself"
             verdict = Verdict("stalled", message)
+        if verdict.status == "converged" and (hidden := _hidden(gains, model, problem)) is not None:
+            verdict, newton_decrement = Verdict("stalled", hidden), math.nan
         try:
             gains, model = fix_degeneracies(gains, model, problem)
             rms = decrement_rms(gains, model, problem, newton_decrement)
@@ -133,6 +138,25 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
     )
     logger.debug("%s after %d steps, %.2f s: %s", solution.status, solution.n_steps, seconds, solution.message)
     return solution, state
+
+
+def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> str | None:
+    """Say that baselines are too weak for a solver to see their residuals, beside others of both their antennas."""
+    antennas, weights = problem.structure.antennas, problem.weights
+    count = np.maximum(np.count_nonzero(weights, axis=1), 1)
+    residual = problem.visibilities - gain_products(gains, antennas) * model
+    power, left = (np.sum(weights * np.abs(cube) ** 2, axis=1) / count for cube in (problem.visibilities, residual))
+    strongest = np.zeros(problem.structure.n_antennas)
+    for column in antennas.T:
+        np.maximum.at(strongest, column, power)
+    weak = (power > 0) & (power < HIDDEN * strongest[antennas].min(axis=1)) & (left > ROUNDING * power)
+    if not weak.any():
+        return None
+    share = math.sqrt(np.max(left[weak] / power[weak]))
+    return (
+        f"converged for the strongest baselines alone: {weak.sum()} of {weak.size} are so much weaker that they are "
+        f"not resolved, with residuals of up to {share:.1e} of their data (flag antennas of far larger amplitudes)"
+    )
 
 
 def decrement_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem, newton_decrement: float) -> float:

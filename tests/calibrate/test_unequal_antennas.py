@@ -1,0 +1,83 @@
+"""Antennas that are dead or far too loud, and data with hardly any channels: told, and not converged in silence."""
+
+import numpy as np
+import pytest
+from test_calamity import make_uvdata
+from toy import make_toy, scattered
+
+from calstudy.base.observation import Observation
+from calstudy.calibrate.amplitudes import conspicuous, dead_samples
+from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.interface import CALIBRATORS
+
+LOUD = 14
+
+
+def data(factor=1.0, n_times=1):
+    """Return visibilities of six antennas, of which number 14 has its amplitudes multiplied."""
+    uvd = make_uvdata(make_toy(scattered(6)), n_times)
+    uvd.data_array[(uvd.ant_1_array == LOUD) | (uvd.ant_2_array == LOUD)] *= factor
+    return uvd
+
+
+def calibrated(uvd, **settings):
+    basis = {"min_delay": "50 ns", "buffer": "50 ns"}
+    calibrator = CALIBRATORS.make({"calibrator": "calamity", "basis": basis, "weights": "flags", **settings})
+    return run_calibrator(calibrator, uvd)
+
+
+@pytest.mark.parametrize("factor", [1e4, 1e6, 1e8])
+def test_an_antenna_that_hides_the_others_is_named_and_no_solve_converges(factor):
+    uvd = data(factor)
+    [told] = conspicuous(Observation(uvd))
+    assert told.startswith(f"Antenna {LOUD}: amplitudes of its visibilities are {factor:.2g} times the median")
+    [record] = calibrated(uvd).solutions
+    assert record.status == "stalled"
+
+
+@pytest.mark.parametrize("factor", [1 / 20, 1, 20])
+def test_amplitudes_that_arrays_have_are_no_matter(factor):
+    assert conspicuous(Observation(data(factor))) == []
+
+
+def test_a_dead_antenna_is_flagged_and_named_and_leaves_the_others_alone():
+    uvd = data(0)
+    assert conspicuous(Observation(uvd)) == [
+        "320 samples are exactly zero, as all of an antenna then, and count as flagged, all that there are of "
+        f"antenna(s) {LOUD}."
+    ]
+    found = calibrated(uvd)
+    dead = found.gains.ant_array == LOUD
+    assert found.gains.flag_array[dead].all()
+    assert not found.gains.flag_array[~dead].any()
+    touching = (found.residual.ant_1_array == LOUD) | (found.residual.ant_2_array == LOUD)
+    assert found.residual.flag_array[touching].all()
+    assert not found.residual.flag_array[~touching].any()
+
+
+def test_zeros_of_one_baseline_are_data():
+    uvd = data()
+    uvd.data_array[(uvd.ant_1_array == LOUD) & (uvd.ant_2_array == 16)] = 0
+    observation = Observation(uvd)
+    assert not dead_samples(observation, np.ones(observation.n_baselines, bool)).any()
+
+
+def test_a_solve_with_one_channel_is_told():
+    uvd = data()
+    uvd.flag_array[:] = True
+    uvd.flag_array[:, 20] = False
+    [told] = conspicuous(Observation(uvd))
+    assert told.startswith("1 integration(s) have data in at most 1 of 64 channels")
+
+
+def test_where_solves_converge_chunks_change_what_the_tolerance_leaves():
+    """The rms that each solve says it has left bounds, to first order, how far two solves are from each other."""
+    uvd = data(n_times=4)
+    times = np.unique(uvd.time_array)
+    parts = [uvd.select(times=times[part], inplace=False) for part in (slice(0, 2), slice(2, 4))]
+    whole, pieces = calibrated(uvd), [calibrated(part) for part in parts]
+    records = [*whole.solutions, *(record for piece in pieces for record in piece.solutions)]
+    assert {record.status for record in records} == {"converged"}
+    residual = np.concatenate([piece.residual.data_array for piece in pieces])
+    difference = np.sqrt(np.mean(np.abs(whole.residual.data_array - residual) ** 2))
+    assert 0 < difference < 2 * max(record.decrement_rms for record in records)

@@ -1,0 +1,133 @@
+"""A blind challenge: seeds that nobody can guess, digests that tell nothing, a recipe that scores what comes back."""
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+import yaml
+
+from calstudy.base.errors import InputError
+from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest, find_returned, salted
+from calstudy.products.corruption import PARITIES, data
+from calstudy.products.graph import Graph
+from calstudy.studies.blind import BITS, write_recipe
+from calstudy.studies.export import CARRIER, Contents
+from calstudy.studies.worlds import load_worlds
+
+CHALLENGE = Path(__file__).parents[2] / "experiments" / "challenge.yaml"
+
+
+def seeds_in(value):
+    """Return all seeds in nested settings."""
+    if isinstance(value, dict):
+        own = [value[name] for name in ("seed", "seeds", "seeds_without_eor") if value.get(name) is not None]
+        flat = [seed for item in own for seed in (item if isinstance(item, list) else [item])]
+        return flat + [seed for item in value.values() for seed in seeds_in(item)]
+    return [seed for item in value for seed in seeds_in(item)] if isinstance(value, list) else []
+
+
+@pytest.fixture(scope="module")
+def open_worlds():
+    return load_worlds(CHALLENGE, None, (), None)
+
+
+@pytest.fixture(scope="module")
+def recipe(open_worlds, tmp_path_factory):
+    path = tmp_path_factory.mktemp("blind") / "secret.yaml"
+    digest = write_recipe(open_worlds, path)
+    assert digest == sha256(path.read_bytes()).hexdigest()
+    assert path.stat().st_mode & 0o777 == 0o600
+    return path
+
+
+@pytest.fixture(scope="module")
+def blind_worlds(recipe):
+    return load_worlds(recipe, None, (), CARRIER)
+
+
+def test_all_that_is_drawn_has_secret_seeds_of_its_own_in_every_world(blind_worlds, recipe):
+    changed = [yaml.safe_load(recipe.read_text())["worlds"][name] for name in ("1", "2", "3")]
+    drawn = [
+        seed
+        for world in changed
+        for name, value in world.items()
+        if name.rpartition(".")[2] in ("seed", "seeds", "seeds_without_eor")
+        for seed in (value if isinstance(value, list) else [value])
+    ]
+    assert len(set(drawn)) == len(drawn)
+    # A number of 128 bits is below 2^64 once in 10^19.
+    assert min(drawn) > 2 ** (BITS // 2)
+    for case in blind_worlds.cases:
+        content = case.experiment.model_dump(mode="json")
+        used = [content["sky"]["foregrounds"]["seed"], content["sky"]["eor"]["seed"]]
+        used += seeds_in(content["corruption"])
+        built = content["instrument"]["as_built"]
+        used += [
+            block["seed"] for block in built.values() if case.world in ("2", "3") and block and block.get("scatter")
+        ]
+        assert set(used) <= set(drawn)
+
+
+def test_nothing_but_seeds_differs_from_the_open_challenge(open_worlds, blind_worlds):
+    def without_seeds(value):
+        if isinstance(value, dict):
+            return {key: without_seeds(item) for key, item in value.items() if not key.startswith("seed")}
+        return [without_seeds(item) for item in value] if isinstance(value, list) else value
+
+    known = {case.world: case.experiment for case in open_worlds.cases}
+    for case in blind_worlds.cases:
+        mine, its = (
+            without_seeds(item.model_dump(mode="json", include={"instrument", "sky", "corruption", "power"}))
+            for item in (case.experiment, known[case.world])
+        )
+        assert mine == its
+
+
+def test_data_with_the_eor_and_without_have_noise_of_their_own(blind_worlds, open_worlds):
+    def noise(worlds):
+        experiment = worlds.cases[0].experiment
+        graph = Graph(experiment)
+        variants = [experiment.variants[name] for name in ("residual", "residual_without_eor")]
+        return [data(graph, variant, parity).settings["noise_seed"] for variant in variants for parity in PARITIES]
+
+    assert len(set(noise(blind_worlds))) == 4
+    assert noise(open_worlds) == [103, 104, 103, 104]
+
+
+def test_digests_of_a_blind_challenge_do_not_tell_what_was_digested(blind_worlds):
+    salt = blind_worlds.file.salt
+    assert len(salt) == BITS // 4
+    for case in blind_worlds.cases:
+        plain, hidden = Contents.of(case.experiment), Contents.of(case.experiment, salt)
+        assert hidden.digest == salted(plain.digest, salt) != plain.digest
+        assert {task.key for task in plain.data} == {task.key for task in hidden.data}
+        order = [salted(task.key, salt) for task in hidden.data]
+        assert order == sorted(order)
+
+
+def test_gains_come_back_by_the_salted_digests(blind_worlds, recipe, tmp_path):
+    [case, *_] = blind_worlds.cases
+    contents = Contents.of(case.experiment, blind_worlds.file.salt)
+    keys = [task.key for task in contents.data]
+    hidden = [salted(key, contents.salt) for key in keys]
+    sets = tuple(
+        DataSet(name=f"data-{place}", file=f"data-{place}.uvh5", digest=digest) for place, digest in enumerate(hidden)
+    )
+    sky = contents.sky_model.key
+    manifest = Manifest(calstudy="0", digest=contents.digest, data=sets, sky_model_digest=salted(sky, contents.salt))
+    (tmp_path / MANIFEST).write_text(manifest.model_dump_json())
+    text = json.dumps(json.loads(manifest.model_dump_json()))
+    assert not any(key in text for key in (*keys, sky))
+    for place in range(4):
+        (tmp_path / f"data-{place}.calh5").touch()
+    worlds = load_worlds(recipe, None, (), {"mine": {"calibrator": "by-file", "folder": str(tmp_path)}})
+    calibrator = worlds.cases[0].experiment.calibration
+    assert [calibrator.for_data(key, sky).gains.name for key in keys] == [f"data-{place}.calh5" for place in range(4)]
+    with pytest.raises(InputError, match="has other digests"):
+        find_returned(tmp_path, keys[0], sky)
+
+
+def test_a_recipe_is_not_replaced(open_worlds, recipe):
+    with pytest.raises(InputError, match="is there already"):
+        write_recipe(open_worlds, recipe)
