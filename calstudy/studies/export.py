@@ -125,7 +125,7 @@ class Contents:
     @property
     def digest(self) -> str:
         """Of all data sets and the sky model."""
-        whole = digest_json([*(task.key for task in self.data), self.sky_model and self.sky_model.key])
+        whole = digest_json([*sorted(task.key for task in self.data), self.sky_model and self.sky_model.key])
         return salted(whole, self.salt)
 
     @property
