@@ -33,6 +33,7 @@ include_patterns = [
     "benchmarks/README.md",
     "figures/*.md",
     "figures/*/*.md",
+    "experiments/validation/README.md",
     "data/README.md",
     "README.md",
     "CHANGELOG.md",
