@@ -134,14 +134,16 @@ def evaluate_run_times(job: Job) -> Mapping[str, Any]:
 
 
 def _write(job: Job, found: Evaluation) -> dict[str, Any]:
-    from calstudy.verdicts.tables import tally, write_claims
+    from calstudy.verdicts.sentences import tally_of_sentences
+    from calstudy.verdicts.tables import write_claims
 
     write_claims(found.verdicts, job.output, job.settings["title"], job.settings.get("notes", ()), found.without_role)
-    failed = [claim.name for claim in found.verdicts if claim.verdict == "FAIL"]
-    return {"verdicts": tally(found.verdicts), "failed": failed, "without_role": list(found.without_role)}
+    contradicted = [claim.name for claim in found.verdicts if claim.verdict == "contradicted"]
+    tally = tally_of_sentences(found.verdicts)
+    return {"verdicts": tally, "contradicted": contradicted, "without_role": list(found.without_role)}
 
 
-EVALUATE = Stage(name="claims", version=11, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
+EVALUATE = Stage(name="claims", version=12, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
 EVALUATE_RUN_TIMES = Stage(
-    name="runtime-claims", version=3, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
+    name="runtime-claims", version=4, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
 )

@@ -7,7 +7,7 @@ import numpy as np
 from calstudy.claims.run_times import RunTimes
 from calstudy.products.run_times import PowerLaw, fit_power_law
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
-from calstudy.verdicts.statement import Source
+from calstudy.verdicts.statement import Sentence, Source
 
 COMPUTATION = Source("Computational Runtime", ("run_time",))
 QUARTER = 0.25
@@ -25,7 +25,9 @@ def _exponent(law: PowerLaw) -> Finding:
     return Finding(law.exponent, law.error)
 
 
-QUADRATIC_SENTENCE = "the computational time for a gradient update follows quadratic scaling with N_ant"
+QUADRATIC_SENTENCE = Sentence(
+    "quadratic-in-antennas", "the computational time for a gradient update follows quadratic scaling with N_ant"
+)
 
 
 @COMPUTATION.states(
@@ -45,7 +47,10 @@ def own_step_quadratic_in_antennas(run: RunTimes) -> Finding:
     return _exponent(run.scaling("rows", "adamax-step"))
 
 
-LINEAR_SENTENCE = "the linear scaling of the gradient update computations with maximum baseline length ∝ N_vec^max"
+LINEAR_SENTENCE = Sentence(
+    "linear-in-longest-baseline",
+    "the linear scaling of the gradient update computations with maximum baseline length ∝ N_vec^max",
+)
 
 
 @COMPUTATION.states(
@@ -78,7 +83,7 @@ def sum_dominates_step(run: RunTimes) -> Finding:
     return Finding(float(run.medians("rows", "paper-sum")[-1] / run.medians("rows", "paper-step")[-1]), 0.0)
 
 
-MEMORY_SENTENCE = "memory use is dominated by the N_vec N_freq N_bl element A matrix"
+MEMORY_SENTENCE = Sentence("memory", "memory use is dominated by the N_vec N_freq N_bl element A matrix")
 
 
 @COMPUTATION.states(
@@ -101,7 +106,10 @@ def memory_grows_like_basis(run: RunTimes) -> Finding:
     return _exponent(fit_power_law(run.column("rows", "basis_bytes"), run.column("rows", "paper_memory")))
 
 
-THOUSANDS_SENTENCE = "given a learning rate of 0.01, CALAMITY requires thousands of gradient descent steps to converge"
+THOUSANDS_SENTENCE = Sentence(
+    "thousands-of-steps",
+    "given a learning rate of 0.01, CALAMITY requires thousands of gradient descent steps to converge",
+)
 THOUSANDS, THOUSANDS_WHY = Within(1e3, 1e4), "thousands, not hundreds or tens of thousands"
 
 
@@ -109,14 +117,14 @@ THOUSANDS, THOUSANDS_WHY = Within(1e3, 1e4), "thousands, not hundreds or tens of
     THOUSANDS_SENTENCE, "steps until the loss is within 5 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
 )
 def thousands_of_steps_to_five_percent(run: RunTimes) -> Finding:
-    return Finding(run.steps_to("0.05"), 0.0)
+    return run.steps_to("0.05")
 
 
 @COMPUTATION.states(
     THOUSANDS_SENTENCE, "steps until the loss is within 1 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
 )
 def thousands_of_steps_to_one_percent(run: RunTimes) -> Finding:
-    return Finding(run.steps_to("0.01"), 0.0)
+    return run.steps_to("0.01")
 
 
 @COMPUTATION.states(
@@ -151,7 +159,10 @@ def gpu_step_constant_in_longest_baseline(run: RunTimes) -> Finding:
     return _exponent(run.scaling("line", "paper-step", device="gpu"))
 
 
-MINUTES_SENTENCE = "solutions for arrays with hundreds of antennas within minutes on a single computer node with a GPU"
+MINUTES_SENTENCE = Sentence(
+    "within-minutes",
+    "solutions for arrays with hundreds of antennas within minutes on a single computer node with a GPU",
+)
 
 
 @COMPUTATION.states(
@@ -162,7 +173,8 @@ MINUTES_SENTENCE = "solutions for arrays with hundreds of antennas within minute
 )
 def paper_solve_in_minutes(run: RunTimes) -> Finding:
     law = run.scaling("rows", "paper-step", device="gpu")
-    return Finding(run.steps_to("0.01") * float(law.at(HUNDREDS)), 0.0)
+    steps = run.steps_to("0.01")
+    return steps._replace(value=steps.value * float(law.at(HUNDREDS)))
 
 
 @COMPUTATION.states(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calstudy.claims.bins import (
@@ -17,10 +19,12 @@ from calstudy.claims.bins import (
 )
 from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
+from calstudy.papers.calamity2022.window import UNBIASED
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
-from calstudy.verdicts.statement import Source, Unevaluated
+from calstudy.verdicts.statement import Sentence, Source, Unevaluated
 
 REDUNDANT = Source("Performance on a Redundant Array", ("minimally_redundant", "redundant"))
+SIMULATED = replace(REDUNDANT, tests_simulation=True)
 K_MIN = 0.2
 K_LOSS = 0.3
 """Up to this wavenumber the paper sees more loss for the redundant array, h/Mpc."""
@@ -34,10 +38,12 @@ def _lower(name: str, first: RunResults, second: RunResults) -> Finding:
     return ratio(*(rms_power(spectrum, used) for spectrum in spectra))
 
 
-SUPPRESSED = "our redundant array suppresses calibration errors by one-to-two orders of magnitude"
+SUPPRESSED = Sentence(
+    "errors-suppressed", "our redundant array suppresses calibration errors by one-to-two orders of magnitude"
+)
 
 
-@REDUNDANT.states(
+@SIMULATED.states(
     SUPPRESSED,
     "median P^V of the minimally redundant array over that of the redundant one, outside the wedge, k >= 0.2; "
     "uncalibrated",
@@ -64,7 +70,7 @@ def calibrated_systematics_suppressed(minimal: RunResults, redundant: RunResults
     return _lower("residual_without_eor", minimal, redundant)
 
 
-@REDUNDANT.states(
+@SIMULATED.states(
     "the noise-only power spectrum is also significantly reduced",
     "rms P^N of the minimally redundant array over that of the redundant one, outside the wedge, k >= 0.2",
     AtLeast(1, 2),
@@ -88,8 +94,7 @@ def redundant_signal_recovered(redundant: RunResults) -> Finding:
 
 
 @REDUNDANT.states(
-    "in both scenarios, it recovers relatively unbiased estimates of the power spectrum within the EoR window "
-    "(Conclusion)",
+    UNBIASED,
     "mean P^R/P^S of the redundant array outside the wedge at k >= 0.3; error of the difference, the EoR being common",
     Equal(1),
     "no bias beyond the errors",
@@ -125,7 +130,7 @@ def _used_bins(runs: tuple[RecoveredPower, RecoveredPower], k_min: float, k_max:
     return used
 
 
-HIGHER_LOSS = "albeit with higher signal loss (compare the regions below ≲ 0.3 h/Mpc)"
+HIGHER_LOSS = Sentence("higher-loss", "albeit with higher signal loss (compare the regions below ≲ 0.3 h/Mpc)")
 MOST = "in most of the region"
 
 
@@ -140,7 +145,7 @@ def less_power_below_0p3(minimal: RunResults, redundant: RunResults) -> Finding:
     runs = _recovered_powers(minimal, redundant)
     used = _used_bins(runs, 0.0, K_LOSS)
     differences = [difference_of_ratios(*runs, np.arange(used.size) == place) for place in np.flatnonzero(used)]
-    return _part_above(*np.transpose(differences))
+    return _part_above(*np.transpose([(item.value, item.uncertainty) for item in differences]))
 
 
 @REDUNDANT.states(
@@ -166,8 +171,9 @@ def _part_above(difference: np.ndarray, error: np.ndarray) -> Finding:
     return Finding(part, float(np.sqrt(part * (1 - part) / difference.size)))
 
 
-ALL_SCALES = (
-    "fewer independent realizations are averaged down in each gain solution, which increases signal loss on all scales"
+ALL_SCALES = Sentence(
+    "loss-on-all-scales",
+    "fewer independent realizations are averaged down in each gain solution, which increases signal loss on all scales",
 )
 
 
@@ -216,7 +222,7 @@ def bias_reaches_larger_k(minimal: RunResults, redundant: RunResults) -> Finding
     return Finding(found[1].value - found[0].value, float(np.hypot(found[0].uncertainty, found[1].uncertainty)))
 
 
-SAME = "we get roughly the same residual when calibrating with redundant modeling"
+SAME = Sentence("same-residual", "we get roughly the same residual when calibrating with redundant modeling")
 
 
 @REDUNDANT.states(
@@ -228,7 +234,8 @@ SAME = "we get roughly the same residual when calibrating with redundant modelin
 )
 def redundant_modelling_same_visibilities(redundant: RunResults, modelling: RunResults) -> Finding:
     per_baseline, per_group = (run.measured("residual_over_noise_outside") for run in (redundant, modelling))
-    return ratio(Finding(per_group.value, per_group.scatter), Finding(per_baseline.value, per_baseline.scatter))
+    found = ratio(Finding(per_group.value, per_group.scatter), Finding(per_baseline.value, per_baseline.scatter))
+    return found._replace(kind="scatter")
 
 
 @REDUNDANT.states(
