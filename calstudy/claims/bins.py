@@ -143,8 +143,9 @@ def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
     """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error.
 
     That is the upper edge of the last such bin before two in succession are not. The lowest bin may be one that is not,
-    if the next is: few modes are in it. Without any bias it is the lower edge of the first bin. The uncertainty is half
-    a bin, or what a deviation by 3 sigma instead of 95 % makes of it if that is more.
+    if the next is: few modes are in it. Without any bias it is the lower edge of the first bin. The uncertainty is the
+    standard deviation of a number that is anywhere within half a bin, or what a deviation by 3 sigma instead of 95 %
+    makes of it if that is more.
     """
     used = np.flatnonzero(used_bins(residual, eor))
     pull = ((eor.power.real - residual.power.real) / residual.difference_error)[used]
@@ -153,7 +154,7 @@ def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
         edges[used[0]] if last is None else edges[used[last] + 1]
         for last in map(_last_biased, (pull > SIGMAS_95, pull > 3))
     ]
-    return Finding(float(ends[0]), max(float(np.diff(edges)[0] / 2), float(abs(ends[0] - ends[1]))))
+    return Finding(float(ends[0]), max(float(np.diff(edges)[0] / np.sqrt(12)), float(abs(ends[0] - ends[1]))))
 
 
 def _last_biased(biased: np.ndarray) -> int | None:

@@ -33,7 +33,7 @@ class World:
 
     recovered: float = 1.0
     recovered_small_k: float = 1.0
-    biased_below: float = 0.28
+    biased_below: float = 0.24
     outside_biased_below: float = 0.0
     noise: float = 0.03
     without_eor_bias: float = 0.0
