@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from calstudy.claims.results import RunResults
 
 SIGMAS_95 = 1.96
+TINY = 1e-9
+"""h/Mpc: a bin belongs to one range, whatever the last digit of its centre."""
 
 
 def used_bins(*spectra: SphericalSpectrum, k_min: float = 0.0, k_max: float = np.inf) -> np.ndarray:
@@ -137,6 +139,27 @@ def difference_of_ratios(first: RecoveredPower, second: RecoveredPower, used: np
     weights /= weights.sum()
     error = np.sqrt(np.sum(weights**2 * sum(variances)) + sum(np.sum(weights * part) ** 2 for part in common))
     return Finding(float(np.sum(weights * (ratios[0] - ratios[1]))), float(error))
+
+
+def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
+    """Return the mean of known values with inverse variances as weights; the errors are taken as common to all.
+
+    Bins of k share the gains, and what the gains absorb by chance does not average down over bins.
+    """
+    known = np.isfinite(values) & np.isfinite(errors)
+    if not known.any():
+        raise Unevaluated("no bins with a transfer function")
+    weights = errors[known] ** -2.0 / np.sum(errors[known] ** -2.0)
+    return Finding(float(np.sum(weights * values[known])), float(np.sum(weights * errors[known])))
+
+
+def difference_of_losses(first: RunResults, second: RunResults, k_min: float, k_max: float = np.inf) -> Finding:
+    """Return T free of the flux scale of one run minus that of another, over bins from `k_min` to `k_max` in h/Mpc."""
+    one, other = (run.transfer("outside-wedge") for run in (first, second))
+    used = (one.k >= k_min - TINY) & (one.k <= k_max)
+    difference = one.scale_free_transfer - other.scale_free_transfer
+    error = np.hypot(one.scale_free_transfer_error, other.scale_free_transfer_error)
+    return mean_of_common_errors(difference[used], error[used])
 
 
 def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:

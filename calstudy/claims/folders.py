@@ -19,6 +19,7 @@ from calstudy.claims.evaluation import (
     members_by_role,
 )
 from calstudy.claims.paper import Paper
+from calstudy.claims.realizations import PooledResults
 from calstudy.claims.results import RunResults
 from calstudy.claims.run_times import RunTimes
 from calstudy.experiment.files import validate
@@ -84,7 +85,7 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = ()) -> EvaluatedRun:
 
 def _played(
     folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]
-) -> tuple[list[Paper], dict[str, RunResults]]:
+) -> tuple[list[Paper], dict[str, RunResults | PooledResults]]:
     """Return the papers of a collection, and its members by the role that they play."""
     members = {name: _results(folder.resolve().parent / place) for name, place in manifest["members"].items()}
     own = {paper.reference: paper for run in members.values() for paper in run.experiment.papers}
@@ -126,8 +127,9 @@ def _tables(folder: Path) -> Path:
     return folder / "tables"
 
 
-def _results(folder: Path) -> RunResults:
+def _results(folder: Path) -> RunResults | PooledResults:
     experiment = validate(read_mapping(folder / EXPERIMENT), folder)
     if experiment.realizations:
-        raise InputError(f"{folder}: pools realizations, and claims are about single runs; give the folder of one")
+        figures = folder / "figures"
+        return PooledResults.of(experiment, figures if figures.is_dir() else folder)
     return RunResults(experiment, (_tables(folder),))

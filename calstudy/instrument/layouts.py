@@ -111,6 +111,11 @@ class RedundantGroups:
     index: np.ndarray
     conjugated: np.ndarray
 
+    @property
+    def redundant_fraction(self) -> float:
+        """Part of the baselines that have a redundant partner."""
+        return float(np.mean(np.bincount(self.index)[self.index] > 1))
+
 
 def make_layout(settings: section.Layout) -> Layout:
     """Return the antennas of the `instrument.layout` section.

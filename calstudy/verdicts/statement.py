@@ -45,12 +45,15 @@ class Statement(Criterion):
         Measures the number on the runs that play `roles`, in their order.
     sentence_id, tests_simulation
         As in `Verdict`.
+    pooled
+        Measures the number on runs that pool realizations, or None if it is one of single runs alone.
     """
 
     roles: tuple[str, ...]
     measure: Callable[..., Finding]
     sentence_id: str
     tests_simulation: bool = False
+    pooled: Callable[..., Finding] | None = None
 
     def outcome(self, finding: Finding) -> Outcome:
         """Return "supported", "contradicted" or "undecided" for a finite number."""
@@ -125,6 +128,7 @@ class Source:
         threshold: Threshold,
         why: str,
         roles: tuple[str, ...] | None = None,
+        pooled: Callable[..., Finding] | None = None,
     ) -> Callable[[Callable[..., Finding]], Statement]:
         """Return a decorator that makes a statement of the function that measures it, named after the function.
 
@@ -140,12 +144,14 @@ class Source:
             Why this threshold.
         roles
             Of the runs that the function takes; by default those of the source.
+        pooled
+            As in `Statement`.
         """
 
         def make(measure: Callable[..., Finding]) -> Statement:
             name = measure.__name__.replace("_", "-")
             known = sentence if isinstance(sentence, Sentence) else Sentence(name, sentence)
             stated = (name, self.section, known.text, quantity, threshold, why)
-            return Statement(*stated, roles or self.roles, measure, known.id, self.tests_simulation)
+            return Statement(*stated, roles or self.roles, measure, known.id, self.tests_simulation, pooled)
 
         return make

@@ -17,8 +17,24 @@ HUNDREDS = 300
 """Antennas that stand for hundreds, as the text has it."""
 MINUTES = AtMost(600)
 MINUTES_WHY = "ten minutes are still minutes"
+THOUSANDS_OF_ANTENNAS = 3000
+HOURS = AtMost(86_400)
+HOURS_WHY = "less than a day"
 AROUND_HUNDRED = 100
 HALF_ORDER = 10**0.5
+
+
+def _paper_solve(run: RunTimes, antennas: int) -> Finding:
+    """Return the seconds that the paper's solver takes on the GPU for so many antennas; a bound if its steps are."""
+    law, steps = run.scaling("rows", "paper-step", device="gpu"), run.steps_to("0.01")
+    return steps._replace(value=steps.value * float(law.at(antennas)))
+
+
+def _default_solve(run: RunTimes, antennas: int) -> Finding:
+    """Return the seconds of the default solver for so many antennas, with the error of the exponent."""
+    law = run.scaling("rows", "default-solve")
+    seconds = float(law.at(antennas))
+    return Finding(seconds, seconds * law.error * float(np.log(antennas / run.column("rows", "antennas").mean())))
 
 
 def _exponent(law: PowerLaw) -> Finding:
@@ -172,9 +188,7 @@ MINUTES_SENTENCE = Sentence(
     MINUTES_WHY,
 )
 def paper_solve_in_minutes(run: RunTimes) -> Finding:
-    law = run.scaling("rows", "paper-step", device="gpu")
-    steps = run.steps_to("0.01")
-    return steps._replace(value=steps.value * float(law.at(HUNDREDS)))
+    return _paper_solve(run, HUNDREDS)
 
 
 @COMPUTATION.states(
@@ -184,6 +198,57 @@ def paper_solve_in_minutes(run: RunTimes) -> Finding:
     MINUTES_WHY,
 )
 def default_solve_in_minutes(run: RunTimes) -> Finding:
-    law = run.scaling("rows", "default-solve")
-    seconds = float(law.at(HUNDREDS))
-    return Finding(seconds, seconds * law.error * float(np.log(HUNDREDS / run.column("rows", "antennas").mean())))
+    return _default_solve(run, HUNDREDS)
+
+
+HOURS_SENTENCE = Sentence("within-hours", "and for thousands of element arrays on timescales of hours")
+
+
+@COMPUTATION.states(
+    HOURS_SENTENCE,
+    f"paper's steps on the GPU to 1 % above the minimum, extrapolated to {THOUSANDS_OF_ANTENNAS} antennas, s",
+    HOURS,
+    HOURS_WHY,
+)
+def paper_solve_of_thousands_in_hours(run: RunTimes) -> Finding:
+    return _paper_solve(run, THOUSANDS_OF_ANTENNAS)
+
+
+@COMPUTATION.states(
+    HOURS_SENTENCE,
+    f"the default solver's whole solve on one core without a GPU, extrapolated to {THOUSANDS_OF_ANTENNAS} antennas, s",
+    HOURS,
+    HOURS_WHY,
+)
+def default_solve_of_thousands_in_hours(run: RunTimes) -> Finding:
+    return _default_solve(run, THOUSANDS_OF_ANTENNAS)
+
+
+CRITICAL_SENTENCE = Sentence(
+    "gpu-critical",
+    "GPU acceleration is critical for our technique for an interferometer with ≳ 10 antennas in a reasonable amount of "
+    "time (Abstract)",
+)
+CRITICAL_WHY = "without it ten minutes at least, which would still be minutes"
+
+
+@COMPUTATION.states(
+    CRITICAL_SENTENCE,
+    "paper's steps on one core to 1 % above the minimum, the array that is closest to that whose steps were counted, s",
+    AtLeast(MINUTES.bound),
+    CRITICAL_WHY,
+)
+def gpu_critical_for_paper_solver(run: RunTimes) -> Finding:
+    closest = int(np.argmin(np.abs(run.column("rows", "antennas") - run.table["descent"]["antennas"])))
+    steps = run.steps_to("0.01")
+    return steps._replace(value=steps.value * float(run.medians("rows", "paper-step")[closest]))
+
+
+@COMPUTATION.states(
+    CRITICAL_SENTENCE,
+    "the default solver's whole solve on one core without a GPU, largest array, s",
+    AtLeast(MINUTES.bound),
+    CRITICAL_WHY,
+)
+def gpu_critical_for_default_solver(run: RunTimes) -> Finding:
+    return Finding(float(run.medians("rows", "default-solve")[-1]), 0.0)

@@ -8,8 +8,10 @@ import numpy as np
 
 from calstudy.claims.bins import (
     SIGMAS_95,
+    TINY,
     RecoveredPower,
     bias_extent,
+    difference_of_losses,
     difference_of_ratios,
     fraction_within,
     ratio,
@@ -17,6 +19,7 @@ from calstudy.claims.bins import (
     rms_power,
     used_bins,
 )
+from calstudy.claims.realizations import over_realizations
 from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
 from calstudy.papers.calamity2022.window import UNBIASED
@@ -28,7 +31,7 @@ SIMULATED = replace(REDUNDANT, tests_simulation=True)
 K_MIN = 0.2
 K_LOSS = 0.3
 """Up to this wavenumber the paper sees more loss for the redundant array, h/Mpc."""
-TINY = 1e-9
+NO_EFFECT = 0.05
 
 
 def _lower(name: str, first: RunResults, second: RunResults) -> Finding:
@@ -99,6 +102,7 @@ def redundant_signal_recovered(redundant: RunResults) -> Finding:
     Equal(1),
     "no bias beyond the errors",
     roles=("redundant",),
+    pooled=over_realizations("ratio", "outside-wedge", K_LOSS),
 )
 def redundant_residual_unbiased(redundant: RunResults) -> Finding:
     return recovered(
@@ -119,7 +123,6 @@ def _recovered_powers(minimal: RunResults, redundant: RunResults) -> tuple[Recov
 
 
 def _used_bins(runs: tuple[RecoveredPower, RecoveredPower], k_min: float, k_max: float) -> np.ndarray:
-    # A bin belongs to one range, whatever the last digit of its centre.
     used = used_bins(
         *(spectrum for run in runs for spectrum in (run.residual, run.eor)), k_min=k_min, k_max=k_max - TINY
     )
@@ -196,16 +199,7 @@ def more_loss_on_all_scales(minimal: RunResults, redundant: RunResults) -> Findi
     "higher beyond the errors",
 )
 def more_loss_on_all_scales_without_flux_scale(minimal: RunResults, redundant: RunResults) -> Finding:
-    first, second = (run.transfer("outside-wedge") for run in (minimal, redundant))
-    used = first.k >= K_LOSS - TINY
-    used &= np.isfinite(first.scale_free_transfer_error) & np.isfinite(second.scale_free_transfer_error)
-    if not used.any():
-        raise Unevaluated(f"no bins at k >= {K_LOSS:g} h/Mpc with a transfer function")
-    variance = first.scale_free_transfer_error[used] ** 2 + second.scale_free_transfer_error[used] ** 2
-    weights = 1 / variance / np.sum(1 / variance)
-    difference = (first.scale_free_transfer - second.scale_free_transfer)[used]
-    # All bins share the gains: their errors are taken as common.
-    return Finding(float(np.sum(weights * difference)), float(np.sum(weights * np.sqrt(variance))))
+    return difference_of_losses(minimal, redundant, K_LOSS)
 
 
 @REDUNDANT.states(
@@ -247,3 +241,15 @@ def redundant_modelling_same_visibilities(redundant: RunResults, modelling: RunR
 )
 def redundant_modelling_same_power(redundant: RunResults, modelling: RunResults) -> Finding:
     return _lower("residual", modelling, redundant)
+
+
+@REDUNDANT.states(
+    "when we use multiple foreground coefficients within a truly redundant group, we are simply adding repeated copies "
+    "of the same set of parameters which has no effect on our final answer",
+    "T free of the flux scale with one model per group minus that with one per baseline, outside the wedge, k < 0.3",
+    Within(-NO_EFFECT, NO_EFFECT),
+    "no effect, to a twentieth of the EoR",
+    roles=("redundant", "redundant_modelling"),
+)
+def redundant_modelling_loses_the_same(redundant: RunResults, modelling: RunResults) -> Finding:
+    return difference_of_losses(modelling, redundant, 0.0, K_LOSS - TINY)

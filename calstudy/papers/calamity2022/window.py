@@ -13,6 +13,7 @@ from calstudy.claims.bins import (
     rms_power,
     used_bins,
 )
+from calstudy.claims.realizations import over_realizations
 from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS, SIMULATED
 from calstudy.power.delay import horizon_delay
@@ -156,7 +157,13 @@ def residual_agrees_outside_wedge(run: RunResults) -> Finding:
     return fraction_within((residual.power - signal.power).real[used], residual.error[used])
 
 
-@RESULTS.states(BROAD, "mean P^R/P^S outside the wedge at k >= 0.2", Within(0.5, 2), FACTOR_OF_TWO)
+@RESULTS.states(
+    BROAD,
+    "mean P^R/P^S outside the wedge at k >= 0.2",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+    pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
+)
 def residual_level_outside_wedge(run: RunResults) -> Finding:
     return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
 
@@ -166,6 +173,7 @@ def residual_level_outside_wedge(run: RunResults) -> Finding:
     "mean P^R/P^S outside the wedge at k >= 0.2; error of the difference, the EoR being common",
     Equal(1),
     "no bias beyond the errors",
+    pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
 def residual_unbiased_outside_wedge(run: RunResults) -> Finding:
     return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
@@ -175,7 +183,13 @@ BIAS = "when we include modes inside of the wedge, we encounter negative bias ou
 BIAS_CAPTION = Sentence("biased-below-0p25", "our calibrated residual is biased below k ≲ 0.25 h/Mpc")
 
 
-@RESULTS.states(BIAS_CAPTION, "mean P^R/P^S of all modes at k <= 0.25", AtMost(1, 2), "a bias beyond the errors")
+@RESULTS.states(
+    BIAS_CAPTION,
+    "mean P^R/P^S of all modes at k <= 0.25",
+    AtMost(1, 2),
+    "a bias beyond the errors",
+    pooled=over_realizations("ratio", "all-modes", 0.0, K_BIAS),
+)
 def residual_biased_with_wedge(run: RunResults) -> Finding:
     return recovered(run.spherical("residual", "all-modes"), run.spherical("eor", "all-modes"), 0.0, K_BIAS)
 
@@ -296,6 +310,7 @@ def _positive_bias(run: RunResults) -> Finding:
     "mean P^R without EoR at k <= 0.5 outside the wedge, in units of P^S; the run's own solver",
     AtLeast(0, 2),
     "positive beyond the errors",
+    pooled=over_realizations("bias", "outside-wedge", 0.0, K_SMALL),
 )
 def positive_bias_at_small_k(run: RunResults) -> Finding:
     return _positive_bias(run)
