@@ -84,9 +84,11 @@ def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults | Po
     papers
         Whose statements.
     runs
-        By the role that they play; statements whose roles nobody plays come back as not evaluated, with the reason.
+        By the role that they play; statements whose roles nobody plays come back as not evaluated, with the reason. If
+        all runs pool realizations, statements on single runs are left out.
     """
-    return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs))])
+    pooled = bool(runs) and all(isinstance(run, PooledResults) for run in runs.values())
+    return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs), pooled)])
 
 
 def evaluate_by_solver(

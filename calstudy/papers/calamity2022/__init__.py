@@ -14,6 +14,7 @@ from calstudy.instrument.as_built import AsBuilt
 from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
 
 if TYPE_CHECKING:
+    from calstudy.claims.realizations import PooledResults
     from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
     from calstudy.verdicts.statement import Statement
@@ -105,7 +106,7 @@ class Calamity2022(Paper):
         found = next((refusal for check in checks if (refusal := check(study, experiment)) is not None), None)
         return _other_solver(experiment) if found is None and role != study else found
 
-    def refusal_of_run(self, role: str, results: RunResults) -> str | None:
+    def refusal_of_run(self, role: str, results: RunResults | PooledResults) -> str | None:
         """Return which setting of a run, or which property of its array, is not that of the role, or None."""
         refusal, study = self.refusal(role, results.experiment), _study(role)
         if refusal is not None or study == "low_snr":

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from calstudy.base.constants import SPEED_OF_LIGHT
-from calstudy.calibrate.basis import delay_half_widths, dpss_vectors
-from calstudy.calibrate.settings import BasisSettings
+from calstudy.calibrate.basis import delay_half_widths, make_basis
+from calstudy.calibrate.settings import ForegroundFit
 from calstudy.claims.bins import mean_of_common_errors
 from calstudy.claims.realizations import PooledResults
 from calstudy.claims.results import RunResults
@@ -32,17 +32,16 @@ VECTORS = Sentence(
 
 def _vectors_over_bandwidth(run: RunResults, buffered: bool) -> Finding:
     """Return the number of vectors over 2 N Δν τ, median and scatter over baselines."""
-    experiment = run.experiment
-    basis: BasisSettings = experiment.calibration.basis
-    channels, lengths = experiment.instrument.channels, pdist(make_array(experiment.instrument).enu)
-    reach = delay_half_widths(lengths, basis)
-    bandwidth = channels.count * channels.width
-    known = {
-        delay: dpss_vectors(channels.count, bandwidth * delay, basis.eigenvalue_cutoff).shape[1]
-        for delay in set(reach.tolist())
-    }
-    vectors = np.array([known[delay] for delay in reach.tolist()])
-    found = vectors / (2 * bandwidth * (reach if buffered else lengths / SPEED_OF_LIGHT))
+    instrument, calibration = run.experiment.instrument, run.experiment.calibration
+    if not isinstance(calibration, ForegroundFit):
+        raise Unevaluated(f"{calibration.label} fits no foregrounds")
+    channels, lengths = instrument.channels, pdist(make_array(instrument).enu)
+    frequencies = channels.first + channels.width * np.arange(channels.count)
+    vectors = np.empty(lengths.size)
+    for bucket in make_basis(lengths, frequencies, calibration.basis).buckets:
+        vectors[bucket.members] = bucket.vectors.shape[1]
+    delay = delay_half_widths(lengths, calibration.basis) if buffered else lengths / SPEED_OF_LIGHT
+    found = vectors / (2 * channels.count * channels.width * delay)
     low, middle, high = np.quantile(found, [0.16, 0.5, 0.84])
     return Finding(float(middle), float(high - low) / 2, "scatter")
 
