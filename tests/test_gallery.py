@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from functools import cache
@@ -12,13 +11,14 @@ import pytest
 
 from calstudy.studies.collection import Collection
 from calstudy.studies.load import load_study
+from calstudy.verdicts.sentences import OUTCOMES, outcomes_of_sentences
+from calstudy.verdicts.tables import from_json
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = sorted(path.name for path in (ROOT / "figures").iterdir() if path.is_dir())
 SECTIONS = dict(
     re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", (ROOT / "docs/gallery.md").read_text(), re.DOTALL | re.MULTILINE)
 )
-VERDICTS = ("PASS", "FAIL", "not evaluated")
 
 folders = pytest.mark.parametrize("folder", FOLDERS)
 
@@ -45,11 +45,11 @@ def test_the_figure_is_of_the_folder(folder):
 @folders
 def test_the_verdicts_are_those_of_the_claims(folder):
     path = ROOT / "figures" / folder / "claims.json"
-    counts = Counter(claim["verdict"] for claim in json.loads(path.read_text())) if path.exists() else Counter()
-    told = {
-        verdict: int(count) for count, verdict in re.findall(r"(\d+)\s+(PASS|FAIL|not\s+evaluated)", SECTIONS[folder])
-    }
-    assert told == {verdict: counts[verdict] for verdict in VERDICTS if counts[verdict]}
+    claims = from_json(path.read_text()) if path.exists() else []
+    counts = Counter(outcomes_of_sentences(claims).values())
+    text = " ".join(SECTIONS[folder].split())
+    told = {verdict: int(count) for count, verdict in re.findall(rf"(\d+) ({'|'.join(OUTCOMES)})", text)}
+    assert told == {verdict: counts[verdict] for verdict in OUTCOMES if counts[verdict]}
 
 
 @folders

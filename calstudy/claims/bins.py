@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from calstudy.claims.results import RunResults
 
 SIGMAS_95 = 1.96
+TINY = 1e-9
+"""h/Mpc: a bin belongs to one range, whatever the last digit of its centre."""
 
 
 def used_bins(*spectra: SphericalSpectrum, k_min: float = 0.0, k_max: float = np.inf) -> np.ndarray:
@@ -139,12 +141,34 @@ def difference_of_ratios(first: RecoveredPower, second: RecoveredPower, used: np
     return Finding(float(np.sum(weights * (ratios[0] - ratios[1]))), float(error))
 
 
+def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
+    """Return the mean of known values with inverse variances as weights; the errors are taken as common to all.
+
+    Bins of k share the gains, and what the gains absorb by chance does not average down over bins.
+    """
+    known = np.isfinite(values) & np.isfinite(errors)
+    if not known.any():
+        raise Unevaluated("no bins with a transfer function")
+    weights = errors[known] ** -2.0 / np.sum(errors[known] ** -2.0)
+    return Finding(float(np.sum(weights * values[known])), float(np.sum(weights * errors[known])))
+
+
+def difference_of_losses(first: RunResults, second: RunResults, k_min: float, k_max: float = np.inf) -> Finding:
+    """Return T free of the flux scale of one run minus that of another, over bins from `k_min` to `k_max` in h/Mpc."""
+    one, other = (run.transfer("outside-wedge") for run in (first, second))
+    used = (one.k >= k_min - TINY) & (one.k <= k_max)
+    difference = one.scale_free_transfer - other.scale_free_transfer
+    error = np.hypot(one.scale_free_transfer_error, other.scale_free_transfer_error)
+    return mean_of_common_errors(difference[used], error[used])
+
+
 def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
     """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error.
 
     That is the upper edge of the last such bin before two in succession are not. The lowest bin may be one that is not,
-    if the next is: few modes are in it. Without any bias it is the lower edge of the first bin. The uncertainty is half
-    a bin, or what a deviation by 3 sigma instead of 95 % makes of it if that is more.
+    if the next is: few modes are in it. Without any bias it is the lower edge of the first bin. The uncertainty is the
+    standard deviation of a number that is anywhere within half a bin, or what a deviation by 3 sigma instead of 95 %
+    makes of it if that is more.
     """
     used = np.flatnonzero(used_bins(residual, eor))
     pull = ((eor.power.real - residual.power.real) / residual.difference_error)[used]
@@ -153,7 +177,7 @@ def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
         edges[used[0]] if last is None else edges[used[last] + 1]
         for last in map(_last_biased, (pull > SIGMAS_95, pull > 3))
     ]
-    return Finding(float(ends[0]), max(float(np.diff(edges)[0] / 2), float(abs(ends[0] - ends[1]))))
+    return Finding(float(ends[0]), max(float(np.diff(edges)[0] / np.sqrt(12)), float(abs(ends[0] - ends[1]))))
 
 
 def _last_biased(biased: np.ndarray) -> int | None:

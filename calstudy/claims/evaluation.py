@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from calstudy.base.plugins import guarded
 from calstudy.calibrate.settings import GainFit
 from calstudy.claims.paper import Paper
+from calstudy.claims.realizations import PooledResults
 from calstudy.claims.run_times import RUN_TIME, RunTimes
 from calstudy.experiment.model import Experiment
 from calstudy.verdicts.criterion import Verdict
@@ -34,7 +35,7 @@ class Evaluation:
     without_role: tuple[str, ...] = ()
 
 
-def evaluate_run(papers: Sequence[Paper], results: RunResults) -> Evaluation:
+def evaluate_run(papers: Sequence[Paper], results: RunResults | PooledResults) -> Evaluation:
     """Evaluate the statements of papers that are about a role that one run plays."""
     verdicts: list[Verdict] = []
     without_role = []
@@ -48,7 +49,7 @@ def evaluate_run(papers: Sequence[Paper], results: RunResults) -> Evaluation:
     return Evaluation(verdicts, tuple(without_role))
 
 
-def refusals_of_run(paper: Paper, results: RunResults) -> dict[str, str | None]:
+def refusals_of_run(paper: Paper, results: RunResults | PooledResults) -> dict[str, str | None]:
     """Return why a run cannot play each role of a paper, None for the roles that it plays."""
     with guarded(paper):
         return {role: paper.refusal_of_run(role, results) for role in paper.roles}
@@ -75,7 +76,7 @@ def evaluate_run_times(papers: Sequence[Paper], run: RunTimes) -> Evaluation:
     return Evaluation(verdicts, tuple(without_role))
 
 
-def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults]) -> Evaluation:
+def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults | PooledResults]) -> Evaluation:
     """Evaluate every statement of papers on the runs that play its roles.
 
     Parameters
@@ -83,12 +84,16 @@ def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults]) ->
     papers
         Whose statements.
     runs
-        By the role that they play; statements whose roles nobody plays come back as not evaluated, with the reason.
+        By the role that they play; statements whose roles nobody plays come back as not evaluated, with the reason. If
+        all runs pool realizations, statements on single runs are left out.
     """
-    return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs))])
+    pooled = bool(runs) and all(isinstance(run, PooledResults) for run in runs.values())
+    return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs), pooled)])
 
 
-def evaluate_by_solver(papers: Sequence[Paper], runs: Mapping[str, RunResults]) -> dict[str, list[Verdict]]:
+def evaluate_by_solver(
+    papers: Sequence[Paper], runs: Mapping[str, RunResults | PooledResults]
+) -> dict[str, list[Verdict]]:
     """Evaluate every statement of papers on the runs with the paper's own solver, and on the same runs with another.
 
     Parameters
@@ -119,12 +124,12 @@ def evaluate_by_solver(papers: Sequence[Paper], runs: Mapping[str, RunResults]) 
     return {"the paper's solver": own, ", ".join(names): other} if own else {}
 
 
-def _solver(run: RunResults) -> str:
+def _solver(run: RunResults | PooledResults) -> str:
     calibration = run.experiment.calibration
     return calibration.solver.name if isinstance(calibration, GainFit) else calibration.label
 
 
-def _accepted(paper: Paper, runs: Mapping[str, RunResults]) -> dict[str, RunResults]:
+def _accepted(paper: Paper, runs: Mapping[str, RunResults | PooledResults]) -> dict[str, RunResults | PooledResults]:
     """Return the runs that a paper lets play their roles: another paper may have a role of the same name."""
     with guarded(paper):
         return {
@@ -134,14 +139,25 @@ def _accepted(paper: Paper, runs: Mapping[str, RunResults]) -> dict[str, RunResu
         }
 
 
-def _evaluate(paper: Paper, runs: Mapping[str, RunResults | RunTimes], only_played: bool = False) -> list[Verdict]:
+def _evaluate(
+    paper: Paper, runs: Mapping[str, RunResults | PooledResults | RunTimes], only_played: bool = False
+) -> list[Verdict]:
     """Evaluate the statements of a paper; with `only_played`, those alone that are about one of the roles."""
-
-    def wanted(statement: Statement) -> bool:
-        return not only_played or any(role in runs for role in statement.roles)
-
+    found = []
     with guarded(paper):
-        return [statement.evaluate(runs, paper.roles) for statement in paper.statements() if wanted(statement)]
+        for statement in paper.statements():
+            measured, usable = _measured_on(statement, runs)
+            if not only_played or any(role in usable for role in statement.roles):
+                found.append(measured.evaluate(usable, paper.roles))
+    return found
+
+
+def _measured_on(statement: Statement, runs: Mapping[str, Any]) -> tuple[Statement, dict[str, Any]]:
+    """Return a statement as it is measured on realizations, if these play its roles, and the runs it is measured on."""
+    played = [runs[role] for role in statement.roles if role in runs]
+    if statement.pooled and played and all(isinstance(run, PooledResults) for run in played):
+        return replace(statement, measure=statement.pooled), dict(runs)
+    return statement, {role: run for role, run in runs.items() if not isinstance(run, PooledResults)}
 
 
 def members_by_role(

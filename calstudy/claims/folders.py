@@ -22,6 +22,7 @@ from calstudy.claims.evaluation import (
     members_by_role,
 )
 from calstudy.claims.paper import Paper
+from calstudy.claims.realizations import PooledResults
 from calstudy.claims.results import RunResults
 from calstudy.claims.run_times import RunTimes
 from calstudy.experiment.files import validate
@@ -96,7 +97,7 @@ def _evaluated(
 
 def _played(
     folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]
-) -> tuple[list[Paper], dict[str, RunResults]]:
+) -> tuple[list[Paper], dict[str, RunResults | PooledResults]]:
     """Return the papers of a collection, and its members by the role that they play."""
     members = {name: _results(folder.resolve().parent / place, named) for name, place in manifest["members"].items()}
     own = {paper.reference: paper for run in members.values() for paper in run.experiment.papers}
@@ -138,11 +139,12 @@ def _tables(folder: Path) -> Path:
     return folder / "tables"
 
 
-def _results(folder: Path, named: Sequence[Paper]) -> RunResults:
+def _results(folder: Path, named: Sequence[Paper]) -> RunResults | PooledResults:
     content = dict(read_mapping(folder / EXPERIMENT))
     if named:
         content.pop("papers", None)
     experiment = validate(content, folder)
     if experiment.realizations:
-        raise InputError(f"{folder}: pools realizations, and claims are about single runs; give the folder of one")
+        figures = folder / "figures"
+        return PooledResults.of(experiment, figures if figures.is_dir() else folder)
     return RunResults(experiment, (_tables(folder),))

@@ -6,15 +6,20 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
-from calstudy.claims.paper import Paper
-from calstudy.experiment.model import Experiment
+from calstudy.claims.paper import Paper, stand_ins
+from calstudy.experiment.model import FIGURES, Experiment
+from calstudy.figures import figure_task
 from calstudy.products import agreement, score, signal_loss, sky_model, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
     from calstudy.claims.evaluation import Evaluation
+    from calstudy.claims.realizations import PooledResults
+    from calstudy.claims.results import RunResults
 
+REALIZATIONS = "realizations"
+"""The figure that has what all realizations of an experiment measured."""
 TABLES = ("spectra", "agreement", "transfer", "score", "sky_model")
 
 
@@ -24,6 +29,8 @@ def _facts(experiment: Experiment) -> Experiment:
 
 
 def _inputs(graph: Graph) -> dict[str, Task]:
+    if graph.experiment.realizations:
+        return {REALIZATIONS: figure_task(graph, FIGURES.make(REALIZATIONS), stand_ins(graph.experiment))}
     inputs = {
         "spectra": spectra.spectra(graph),
         "agreement": agreement.agreement(graph),
@@ -106,15 +113,9 @@ def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Tas
 def evaluate(job: Job) -> Mapping[str, Any]:
     """Write the claims of one run, or of the members of a collection in the roles that they play."""
     from calstudy.claims.evaluation import evaluate_by_solver, evaluate_members, evaluate_run
-    from calstudy.claims.results import RunResults
     from calstudy.verdicts.tables import write_claims_by_solver
 
-    results = {
-        name: RunResults(
-            experiment, tuple(job.inputs[f"{table}:{name}"] for table in TABLES if f"{table}:{name}" in job.inputs)
-        )
-        for name, experiment in job.settings["experiments"].items()
-    }
+    results = {name: _results(job, name, experiment) for name, experiment in job.settings["experiments"].items()}
     papers = job.settings["papers"]
     if "roles" not in job.settings:
         return _write(job, evaluate_run(papers, results[""]))
@@ -122,6 +123,16 @@ def evaluate(job: Job) -> Mapping[str, Any]:
     if by_solver := evaluate_by_solver(papers, runs):
         write_claims_by_solver(by_solver, job.output, job.settings["title"], job.settings["notes"])
     return _write(job, evaluate_members(papers, runs))
+
+
+def _results(job: Job, name: str, experiment: Experiment) -> RunResults | PooledResults:
+    from calstudy.claims.realizations import PooledResults
+    from calstudy.claims.results import RunResults
+
+    if experiment.realizations:
+        return PooledResults.of(experiment, job.inputs[f"{REALIZATIONS}:{name}"])
+    tables = (job.inputs.get(f"{table}:{name}") for table in TABLES)
+    return RunResults(experiment, tuple(folder for folder in tables if folder is not None))
 
 
 def evaluate_run_times(job: Job) -> Mapping[str, Any]:
@@ -134,14 +145,16 @@ def evaluate_run_times(job: Job) -> Mapping[str, Any]:
 
 
 def _write(job: Job, found: Evaluation) -> dict[str, Any]:
-    from calstudy.verdicts.tables import tally, write_claims
+    from calstudy.verdicts.sentences import tally_of_sentences
+    from calstudy.verdicts.tables import write_claims
 
     write_claims(found.verdicts, job.output, job.settings["title"], job.settings.get("notes", ()), found.without_role)
-    failed = [claim.name for claim in found.verdicts if claim.verdict == "FAIL"]
-    return {"verdicts": tally(found.verdicts), "failed": failed, "without_role": list(found.without_role)}
+    contradicted = [claim.name for claim in found.verdicts if claim.verdict == "contradicted"]
+    tally = tally_of_sentences(found.verdicts)
+    return {"verdicts": tally, "contradicted": contradicted, "without_role": list(found.without_role)}
 
 
-EVALUATE = Stage(name="claims", version=11, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
+EVALUATE = Stage(name="claims", version=12, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
 EVALUATE_RUN_TIMES = Stage(
-    name="runtime-claims", version=3, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
+    name="runtime-claims", version=4, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
 )

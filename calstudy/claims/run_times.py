@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from calstudy.products.run_times import RUNTIME, PowerLaw, fit_power_law
+from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
 RUN_TIME = "run_time"
@@ -24,7 +25,7 @@ class RunTimes:
     Attributes
     ----------
     name
-        Of the run.
+        Of the run, and the machine.
     table
         What `calstudy.products.run_times` wrote: ``cases``, one per array and device, and ``descent``.
     """
@@ -35,7 +36,8 @@ class RunTimes:
     @classmethod
     def of(cls, name: str, folder: Path) -> RunTimes:
         """Read the table of a run."""
-        return cls(name, json.loads((folder / RUNTIME).read_text(encoding="utf-8")))
+        table = json.loads((folder / RUNTIME).read_text(encoding="utf-8"))
+        return cls(f"{name} on {machine_in_words(table['machine'])}", table)
 
     def cases(self, panel: str, device: str = "cpu") -> list[Mapping[str, Any]]:
         """Return the arrays of one panel, the smallest first; raises Unevaluated if that device was not timed."""
@@ -88,10 +90,14 @@ class RunTimes:
         """
         return fit_power_law(self.column(panel, against, device), self.medians(panel, kind, device))
 
-    def steps_to(self, excess: str) -> float:
-        """Return how many steps the paper's solver took to come within a fraction of the minimum."""
+    def steps_to(self, excess: str) -> Finding:
+        """Return how many steps the paper's solver took to come within a fraction of the minimum, or took in vain."""
         descent = self.table["descent"]
         steps = descent["steps_to"][excess]
-        if steps is None:
-            raise Unevaluated(f"not within {100 * float(excess):g} % of the minimum after {descent['max_steps']} steps")
-        return float(steps)
+        return Finding(descent["max_steps"], 0.0, "at least") if steps is None else Finding(steps, 0.0)
+
+
+def machine_in_words(machine: Mapping[str, Any]) -> str:
+    """Return processor, cores and memory of a machine, and its GPU if one was timed."""
+    words = f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB"
+    return f"{words}, {machine['gpu']}" if machine.get("gpu") else words

@@ -171,12 +171,15 @@ def claims(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a finished run with published statements: the measured number, its threshold, PASS or FAIL.
+    """Compare a finished run with published statements: the measured number, its threshold, and the verdict.
+
+    A statement is supported, contradicted or undecided by the 95 % interval of the number.
 
     Writes claims.json and claims.md into the folder, and for a collection that has studies with the paper's own solver
     and with another one claims-by-solver.json and claims-by-solver.md.
     """
     from calstudy.claims.folders import evaluate_folder
+    from calstudy.verdicts.sentences import tally_of_sentences
     from calstudy.verdicts.tables import show_verdicts, to_json
 
     console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or (), run_code)
@@ -184,7 +187,8 @@ def claims(
         typer.echo(to_json(evaluated.claims))
         return
     if evaluated.claims:
-        show_verdicts(evaluated.claims, evaluated.title, console)
+        tally = tally_of_sentences(evaluated.claims)
+        show_verdicts(evaluated.claims, evaluated.title, console, summary=tally)
     for sentence in evaluated.without_role:
         console.print(sentence, markup=False)
 

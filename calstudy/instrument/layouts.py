@@ -119,6 +119,11 @@ class RedundantGroups:
     index: np.ndarray
     conjugated: np.ndarray
 
+    @property
+    def redundant_fraction(self) -> float:
+        """Part of the baselines that have a redundant partner."""
+        return float(np.mean(np.bincount(self.index)[self.index] > 1))
+
 
 def layout_of(section: Plugin) -> ArrayLayout:
     """Return the value of a layout field as an `ArrayLayout`; its registry admits no other plug-ins."""

@@ -46,8 +46,8 @@ def error_of_calibration_is_reduced(sky_based: RunResults, delay_weighted: RunRe
 
 @BOTH.states(
     "it improves the sensitivity of the power spectrum by about two orders of magnitude",
-    "s² P^R0 / P^S outside the wedge, k of 0.2 to 0.5 h/Mpc: sky-based over delay-weighted, or the 95 % lower limit "
-    "where the latter is within its error",
+    "s² P^R0 / P^S outside the wedge, k of 0.2 to 0.5 h/Mpc: sky-based over delay-weighted, or a lower limit where the "
+    "latter is within its error",
     HUNDRED,
     "a hundred, to half an order of magnitude",
 )
@@ -62,12 +62,7 @@ def sensitivity_improves_hundredfold(sky_based: RunResults, delay_weighted: RunR
     if abs(second.value) >= 2 * second.uncertainty:
         return ratio(first, Finding(abs(second.value), second.uncertainty))
     most = max(second.value, 0) + 2 * second.uncertainty
-    if (first.value - 2 * first.uncertainty) / most > HUNDRED.high:
-        return Finding(first.value / most, first.uncertainty / most)
-    raise Unevaluated(
-        f"the bias of delay-weighted calibration, {second.value:.2g} ± {second.uncertainty:.2g}, is within its error: "
-        f"the ratio is above {first.value / most:.3g}, which does not contradict {HUNDRED}"
-    )
+    return Finding(first.value / most, first.uncertainty / most, "at least")
 
 
 class Byrne2023(Paper):

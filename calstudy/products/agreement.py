@@ -55,6 +55,7 @@ def measure(job: Job) -> Mapping[str, Any]:
     from calstudy.base.errors import InputError
     from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
     from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth
+    from calstudy.instrument.layouts import redundant_groups
     from calstudy.products.selection import read_gains
 
     data = read_visibilities(job.inputs["data"] / DATA)
@@ -94,7 +95,7 @@ def measure(job: Job) -> Mapping[str, Any]:
         job.output / AGREEMENT,
         {
             "measurements": as_json(found),
-            "redundant_fraction": _redundant_fraction(vectors, job.settings["redundancy_tolerance"]),
+            "redundant_fraction": redundant_groups(vectors, job.settings["redundancy_tolerance"]).redundant_fraction,
             "integrations": chosen.size,
             "integrations_without_solution": int((~solved).sum()),
         },
@@ -112,16 +113,6 @@ def spread(places: np.ndarray, most: int) -> np.ndarray:
     import numpy as np
 
     return places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))]
-
-
-def _redundant_fraction(vectors: np.ndarray, tolerance: float) -> float:
-    """Return which part of the baselines has a redundant partner."""
-    import numpy as np
-
-    from calstudy.instrument.layouts import redundant_groups
-
-    groups = redundant_groups(vectors, tolerance)
-    return float(np.mean(np.bincount(groups.index)[groups.index] > 1))
 
 
 def _cost(task: Task) -> Cost:

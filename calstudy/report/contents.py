@@ -14,6 +14,8 @@ from calstudy.report import measured
 from calstudy.report.charts import Chart, read_charts
 from calstudy.report.headline import Number, read_claims, read_excess, read_headline
 from calstudy.run.progress import duration
+from calstudy.verdicts.sentences import tally_of_sentences
+from calstudy.verdicts.tables import measured as number_measured
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
 COMPARISON = "comparison.csv"
@@ -37,7 +39,7 @@ class Table:
     note
         A sentence below the heading, may be empty.
     verdicts
-        Indices of the columns whose texts are PASS or FAIL and are coloured.
+        Indices of the columns whose texts are verdicts and are coloured.
     """
 
     title: str
@@ -45,6 +47,11 @@ class Table:
     rows: Sequence[Sequence[str]]
     note: str = ""
     verdicts: Sequence[int] = ()
+
+    @property
+    def outcomes(self) -> list[str]:
+        """The verdicts that it has, once each."""
+        return sorted({row[place] for row in self.rows for place in self.verdicts} - {""})
 
 
 @dataclass(frozen=True)
@@ -229,24 +236,18 @@ def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None
     if not path.is_file():
         return None
     claims = read_claims(path)
-    evaluated = [claim for claim in claims if claim["measured"] is not None]
+    evaluated = [claim for claim in claims if claim.measured is not None]
     if not evaluated:
         reasons = [text for item in products for text in item.get("notes", {}).get("without_role", [])]
         return Table(CLAIMS_TITLE, (), (), " ".join(reasons)) if reasons else None
     rows = [
-        (
-            claim["section"],
-            claim["sentence"],
-            claim["quantity"],
-            with_error(claim["measured"], claim["uncertainty"]),
-            claim["threshold"],
-            claim["verdict"],
-        )
+        (claim.section, claim.sentence, claim.quantity, number_measured(claim), claim.threshold, claim.verdict)
         for claim in evaluated
     ]
     others = len(claims) - len(evaluated)
-    note = f"{others} further claims were not evaluated; claims.md says why." if others else ""
-    columns = ("section", "the paper says", "measured is", "measured", "holds if", "verdict")
+    lacking = f" {others} further claims were not evaluated; claims.md says why." if others else ""
+    note = f"{tally_of_sentences(claims)}.{lacking}"
+    columns = ("section", "the paper says", "measured is", "measured", "must be", "verdict")
     return Table(CLAIMS_TITLE, columns, rows, note, verdicts=(5,))
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from calstudy.base.errors import InputError
+from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.sentences import counts, outcomes_of_sentences
+from calstudy.verdicts.tables import from_json
 
 BAND = (0.2, 0.5)
 """Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""
@@ -74,7 +74,7 @@ class Signal:
 
 
 def read_headline(folder: Path) -> list[Number]:
-    """Return the numbers of a run folder: T, bias and flux scale, and how many claims hold; as far as there are any.
+    """Return the numbers of a run folder: T, bias and flux scale, and counts of the claims; as far as there are any.
 
     Parameters
     ----------
@@ -137,26 +137,21 @@ def _sums(rows: list[dict[str, float]], low: float, high: float) -> tuple[float,
     return total, math.sqrt(variance)
 
 
-def read_claims(path: Path) -> list[dict[str, Any]]:
-    """Return what a claims.json says of each statement; raises InputError if it is damaged."""
+def read_claims(path: Path) -> list[Verdict]:
+    """Return the verdicts of a claims.json; raises InputError if it is damaged."""
     try:
-        claims = json.loads(path.read_text(encoding="utf-8"))
-        whole = isinstance(claims, list) and all({"verdict", "measured", "uncertainty"} <= set(item) for item in claims)
-    except (OSError, ValueError, TypeError):
-        whole = False
-    if not whole:
-        raise InputError(f"{path}: is damaged; write it again: calstudy claims {path.parent}")
-    return claims
+        return from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError, KeyError):
+        raise InputError(f"{path}: is damaged; write it again: calstudy claims {path.parent}") from None
 
 
 def _verdicts(path: Path) -> Number | None:
     if not path.is_file():
         return None
-    counts = Counter(claim["verdict"] for claim in read_claims(path))
-    if not counts["PASS"] + counts["FAIL"]:
-        return None
-    text = f"{counts['PASS']} PASS, {counts['FAIL']} FAIL"
-    return Number("claims", text, f"statements of the papers; {counts.total()} in all, the others were not evaluated")
+    outcomes = list(outcomes_of_sentences(read_claims(path)).values())
+    evaluated = counts(outcome for outcome in outcomes if outcome != "not evaluated")
+    meaning = f"sentences of the papers; {len(outcomes)} in all, the others were not evaluated"
+    return Number("claims", evaluated, meaning) if evaluated else None
 
 
 def _with_error(value: float, error: float) -> str:

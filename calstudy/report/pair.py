@@ -106,5 +106,5 @@ def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -
         (*statement, *(text for pair in zip_longest(*(side or ("", "") for side in sides)) for text in pair))
         for statement, sides in rows.items()
     ]
-    columns = ("section", "the paper says", "measured is", "holds if", *names, *(f"verdict, {name}" for name in names))
+    columns = ("section", "the paper says", "measured is", "must be", *names, *(f"verdict, {name}" for name in names))
     return Table(CLAIMS_TITLE, columns, cells, verdicts=(6, 7)) if cells else None

@@ -157,14 +157,9 @@ class Collection(Study):
 
     @cached_property
     def claims(self) -> Task | None:
-        """The statements of the members' papers, each evaluated on the members whose roles it is about, or None.
-
-        Members with realizations have no claims: these are about single runs.
-        """
+        """The statements of the members' papers, each evaluated on the members whose roles it is about, or None."""
         graphs = {name: study.graph for name, study in self.studies.items()}
-        papers = distinct_papers(
-            paper for experiment in self.members.values() if not experiment.realizations for paper in experiment.papers
-        )
+        papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
         return combined_claims(self.name, graphs, papers, self.roles, self.stand_ins)
 
     def _place(self, name: str) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from calstudy.claims.paper import stand_ins
+from calstudy.claims.product import claims
 from calstudy.experiment.files import dump
 from calstudy.experiment.model import FIGURES, Experiment, Outputs
 from calstudy.experiment.realizations import expand_realizations
@@ -83,16 +84,23 @@ class Realizations(Study):
         """The tables and verdicts of all realizations."""
         return pooled(self.graph)
 
+    @cached_property
+    def claims(self) -> Task | None:
+        """The statements of the papers that the experiment names, where realizations measure them, or None."""
+        return claims(self.graph, self.stand_ins)
+
     @property
     def targets(self) -> Sequence[Task]:
-        """The figure and the tables."""
-        return [self.table, self.figure]
+        """The figure, the tables and claims."""
+        return [self.table, self.figure, *([self.claims] if self.claims else [])]
 
     def fill(self, made: Made) -> None:
-        """Write figure, tables, the experiment and the manifest."""
+        """Write figure, tables, claims, the experiment and the manifest."""
         folder, figure = self.folder, made.products[self.figure.key]
         publish([figure], folder / "figures")
         publish([made.products[self.table.key]], folder / "tables")
+        if self.claims is not None:
+            publish([made.products[self.claims.key]], folder)
         write(folder / EXPERIMENT, dump(self.experiment))
         fields = {
             "description": self.description,

@@ -20,6 +20,7 @@ from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.folder import MANIFEST
 from calstudy.studies.study import Budget, Run, Study
+from calstudy.verdicts.sentences import tally_of_sentences
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
 
 NAMED = 8
@@ -145,7 +146,7 @@ def _show_total(plan: Mapping[str, Any], console: Console) -> None:
 
 
 def show_run(run: Run, console: Console) -> None:
-    """Print what a run and its parts made, what they warn of, where the results are, and which claims hold."""
+    """Print what a run and its parts made, what they warn of, where the results are, and what became of the claims."""
     for name, part in run.parts.items():
         console.print(f"\n{name}", markup=False)
         _show_products(part, console)
@@ -211,15 +212,15 @@ def _show_criteria(folder: Path, console: Console) -> None:
 
 
 def _show_claims(folder: Path, console: Console) -> None:
-    """Print how many claims hold in a run, which fail, and where all of them are; nothing without claims."""
+    """Print the counts of claims of a run, which are contradicted, and where all are; nothing without claims."""
     path = folder / CLAIMS_JSON
     verdicts = from_json(path.read_text(encoding="utf-8")) if path.is_file() else []
     for verdict in verdicts:
-        if verdict.verdict == "FAIL":
-            text = f"claim FAILS: {verdict.name}: {measured(verdict)}, must be {verdict.threshold}"
+        if verdict.verdict == "contradicted":
+            text = f"claim contradicted: {verdict.name}: {measured(verdict)}, must be {verdict.threshold}"
             console.print(text, markup=False)
     if verdicts:
-        console.print(f"claims: {tally(verdicts)}: {folder / CLAIMS_MARKDOWN}", markup=False)
+        console.print(f"claims: {tally_of_sentences(verdicts)}: {folder / CLAIMS_MARKDOWN}", markup=False)
     elif path.is_file():
         text = "claims: none, for the run plays no role in the papers that it names; for the reasons see"
         console.print(f"{text} {folder / CLAIMS_MARKDOWN}", markup=False)

@@ -5,20 +5,46 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
-Outcome = Literal["PASS", "FAIL", "not evaluated"]
+Outcome = Literal["PASS", "FAIL", "supported", "contradicted", "undecided", "not evaluated"]
+"""PASS and FAIL are for limits of our own; the three after them for what others state."""
+Kind = Literal["error", "scatter", "at least", "at most"]
 
 
 class Finding(NamedTuple):
-    """A measured number and its uncertainty: one standard deviation, or the scatter that the quantity names."""
+    """A measured number.
+
+    Attributes
+    ----------
+    value
+        The number.
+    uncertainty
+        One standard deviation, or the scatter that the quantity names.
+    kind
+        "error" if `uncertainty` is the standard deviation of the number; "scatter" if it is that of the values whose
+        median the number is; "at least" or "at most" if the number is a bound of what was to be measured.
+    """
 
     value: float
     uncertainty: float
+    kind: Kind = "error"
 
 
 class Threshold(Protocol):
-    """The condition on a measured number; `str` puts it into words."""
+    """The condition on a measured number, from `low` to `high`, by `sigmas`; `str` puts it into words."""
+
+    @property
+    def low(self) -> float:
+        """The least number that meets it."""
+
+    @property
+    def high(self) -> float:
+        """The largest number that meets it."""
+
+    @property
+    def sigmas(self) -> float:
+        """How many uncertainties a number is to be within it, or, of a single value, may be off."""
 
     def holds(self, finding: Finding) -> bool:
         """Return whether the number meets it."""
@@ -30,6 +56,7 @@ class Within:
 
     low: float
     high: float
+    sigmas: ClassVar[float] = 0.0
 
     def holds(self, finding: Finding) -> bool:
         """Return whether the value is in the interval."""
@@ -45,6 +72,12 @@ class AtLeast:
 
     bound: float
     sigmas: float = 0.0
+    high: ClassVar[float] = math.inf
+
+    @property
+    def low(self) -> float:
+        """The bound."""
+        return self.bound
 
     def holds(self, finding: Finding) -> bool:
         """Return whether the value is that far above the bound."""
@@ -60,6 +93,12 @@ class AtMost:
 
     bound: float
     sigmas: float = 0.0
+    low: ClassVar[float] = -math.inf
+
+    @property
+    def high(self) -> float:
+        """The bound."""
+        return self.bound
 
     def holds(self, finding: Finding) -> bool:
         """Return whether the value is that far below the bound."""
@@ -75,6 +114,16 @@ class Equal:
 
     target: float
     sigmas: float = 2.0
+
+    @property
+    def low(self) -> float:
+        """The target."""
+        return self.target
+
+    @property
+    def high(self) -> float:
+        """The target."""
+        return self.target
 
     def holds(self, finding: Finding) -> bool:
         """Return whether the value is that close to the target."""
@@ -106,6 +155,14 @@ class Verdict:
         Names of the runs that it was measured on.
     reason
         Why there is no number, or empty.
+    kind
+        What number and uncertainty are, as in `Finding`.
+    smallest_effect
+        Of an undecided statement: how far from what it says the number would have to be for the data to show it.
+    sentence_id
+        Of the paper's sentence to which a statement belongs, maybe with others; empty for criteria of our own.
+    tests_simulation
+        Whether no calibration is in the number, so that it tests the simulated data alone.
     """
 
     name: str
@@ -119,6 +176,10 @@ class Verdict:
     verdict: Outcome
     runs: tuple[str, ...]
     reason: str
+    kind: Kind = "error"
+    smallest_effect: float | None = None
+    sentence_id: str = ""
+    tests_simulation: bool = False
 
 
 @dataclass(frozen=True)
@@ -133,10 +194,14 @@ class Criterion:
     why: str
 
     def judge(self, finding: Finding, runs: Sequence[str] = ()) -> Verdict:
-        """Return PASS or FAIL for a measured number; one that is not finite is not evaluated."""
+        """Return the verdict on a measured number; one that is not finite is not evaluated."""
         if not (math.isfinite(finding.value) and math.isfinite(finding.uncertainty)):
             return self.unevaluated("the measured number is not finite", runs)
-        return self._verdict(finding, "PASS" if self.threshold.holds(finding) else "FAIL", runs, "")
+        return self._verdict(finding, self.outcome(finding), runs, "")
+
+    def outcome(self, finding: Finding) -> Outcome:
+        """Return PASS or FAIL for a finite number."""
+        return "PASS" if self.threshold.holds(finding) else "FAIL"
 
     def unevaluated(self, reason: str, runs: Sequence[str] = ()) -> Verdict:
         """Return the verdict "not evaluated", with the reason."""
@@ -155,4 +220,5 @@ class Criterion:
             verdict=outcome,
             runs=tuple(runs),
             reason=reason,
+            kind="error" if finding is None else finding.kind,
         )

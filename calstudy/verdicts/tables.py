@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,15 @@ from rich.markup import escape
 from rich.table import Table as TerminalTable
 
 from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.sentences import tally_of_sentences
 
-OUTCOMES = ("PASS", "FAIL", "not evaluated")
+LIMIT_OUTCOMES = ("PASS", "FAIL", "not evaluated")
 COLOURS = {
     "PASS": "green",
     "FAIL": "bold red",
+    "supported": "green",
+    "contradicted": "bold red",
+    "undecided": "yellow",
     "not evaluated": "dim",
     "same": "green",
     "moved": "yellow",
@@ -94,8 +98,18 @@ def number(value: float, uncertainty: float | None = None) -> str:
 
 
 def measured(verdict: Verdict) -> str:
-    """Write the measured number and its uncertainty, or why there is none."""
-    return verdict.reason if verdict.measured is None else number(verdict.measured, verdict.uncertainty)
+    """Write the measured number and its uncertainty, or why there is none; and what would have been seen."""
+    if verdict.measured is None:
+        return verdict.reason
+    text = number(verdict.measured, verdict.uncertainty)
+    if verdict.kind in ("at least", "at most"):
+        return f"{verdict.kind} {text}"
+    return text if verdict.smallest_effect is None else f"{text}; {visible(verdict.smallest_effect)}"
+
+
+def visible(smallest_effect: float) -> str:
+    """Write the smallest effect that would have been seen."""
+    return f"smallest effect seen {smallest_effect:.2g}"
 
 
 def count(words: Sequence[str], kinds: Iterable[str]) -> str:
@@ -104,13 +118,17 @@ def count(words: Sequence[str], kinds: Iterable[str]) -> str:
 
 
 def tally(verdicts: Sequence[Verdict]) -> str:
-    """Count the outcomes in one line."""
-    return count([verdict.verdict for verdict in verdicts], OUTCOMES)
+    """Count the outcomes of criteria that are limits of our own in one line."""
+    return count([verdict.verdict for verdict in verdicts], LIMIT_OUTCOMES)
 
 
 def as_json(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """Return verdicts as JSON-able objects."""
-    return [asdict(verdict) for verdict in verdicts]
+    """Return verdicts as JSON-able objects, without the fields that have their default."""
+    defaults = {field.name: field.default for field in fields(Verdict) if field.default is not MISSING}
+    return [
+        {name: value for name, value in asdict(verdict).items() if name not in defaults or value != defaults[name]}
+        for verdict in verdicts
+    ]
 
 
 def to_json(verdicts: Sequence[Verdict]) -> str:
@@ -157,7 +175,14 @@ def to_markdown(
 def _cells(verdict: Verdict) -> tuple[str, ...]:
     runs = f"; {', '.join(verdict.runs)}" if verdict.runs else ""
     number_and_quantity = f"**{measured(verdict)}** ({verdict.quantity}{runs})"
-    return verdict.name, verdict.sentence, number_and_quantity, verdict.threshold, verdict.why, verdict.verdict
+    return *_named(verdict), number_and_quantity, verdict.threshold, verdict.why, verdict.verdict
+
+
+def _named(verdict: Verdict) -> tuple[str, str]:
+    """Return the name, marked if it tests the simulation alone, and the sentence with its id."""
+    marked = " (simulation alone)" if verdict.tests_simulation else ""
+    shared = verdict.sentence_id and verdict.sentence_id != verdict.name
+    return verdict.name + marked, f"{verdict.sentence} [{verdict.sentence_id}]" if shared else verdict.sentence
 
 
 def show_verdicts(
@@ -219,13 +244,13 @@ def write_claims(
         Sentences on why there are no verdicts on a paper, written below the table.
     """
     (folder / CLAIMS_JSON).write_text(to_json(verdicts) + "\n", encoding="utf-8")
-    summary = None if verdicts else "No claims."
+    summary = tally_of_sentences(verdicts) if verdicts else "No claims."
     text = to_markdown(verdicts, f"Claims of the paper: {title}", ("claim", "the paper"), summary, notes)
     (folder / CLAIMS_MARKDOWN).write_text("\n".join([text, *without_role]).rstrip() + "\n", encoding="utf-8")
 
 
-STATEMENT = ("name", "section", "sentence", "quantity", "threshold", "why")
-RESULT = ("measured", "uncertainty", "verdict", "runs", "reason")
+STATEMENT = ("name", "section", "sentence", "sentence_id", "tests_simulation", "quantity", "threshold", "why")
+RESULT = ("measured", "uncertainty", "kind", "smallest_effect", "verdict", "runs", "reason")
 
 
 def write_claims_by_solver(
@@ -255,7 +280,7 @@ def write_claims_by_solver(
     text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / BY_SOLVER_JSON).write_text(text + "\n", encoding="utf-8")
     lines = [f"# Claims of the paper, by solver: {title}", ""]
-    lines += [f"- {name}: {tally([row[place] for row in rows])}" for place, name in enumerate(columns)]
+    lines += [f"- {name}: {tally_of_sentences([row[place] for row in rows])}" for place, name in enumerate(columns)]
     lines += ["", f"The verdict differs: {', '.join(_differing(rows)) or 'nowhere'}.", ""]
     lines += [f"Stand-in: {note}." for note in notes] + ([""] if notes else [])
     headings = ("claim", "the paper", "measured is", "must be", *(cell for name in columns for cell in (name, "")))
@@ -274,4 +299,4 @@ def _differing(rows: Iterable[Sequence[Verdict]]) -> list[str]:
 def _cells_by_solver(row: Sequence[Verdict]) -> tuple[str, ...]:
     first = row[0]
     found = (("-", item.verdict) if item.measured is None else (f"**{measured(item)}**", item.verdict) for item in row)
-    return first.name, first.sentence, first.quantity, first.threshold, *(cell for pair in found for cell in pair)
+    return *_named(first), first.quantity, first.threshold, *(cell for pair in found for cell in pair)

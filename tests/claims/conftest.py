@@ -33,7 +33,7 @@ class World:
 
     recovered: float = 1.0
     recovered_small_k: float = 1.0
-    biased_below: float = 0.28
+    biased_below: float = 0.24
     outside_biased_below: float = 0.0
     noise: float = 0.03
     without_eor_bias: float = 0.0
@@ -45,6 +45,7 @@ class World:
     artefact: float = 0.0
     artefact_left: float = 0.0
     scale_free_transfer: float = 0.94
+    coherence: float = 1.0
     flux_scale: float = 1.01
     redundant_fraction: float = 0.02
     agreement: dict[str, float] = field(default_factory=dict)
@@ -144,8 +145,8 @@ def transfer(world: World) -> TransferFunction:
         cross_transfer_error=0.01 * ones,
         scale_free_transfer=scale_free,
         scale_free_transfer_error=0.01 * ones,
-        squared_coherence=scale_free,
-        squared_coherence_error=0.01 * ones,
+        squared_coherence=world.coherence * ones,
+        squared_coherence_error=0.001 * ones,
         signal=SIGNAL * ones,
         n_samples=100 * np.ones(K.size, int),
         flux_scale=world.flux_scale,

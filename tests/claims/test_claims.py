@@ -1,4 +1,4 @@
-"""Claims: PASS where the sentence is true by construction, FAIL where it is false, a reason where it cannot be told."""
+"""Claims: supported where the sentence is true by construction, contradicted where it is false, or undecided."""
 
 import json
 from dataclasses import replace
@@ -30,8 +30,25 @@ def verdicts(claims) -> dict[str, str]:
     return {claim.name: claim.verdict for claim in claims}
 
 
+NEVER_SUPPORTED = {
+    # No number shows that there is nothing: an interval always has parts beside zero.
+    "residual-unbiased-outside-wedge",
+    "redundant-residual-unbiased",
+    "no-bias-beyond-small-k",
+    "artefact-removed",
+    # Means of three and seven bins have errors of 0.6 and 0.4 of the noise: too much for a factor of two.
+    "bias-at-level-of-noise-below-0p2",
+    "bias-at-level-of-noise-from-0p2-to-0p5",
+}
+"""A single run leaves these undecided where they are true."""
+OF_SETTINGS = {"vectors-like-bandwidth-of-horizon"}
+"""Decided by the array and the basis, which are the same in all these worlds: false for short baselines."""
+
+
 def failing(claims) -> set[str]:
-    return {claim.name for claim in claims if claim.verdict == "FAIL"}
+    """All that is contradicted, and what is undecided though one run can support it."""
+    failed = {claim.name for claim in claims if claim.verdict == "contradicted"} - OF_SETTINGS
+    return failed | {claim.name for claim in claims if claim.verdict == "undecided"} - NEVER_SUPPORTED
 
 
 def alone(study):
@@ -66,7 +83,7 @@ def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(ma
     ("truth", "fail"),
     [
         (
-            {"recovered": 0.5},
+            {"recovered": 0.6},
             {
                 "residual-agrees-outside-wedge",
                 "residual-unbiased-outside-wedge",
@@ -91,6 +108,7 @@ def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(ma
         ),
         ({"leakage": 30.0}, {"leakage-far-above-signal", "systematics-removed-from-window"}),
         ({"window_leak": 50.0}, {"foregrounds-contained"}),
+        ({"coherence": 0.944}, {"loss-limited-to-wedge"}),
         (
             {"foregrounds": 1e5, "sidelobes": 10.0},
             {
@@ -141,19 +159,23 @@ def test_a_claim_fails_where_its_sentence_is_false_and_the_others_do_not(make_st
     assert failing(alone(make_study(without_eor_bias=0.03, **truth))) == fail
 
 
-def test_residuals_of_noise_alone_show_no_bias_and_the_claims_of_one_fail(make_study):
-    assert failing(alone(make_study())) == BIAS_CLAIMS
+def test_residuals_of_noise_alone_do_not_tell_a_bias_from_none(make_study):
+    # Undecided, not contradicted: the sentence says "slight", and less than the errors of one run would be slight too.
+    claims = {claim.name: claim for claim in alone(make_study())}
+    assert failing(claims.values()) == {BIAS_CLAIM}
+    assert {claims[name].verdict for name in BIAS_CLAIMS} == {"undecided"}
+    assert all(0 < claims[name].smallest_effect < 2 for name in BIAS_CLAIMS)
 
 
 def test_a_bias_above_the_eor_is_neither_lower_nor_at_the_level_of_the_noise(make_study):
     levels = BIAS_CLAIMS - {BIAS_CLAIM}
     strong = alone(make_study("strong", without_eor_bias=3.0))
     assert levels | {"bias-lower-than-eor-below-0p2", "bias-lower-than-eor-from-0p2-to-0p5"} <= failing(strong)
-    assert verdicts(strong)["no-bias-beyond-small-k"] == verdicts(strong)[BIAS_CLAIM] == "PASS"
+    assert (verdicts(strong)["no-bias-beyond-small-k"], verdicts(strong)[BIAS_CLAIM]) == ("undecided", "supported")
     # Ten times the noise, and half the EoR.
     weaker = verdicts(alone(make_study("weaker", without_eor_bias=0.5, noise=0.05)))
-    assert {weaker[name] for name in levels} == {"FAIL"}
-    assert weaker["bias-lower-than-eor-below-0p2"] == weaker["bias-lower-than-eor-from-0p2-to-0p5"] == "PASS"
+    assert {weaker[name] for name in levels} == {"contradicted"}
+    assert weaker["bias-lower-than-eor-below-0p2"] == weaker["bias-lower-than-eor-from-0p2-to-0p5"] == "supported"
 
 
 def test_each_band_of_the_bias_is_measured_by_itself(make_study):
@@ -175,15 +197,15 @@ def test_each_band_of_the_bias_is_measured_by_itself(make_study):
         for other in bands:
             expected = 5 / (0.03 if other.startswith("no-bias") else 1) if other == name else 0
             assert after[other].measured - before[other].measured == pytest.approx(expected, abs=1e-5)
-        assert before[name].verdict == "PASS"
-        assert after[name].verdict == "FAIL"
+        assert before[name].verdict == ("undecided" if name in NEVER_SUPPORTED else "supported")
+        assert after[name].verdict == "contradicted"
 
 
 def test_the_papers_solver_is_held_to_its_own_claim(make_study):
     biased = alone(make_study("biased", without_eor_bias=0.1, facts=ADAMAX))
     clean = alone(make_study("clean", facts=ADAMAX))
     name = f"{BIAS_CLAIM}-with-papers-solver"
-    assert (verdicts(biased)[name], verdicts(clean)[name]) == ("PASS", "FAIL")
+    assert (verdicts(biased)[name], verdicts(clean)[name]) == ("supported", "undecided")
     assert name not in verdicts(alone(make_study("own")))
 
 
@@ -196,7 +218,7 @@ def compare(make_study, minimal=None, **redundant):
     truth = {
         "recovered_small_k": 0.5,
         "recovered": 0.9,
-        "noise": 0.003,
+        "noise": 0.002,
         "leakage": 2e4,
         "redundant_fraction": 0.9,
         "scale_free_transfer": 0.9,
@@ -216,8 +238,8 @@ def test_claims_on_the_redundant_array_hold_in_the_papers_world(make_study):
     claims = compare(make_study, recovered=0.96)
     # More loss on all scales, and no bias: with errors this small only one of the two can be.
     contradicted = {"redundant-residual-unbiased"}
-    assert failing(claims) == contradicted, [claim for claim in claims if claim.verdict == "FAIL"]
-    assert all(claim.verdict == "PASS" for claim in claims if claim.name not in contradicted)
+    assert failing(claims) == contradicted, [claim for claim in claims if claim.verdict == "contradicted"]
+    assert all(claim.verdict == "supported" for claim in claims if claim.name not in contradicted)
 
 
 @pytest.mark.parametrize(
@@ -237,6 +259,7 @@ def test_claims_on_the_redundant_array_hold_in_the_papers_world(make_study):
             {"more-loss-on-all-scales-without-flux-scale", "less-of-the-eor-below-0p3"},
         ),
         ({"agreement": {"residual_over_noise_outside": 3.0}}, {"redundant-modelling-same-visibilities"}),
+        ({"scale_free_transfer": 0.8}, {"redundant-modelling-loses-the-same"}),
     ],
 )
 def test_claims_on_the_redundant_array_fail_where_they_are_false(make_study, truth, fail):
@@ -247,10 +270,18 @@ def test_where_the_minimally_redundant_array_has_no_negative_bias_its_end_is_not
     claims = {item.name: item for item in compare(make_study, {"outside_biased_below": 0.0}, recovered=0.96)}
     assert claims["bias-reaches-larger-k"].verdict == "not evaluated"
     assert "has no negative bias at the smallest k" in claims["bias-reaches-larger-k"].reason
-    assert claims["less-power-below-0p3"].verdict == "PASS"
+    assert claims["less-power-below-0p3"].verdict == "supported"
 
 
-LOW_SNR = {"facts": LOW_SNR_FACTS, "noise": 1000.0, "leakage": 0.0}
+# Of 80 bins, 76 are within the 95 % bars with this seed; two fewer, as happens by chance, do not exclude 90 %.
+# Of one integration, the artefact is as far above the noise whether the sentence means the average or not.
+LOW_SNR = {"facts": LOW_SNR_FACTS | {"instrument": {"times": {"count": 1}}}, "noise": 1000.0, "leakage": 0.0, "seed": 2}
+
+
+TENFOLD = {
+    f"artefact-tenfold-above-noise{reading}"
+    for reading in ("", "-bars", "-of-one-integration", "-bars-of-one-integration")
+}
 
 
 def low_snr(study):
@@ -260,7 +291,7 @@ def low_snr(study):
 def test_claims_at_low_snr_hold_where_the_artefact_is_tenfold_and_removed(make_study):
     claims = low_snr(make_study(artefact=15_000.0, **LOW_SNR))
     assert failing(claims) == set()
-    assert len(claims) == 7
+    assert len(claims) == 9
 
 
 @pytest.mark.parametrize(
@@ -268,9 +299,9 @@ def test_claims_at_low_snr_hold_where_the_artefact_is_tenfold_and_removed(make_s
     [
         (
             {"artefact": 0.0},
-            {"artefact-visible-above-noise", "artefact-tenfold-above-noise", "artefact-tenfold-above-noise-bars"},
+            {"artefact-visible-above-noise", *TENFOLD},
         ),
-        ({"artefact": 1e6}, {"artefact-tenfold-above-noise", "artefact-tenfold-above-noise-bars"}),
+        ({"artefact": 1e6}, TENFOLD),
         (
             {"artefact": 15_000.0, "artefact_left": 15_000.0},
             {"artefact-removed", "residual-consistent-with-noise"},
@@ -280,6 +311,57 @@ def test_claims_at_low_snr_hold_where_the_artefact_is_tenfold_and_removed(make_s
 )
 def test_claims_at_low_snr_fail_where_they_are_false(make_study, truth, fail):
     assert failing(low_snr(make_study(**(LOW_SNR | truth)))) == fail
+
+
+@pytest.mark.parametrize("blocks", [1, 8])
+def test_the_noise_of_one_integration_is_that_before_the_average(make_study, blocks):
+    """An artefact that is ten times the noise of one integration, whatever was averaged before or after squaring."""
+    times = {"count": 16, "integration": "2 s"}
+    artefact = 10 * LOW_SNR["noise"] * 16 / np.sqrt(blocks)
+    facts = LOW_SNR_FACTS | {"instrument": {"times": times}, "power": {"coherent_time": f"{32 / blocks} s"}}
+    claims = {claim.name: claim for claim in low_snr(make_study(**(LOW_SNR | {"artefact": artefact, "facts": facts})))}
+    assert claims["artefact-tenfold-above-noise"].verdict == "contradicted"
+    one = claims["artefact-tenfold-above-noise-of-one-integration"]
+    # The largest of six bins has noise of its own, a part of that of the average.
+    assert (one.verdict, one.measured) == ("supported", pytest.approx(10, abs=3 * np.sqrt(blocks) / 16))
+    bars = claims["artefact-tenfold-above-noise-bars-of-one-integration"]
+    assert bars.measured == pytest.approx(one.measured / 1.96)
+
+
+@pytest.mark.parametrize(("spacing", "verdict"), [("4 m", "contradicted"), ("400 m", "supported")])
+def test_vectors_are_as_many_as_the_bandwidth_where_baselines_are_long(make_study, spacing, verdict):
+    layout = {"kind": "linear", "count": 4, "spacing": spacing}
+    claims = verdicts(alone(make_study(facts={"instrument": {"layout": layout}})))
+    assert claims["vectors-like-bandwidth-of-horizon"] == verdict
+
+
+def test_loss_is_compared_between_channels_of_the_same_band(make_study):
+    def channels(width, count):
+        return {"instrument": {"channels": {"first": "167 MHz", "width": width, "count": count}}}
+
+    papers = make_study("paper", scale_free_transfer=0.94, facts=channels("80 kHz", 384))
+    for name, width, count, left, verdict in (
+        ("same", "160 kHz", 192, 0.94, "undecided"),
+        ("less", "160 kHz", 192, 0.80, "supported"),
+        ("band", "160 kHz", 384, 0.80, "not evaluated"),
+    ):
+        other = make_study(name, scale_free_transfer=left, facts=channels(width, count))
+        runs = {"minimally_redundant": papers, "other_channels": other}
+        assert verdicts(evaluate_members([PAPER], runs).verdicts)["loss-depends-on-channels"] == verdict
+    assert PAPER.refusal("other_channels", papers.experiment) == "instrument.channels.width is the paper's, 80 kHz"
+
+
+def test_what_no_run_can_tell_has_a_reason(make_study):
+    claims = {claim.name: claim for claim in alone(make_study())}
+    for name, reason in (
+        ("one-complex-degeneracy", "step 2.1 of the validation ladder"),
+        ("artefacts-at-minus-45-db", "'calstudy check floor' measures it"),
+        ("average-loses-nothing", "needs realizations"),
+        ("leakage-is-not-corrected", "the simulated sky is not polarized"),
+        ("filter-rescues-coupling", "no filter in fringe rate"),
+    ):
+        assert claims[name].verdict == "not evaluated"
+        assert reason in claims[name].reason
 
 
 @pytest.mark.parametrize(
@@ -425,19 +507,20 @@ def test_a_run_without_a_role_has_no_claims_and_says_why_in_a_sentence(make_stud
     assert found.verdicts == []
     (sentence,) = found.without_role
     assert sentence.startswith("The run plays no role in calamity2022: calibration.calibrator is 'sky-based', not ")
-    others = "minimally_redundant, redundant, low_snr, paper_solver, redundant_paper_solver, low_snr_paper_solver"
-    assert sentence.count(f"'calamity' ({others})") == 1
+    others = "minimally_redundant, redundant, low_snr, other_channels, paper_solver, redundant_paper_solver"
+    assert sentence.count(f"'calamity' ({others}, low_snr_paper_solver)") == 1
 
 
 def test_a_run_is_held_to_the_statements_about_its_role_alone(make_study):
     groups = evaluate_run([PAPER], make_study(redundant_fraction=0.9, facts=GROUPS))
-    assert set(verdicts(groups.verdicts)) == {"redundant-modelling-same-visibilities", "redundant-modelling-same-power"}
+    names = ("same-visibilities", "same-power", "loses-the-same")
+    assert set(verdicts(groups.verdicts)) == {f"redundant-modelling-{name}" for name in names}
     assert {claim.reason for claim in groups.verdicts} == {f"needs {PAPER.roles['redundant']}"}
 
 
 def test_what_a_run_lacks_is_said(make_study):
     claims = {claim.name: claim for claim in alone(make_study(kinds=("eor", "noise", "uncorrupted", "uncalibrated")))}
-    assert claims["leakage-fills-window"].verdict == "PASS"
+    assert claims["leakage-fills-window"].verdict == "supported"
     assert claims["residual-agrees-outside-wedge"].reason == "the run has no variant 'residual'"
     assert claims["noise-reduced"].reason.startswith("needs a run of a redundant array")
     assert claims["noise-reduced"].measured is None

@@ -41,10 +41,10 @@ def test_every_statement_is_evaluated_with_either_solver(studies):
         assert {item.threshold for item in (mine, theirs)} == {mine.threshold}
         if theirs.runs:
             assert mine.runs == tuple(members[name] for name in theirs.runs)
-    assert (verdicts(own)[BIAS], verdicts(other)[BIAS]) == ("PASS", "FAIL")
+    assert (verdicts(own)[BIAS], verdicts(other)[BIAS]) == ("supported", "undecided")
     # What is said of the paper's solver alone has no verdict with another.
     name = f"{BIAS}-with-papers-solver"
-    assert (verdicts(own)[name], verdicts(other)[name]) == ("PASS", "not evaluated")
+    assert (verdicts(own)[name], verdicts(other)[name]) == ("supported", "not evaluated")
     same = [a.verdict == b.verdict for a, b in zip(own, other, strict=True) if a.name.startswith("gains")]
     assert same
     assert all(same)
@@ -73,8 +73,8 @@ def test_the_folder_of_a_collection_gets_the_table_and_a_single_run_does_not(stu
     evaluate_folder(folder)
     found = {row["name"]: row for row in json.loads((folder / "claims-by-solver.json").read_text())}
     assert {name: result["verdict"] for name, result in found[BIAS]["solvers"].items()} == {
-        "the paper's solver": "PASS",
-        "gauss-newton": "FAIL",
+        "the paper's solver": "supported",
+        "gauss-newton": "undecided",
     }
     assert found[BIAS]["solvers"]["the paper's solver"]["runs"] == ["minimal-adamax"]
     # Nothing is said of run times, which none of the runs measures.

@@ -25,7 +25,7 @@ from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
 
 CODE = sections()["A paper"]["python"]
-VERDICTS = {"gains-recovered": "PASS", "signal-kept": "FAIL"}
+VERDICTS = {"gains-recovered": "supported", "signal-kept": "contradicted"}
 BROKEN = CODE.replace('run.measured("gains_aligned")', "run.gains")
 
 
@@ -61,10 +61,10 @@ def test_its_statements_are_judged_as_they_come_out(folder):
     assert claims["signal-kept"].runs == ("tiny",)
     text = (run.folder / "claims.md").read_text()
     assert "no EoR is lost outside the wedge" in text
-    assert "claim FAILS: signal-kept" in shown
-    assert "claims: 1 PASS, 1 FAIL, 0 not evaluated" in shown
+    assert "claim contradicted: signal-kept" in shown
+    assert "claims: 2 sentences: 1 supported, 1 contradicted; 2 statements: 1 supported, 1 contradicted" in shown
     (table,) = [table for table in read_contents(run.folder).tables if table.title == "Claims of the paper"]
-    assert [row[-1] for row in table.rows] == ["PASS", "FAIL"]
+    assert [row[-1] for row in table.rows] == ["supported", "contradicted"]
 
 
 def test_an_installed_one_is_used_by_its_name_and_beside_others(folder, monkeypatch, tmp_path):

@@ -163,17 +163,17 @@ def test_times_of_a_machine_are_told_and_never_too_far():
 @pytest.mark.parametrize(
     ("uncertainty", "measured", "verdict", "status"),
     [
-        (0.1, 1.0, "PASS", "same"),
-        (0.1, 1.2, "PASS", "moved"),
-        (0.1, 1.2, "FAIL", "moved"),
-        (0.1, 1.4, "FAIL", "beyond"),
-        (0.0, 1.1, "FAIL", "beyond"),
+        (0.1, 1.0, "supported", "same"),
+        (0.1, 1.2, "supported", "moved"),
+        (0.1, 1.2, "contradicted", "moved"),
+        (0.1, 1.4, "contradicted", "beyond"),
+        (0.0, 1.1, "contradicted", "beyond"),
         (0.1, None, "not evaluated", "beyond"),
     ],
 )
 def test_a_verdict_may_change_with_a_number_that_moved_within_its_error(uncertainty, measured, verdict, status):
     texts = {"section": "", "sentence": "", "quantity": "", "threshold": "", "why": "", "reason": "", "runs": ()}
-    old = Verdict(name="claim", measured=1.0, uncertainty=uncertainty, verdict="PASS", **texts)
+    old = Verdict(name="claim", measured=1.0, uncertainty=uncertainty, verdict="supported", **texts)
     new = dataclasses.replace(old, measured=measured, verdict=verdict)
     assert [item.status for item in compare_claims([old], [new])] == [status]
     assert [item.status for item in compare_claims([old], [])] == ["beyond"]
@@ -182,8 +182,8 @@ def test_a_verdict_may_change_with_a_number_that_moved_within_its_error(uncertai
 
 def test_verdicts_on_run_time_may_be_others_on_another_machine():
     texts = dict.fromkeys(("section", "sentence", "quantity", "threshold", "why", "reason"), "")
-    old = Verdict(name="claim", measured=1.0, uncertainty=0.0, verdict="PASS", runs=(), **texts)
-    slower = dataclasses.replace(old, measured=2.0, verdict="FAIL")
+    old = Verdict(name="claim", measured=1.0, uncertainty=0.0, verdict="supported", runs=(), **texts)
+    slower = dataclasses.replace(old, measured=2.0, verdict="contradicted")
     gone = dataclasses.replace(old, measured=None, verdict="not evaluated")
     assert [item.status for item in compare_claims([old], [slower], on_machines=True)] == ["moved"]
     assert [item.status for item in compare_claims([old], [slower])] == ["beyond"]

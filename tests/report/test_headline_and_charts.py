@@ -72,9 +72,15 @@ def test_noise_above_the_eor_is_no_excess(tables):
 
 
 def test_the_headline_counts_verdicts(tmp_path):
-    claims = [{"verdict": verdict} for verdict in ("PASS", "FAIL", "PASS", "not evaluated")]
+    texts = dict.fromkeys(("section", "sentence", "quantity", "threshold", "why", "reason"), "")
+    words = ("supported", "contradicted", "supported", "not evaluated", "undecided")
+    claims = [
+        {**texts, "name": f"{place}", "measured": 1.0, "uncertainty": 0.1, "verdict": verdict, "runs": []}
+        for place, verdict in enumerate(words)
+    ]
     (tmp_path / "claims.json").write_text(json.dumps(claims))
-    assert [(number.name, number.text) for number in read_headline(tmp_path)] == [("claims", "2 PASS, 1 FAIL")]
+    found = [(number.name, number.text) for number in read_headline(tmp_path)]
+    assert found == [("claims", "2 supported, 1 contradicted, 1 undecided")]
 
 
 def test_curves_are_the_arrays_of_the_figure(tmp_path):

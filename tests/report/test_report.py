@@ -55,7 +55,7 @@ MANIFEST = {
 
 CLAIM = {
     "name": "a", "section": "Results", "sentence": "R agrees with S.", "quantity": "pull", "measured": 1.234,
-    "uncertainty": 0.1, "threshold": "<= 2", "why": "", "verdict": "PASS", "runs": ["demo"], "reason": "",
+    "uncertainty": 0.1, "threshold": "<= 2", "why": "", "verdict": "supported", "runs": ["demo"], "reason": "",
 }  # fmt: skip
 
 
@@ -152,13 +152,13 @@ def test_convergence_simulation_and_stages_are_told(folder):
 def test_claims_are_a_table_if_there_are_any(folder):
     assert rows(folder, "Claims of the paper") == []
     unknown = {**CLAIM, "measured": None, "uncertainty": None, "verdict": "not evaluated"}
-    failed = {**CLAIM, "verdict": "FAIL"}
+    failed = {**CLAIM, "verdict": "contradicted"}
     (folder / "claims.json").write_text(json.dumps([CLAIM, unknown, failed]))
     found = rows(folder, "Claims of the paper")
-    assert [row[-1] for row in found] == ["PASS", "FAIL"]
+    assert [row[-1] for row in found] == ["supported", "contradicted"]
     assert found[0][3] == "1.23 ± 0.1"
     page = page_of(folder)
-    assert ("td", "class", "FAIL") in page.attributes
+    assert ("td", "class", "contradicted") in page.attributes
     assert "1 further claims were not evaluated" in page.words
 
 

@@ -36,7 +36,7 @@ def folder(tmp_path):
     cube = {**axes, "power": np.array([[1.0, 2, 3], [4, 5, 4.2e6]])}
     np.savez(tmp_path / "figures" / "wedge.npz", **{f"residual.{key}": item for key, item in cube.items()})
     claims = [
-        {**CLAIM, "measured": 12.0, "verdict": "FAIL"},
+        {**CLAIM, "measured": 12.0, "verdict": "contradicted"},
         {**CLAIM, "measured": 1.5, "quantity": "the second pull"},
         {**CLAIM, "measured": -3.0},
     ]
@@ -67,11 +67,11 @@ def test_the_report_works_at_any_width(folder, width):
     assert found["errors"] == []
     # A headless window may not be made as narrow as it is asked to be; the page has to fit whatever it is.
     assert found["wide"] <= 0
-    assert found["rising"] == ["-3 ± 0.1", "1.5 ± 0.1", "12 ± 0.1"]
+    assert found["rising"] == ["-3.00 ± 0.1", "1.50 ± 0.1", "12.00 ± 0.1"]
     assert found["falling"] == found["rising"][::-1]
-    assert found["failed"] == ["FAIL"]
+    assert found["failed"] == ["contradicted"]
     assert found["count"] == "1 of 3"
-    assert found["words"] == ["1.5 ± 0.1"]
+    assert found["words"] == ["1.50 ± 0.1"]
     # Once on top, and once below the figure.
     assert found["points"] == 6
     assert "k = 0.3" in found["curve"]

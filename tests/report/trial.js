@@ -27,7 +27,7 @@ function tryAll() {
   found.falling = column(claims, measured);
   const filter = claims.closest("section").querySelector(".filter");
   const [words, verdict] = [filter.querySelector("input"), filter.querySelector("select")];
-  verdict.value = "FAIL";
+  verdict.value = "contradicted";
   verdict.dispatchEvent(new Event("change"));
   found.failed = column(claims, headings.length - 1);
   found.count = text(filter.querySelector("span"));

@@ -217,10 +217,19 @@ def test_a_run_leaves_tables_a_figure_and_verdicts(finished):
     assert "criteria: " in console.export_text()
 
 
-def test_claims_are_about_single_runs(finished):
-    with pytest.raises(InputError, match="pools realizations, and claims are about single runs"):
-        evaluate_folder(finished.folder, ["calamity2022"])
-    assert not (finished.folder / "claims.json").exists()
+def test_claims_are_those_that_realizations_measure(finished, folder, tmp_path):
+    """The numbers of the folder's arrays, those of the product of the run, and those of its table."""
+    claims = {claim.name: claim for claim in evaluate_folder(finished.folder, ["calamity2022"]).claims}
+    level, unbiased = claims["residual-level-outside-wedge"], claims["residual-unbiased-outside-wedge"]
+    assert (level.runs, level.measured) == ((finished.name,), unbiased.measured)
+    data = small(folder, papers=["calamity2022"], outputs__runs=str(tmp_path))
+    again = run_study(Realizations(validate(data, folder)), Budget(workers=1))
+    made = {claim["name"]: claim["measured"] for claim in json.loads((again.folder / "claims.json").read_text())}
+    assert made == {name: claim.measured for name, claim in claims.items()}
+    with (finished.folder / "tables" / "realizations.csv").open(newline="") as table:
+        rows = [row for row in csv.DictReader(table) if row["region"] == "outside-wedge"]
+    ratios = [float(row["ratio mean"]) for row in rows if float(row["k [h/Mpc]"]) >= 0.2]
+    assert level.measured == pytest.approx(np.nanmean(ratios), rel=1e-6)
 
 
 def test_the_plan_counts_the_disk_that_is_held_at_one_time(folder, tmp_path):

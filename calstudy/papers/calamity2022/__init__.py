@@ -14,12 +14,15 @@ from calstudy.instrument.as_built import AsBuilt
 from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
 
 if TYPE_CHECKING:
+    from calstudy.claims.realizations import PooledResults
     from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
     from calstudy.verdicts.statement import Statement
 
 REDUNDANT_FROM = 0.5
 """An array is redundant if this part of its baselines has a redundant partner."""
+PAPER_WIDTH = 80e3
+"""Of a channel, Hz."""
 EOR_LEVEL = -40.0
 """Of the foregrounds, dB of brightness."""
 NOISE_FACTORS = {"times-eor": 10.0, "times-foregrounds": 0.1}
@@ -44,6 +47,7 @@ class Calamity2022(Paper):
         "redundant": "a run of a redundant array, each baseline modelled by itself",
         "redundant_modelling": "a run of the redundant array with one model per group (calibrator: calamity-redundant)",
         "low_snr": "a run with reflection gains alone",
+        "other_channels": "a run of the minimally redundant array with channels of another width",
         "paper_solver": "a run of the minimally redundant array with the paper's solver (solver: adamax)",
         "redundant_paper_solver": "a run of the redundant array with the paper's solver",
         "low_snr_paper_solver": "a run with reflection gains alone and the paper's solver",
@@ -66,10 +70,19 @@ class Calamity2022(Paper):
 
     def statements(self) -> Sequence[Statement]:
         """Return the statements, in the order of the paper's sections."""
-        from calstudy.papers.calamity2022 import calibration, computation, low_snr, positive_bias, redundant, window
+        from calstudy.papers.calamity2022 import (
+            calibration,
+            caveats,
+            computation,
+            low_snr,
+            method,
+            positive_bias,
+            redundant,
+            window,
+        )
         from calstudy.verdicts.statement import Statement
 
-        modules = (calibration, window, positive_bias, redundant, low_snr, computation)
+        modules = (method, calibration, window, positive_bias, redundant, low_snr, computation, caveats)
         return [item for module in modules for item in vars(module).values() if isinstance(item, Statement)]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
@@ -80,12 +93,20 @@ class Calamity2022(Paper):
         """
         if role == "run_time":
             return "an experiment measures no run times"
-        checks = (_other_calibrator, _other_gains, _other_noise, _other_data, _other_sky, _too_few_steps)
+        checks = (
+            _other_calibrator,
+            _other_gains,
+            _other_noise,
+            _other_data,
+            _other_sky,
+            _too_few_steps,
+            _same_channels,
+        )
         study = _study(role)
         found = next((refusal for check in checks if (refusal := check(study, experiment)) is not None), None)
         return _other_solver(experiment) if found is None and role != study else found
 
-    def refusal_of_run(self, role: str, results: RunResults) -> str | None:
+    def refusal_of_run(self, role: str, results: RunResults | PooledResults) -> str | None:
         """Return which setting of a run, or which property of its array, is not that of the role, or None."""
         refusal, study = self.refusal(role, results.experiment), _study(role)
         if refusal is not None or study == "low_snr":
@@ -168,6 +189,12 @@ def _other_sky(role: str, experiment: Experiment) -> str | None:
     del role
     if experiment.sky.diffuse.kind != "none":
         return f"sky.diffuse is {experiment.sky.diffuse.kind!r}, and the paper's sky has sources alone"
+    return None
+
+
+def _same_channels(role: str, experiment: Experiment) -> str | None:
+    if role == "other_channels" and experiment.instrument.channels.width == PAPER_WIDTH:
+        return f"instrument.channels.width is the paper's, {PAPER_WIDTH / 1e3:g} kHz"
     return None
 
 

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from calstudy.claims.results import RunResults
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
-from calstudy.verdicts.statement import Source
+from calstudy.verdicts.statement import Sentence, Source
 
 RESULTS = Source("Simulation Results", ("minimally_redundant",))
+SIMULATED = replace(RESULTS, tests_simulation=True)
 FACTOR_OF_TWO = "the paper's 'similar', 'about' and 'roughly' are read as within a factor of two"
 
 
 def _median(run: RunResults, name: str) -> Finding:
-    """Return the median over antennas or baselines, with their scatter as its uncertainty."""
+    """Return the median over antennas or baselines, with their scatter."""
     found = run.measured(name)
-    return Finding(found.value, found.scatter)
+    return Finding(found.value, found.scatter, "scatter")
 
 
-GAINS = "our fitted gains do not agree particularly well with the true gains, only on the ≲ 20 % level on all delays"
-GAINS_CAPTION = "their residuals are on the order of 10 %"
+GAINS = Sentence(
+    "gains-agree",
+    "our fitted gains do not agree particularly well with the true gains, only on the ≲ 20 % level on all delays",
+)
+GAINS_CAPTION = Sentence("gain-residuals", "their residuals are on the order of 10 %")
 
 
 @RESULTS.states(
@@ -61,7 +67,9 @@ def gains_of_order_10_percent(run: RunResults) -> Finding:
     return _median(run, "gains_aligned")
 
 
-GAINS_BY_DELAY = "even in the delay domain, the residuals are at 10 % at all delays"
+GAINS_BY_DELAY = Sentence(
+    "gain-residuals-by-delay", "even in the delay domain, the residuals are at 10 % at all delays"
+)
 
 
 @RESULTS.states(
@@ -100,7 +108,10 @@ def gains_of_order_10_percent_raw(run: RunResults) -> Finding:
     return _median(run, "gains_raw")
 
 
-MODEL = "the residual is on the order of ≈ 10-20 % and significantly exceeds the level of the thermal noise"
+MODEL = Sentence(
+    "model-residual",
+    "the residual is on the order of ≈ 10-20 % and significantly exceeds the level of the thermal noise",
+)
 
 
 @RESULTS.states(
@@ -120,8 +131,9 @@ def model_error_exceeds_noise(run: RunResults) -> Finding:
     return _median(run, "model_over_noise")
 
 
-PRODUCT = (
-    "our visibility model is accurate at the 0.1 % level and at a similar level to the thermal noise at all delays"
+PRODUCT = Sentence(
+    "visibility-model",
+    "our visibility model is accurate at the 0.1 % level and at a similar level to the thermal noise at all delays",
 )
 
 
@@ -157,7 +169,7 @@ def product_at_tenth_of_percent(run: RunResults) -> Finding:
 def product_far_better_than_gains(run: RunResults) -> Finding:
     gains, product = run.measured("gains_aligned"), run.measured("product_over_data")
     ratio = gains.value / product.value
-    return Finding(ratio, ratio * product.scatter / product.value)
+    return Finding(ratio, ratio * product.scatter / product.value, "scatter")
 
 
 @RESULTS.states(

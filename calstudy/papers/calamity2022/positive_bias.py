@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calstudy.claims.bins import power_without_eor, used_bins
+from calstudy.claims.realizations import over_realizations
 from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS
 from calstudy.papers.calamity2022.window import K_AGREEMENT, K_SMALL, POSITIVE
@@ -40,6 +41,7 @@ def _over_eor(run: RunResults, k_min: float, k_max: float) -> Finding:
     "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k <= 0.2",
     Within(0.5, 2),
     FACTOR_OF_TWO,
+    pooled=over_realizations("pull_without_eor", "outside-wedge", 0.0, K_AGREEMENT),
 )
 def bias_at_level_of_noise_below_0p2(run: RunResults) -> Finding:
     return _over_noise(run, 0.0, K_AGREEMENT)
@@ -50,18 +52,29 @@ def bias_at_level_of_noise_below_0p2(run: RunResults) -> Finding:
     "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k from 0.2 to 0.5",
     Within(0.5, 2),
     FACTOR_OF_TWO,
+    pooled=over_realizations("pull_without_eor", "outside-wedge", _above(K_AGREEMENT), K_SMALL),
 )
 def bias_at_level_of_noise_from_0p2_to_0p5(run: RunResults) -> Finding:
     return _over_noise(run, _above(K_AGREEMENT), K_SMALL)
 
 
-@RESULTS.states(POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k <= 0.2", Within(-1, 1), SLIGHT)
+@RESULTS.states(
+    POSITIVE,
+    "mean P^R without EoR over mean P^S, outside the wedge, k <= 0.2",
+    Within(-1, 1),
+    SLIGHT,
+    pooled=over_realizations("bias", "outside-wedge", 0.0, K_AGREEMENT),
+)
 def bias_lower_than_eor_below_0p2(run: RunResults) -> Finding:
     return _over_eor(run, 0.0, K_AGREEMENT)
 
 
 @RESULTS.states(
-    POSITIVE, "mean P^R without EoR over mean P^S, outside the wedge, k from 0.2 to 0.5", Within(-1, 1), SLIGHT
+    POSITIVE,
+    "mean P^R without EoR over mean P^S, outside the wedge, k from 0.2 to 0.5",
+    Within(-1, 1),
+    SLIGHT,
+    pooled=over_realizations("bias", "outside-wedge", _above(K_AGREEMENT), K_SMALL),
 )
 def bias_lower_than_eor_from_0p2_to_0p5(run: RunResults) -> Finding:
     return _over_eor(run, _above(K_AGREEMENT), K_SMALL)
@@ -72,6 +85,7 @@ def bias_lower_than_eor_from_0p2_to_0p5(run: RunResults) -> Finding:
     "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k > 0.5",
     Equal(0),
     "a bias at small k is not at larger k",
+    pooled=over_realizations("pull_without_eor", "outside-wedge", _above(K_SMALL)),
 )
 def no_bias_beyond_small_k(run: RunResults) -> Finding:
     return _over_noise(run, _above(K_SMALL), np.inf)

@@ -13,12 +13,13 @@ from calstudy.claims.bins import (
     rms_power,
     used_bins,
 )
+from calstudy.claims.realizations import over_realizations
 from calstudy.claims.results import RunResults
-from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS
+from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS, SIMULATED
 from calstudy.power.delay import horizon_delay
 from calstudy.power.spectra import CylindricalSpectrum
 from calstudy.verdicts.criterion import AtLeast, AtMost, Equal, Finding, Within
-from calstudy.verdicts.statement import Unevaluated
+from calstudy.verdicts.statement import Sentence, Unevaluated
 
 K_AGREEMENT = 0.2
 """The paper's P^R agrees with P^S beyond this, h/Mpc."""
@@ -53,10 +54,13 @@ def _row_ratio(run: RunResults, above: str, below: tuple[str, ...]) -> Finding:
     chosen = window(run, upper)
     total = sum(_rows(run.wedge(name).power.real, chosen) for name in below)
     low, middle, high = np.quantile(_rows(upper.power.real, chosen) / total, [0.16, 0.5, 0.84])
-    return Finding(float(middle), float(high - low) / 2)
+    return Finding(float(middle), float(high - low) / 2, "scatter")
 
 
-@RESULTS.states(
+FILLED = Sentence("window-filled", "the entire EoR window is filled in with systematics")
+
+
+@SIMULATED.states(
     "in our simulated visibilities without calibration errors, foreground power is contained within the wedge",
     "|P^{S+N+F}| in the window over |P^S| + |P^N|; medians",
     AtMost(2),
@@ -66,8 +70,8 @@ def foregrounds_contained(run: RunResults) -> Finding:
     return _row_ratio(run, "uncorrupted", ("eor", "noise"))
 
 
-@RESULTS.states(
-    "the entire EoR window is filled in with systematics",
+@SIMULATED.states(
+    FILLED,
     "part of the window in which P^V exceeds P^S",
     AtLeast(0.95),
     "the entire window, but for chance crossings of zero",
@@ -79,8 +83,8 @@ def leakage_fills_window(run: RunResults) -> Finding:
     return Finding(float(above.mean()), float(np.sqrt(above.mean() * (1 - above.mean()) / above.size)))
 
 
-@RESULTS.states(
-    "the entire EoR window is filled in with systematics",
+@SIMULATED.states(
+    FILLED,
     "|P^V| in the window over |P^S|; medians",
     AtLeast(100),
     "systematics orders of magnitude above the signal: two at least",
@@ -99,7 +103,7 @@ def systematics_removed_from_window(run: RunResults) -> Finding:
     return _row_ratio(run, "uncalibrated", ("residual",))
 
 
-@RESULTS.states(
+@SIMULATED.states(
     "clear positive and negative fluctuations arising from noise",
     "part of the window in which P^N is negative",
     Within(0.4, 0.6),
@@ -130,7 +134,15 @@ def calibrated_window_consistent(run: RunResults) -> Finding:
     return fraction_within(difference[chosen[rows]], (thermal[:, None] + sample)[chosen[rows]])
 
 
-BROAD = "P^R is in broad agreement with P^S beyond k ≳ 0.2 h/Mpc when we only average modes outside of the wedge"
+BROAD = Sentence(
+    "broad-agreement",
+    "P^R is in broad agreement with P^S beyond k ≳ 0.2 h/Mpc when we only average modes outside of the wedge",
+)
+UNBIASED = Sentence(
+    "relatively-unbiased",
+    "in both scenarios, it recovers relatively unbiased estimates of the power spectrum within the EoR window "
+    "(Conclusion)",
+)
 
 
 @RESULTS.states(
@@ -145,27 +157,39 @@ def residual_agrees_outside_wedge(run: RunResults) -> Finding:
     return fraction_within((residual.power - signal.power).real[used], residual.error[used])
 
 
-@RESULTS.states(BROAD, "mean P^R/P^S outside the wedge at k >= 0.2", Within(0.5, 2), FACTOR_OF_TWO)
+@RESULTS.states(
+    BROAD,
+    "mean P^R/P^S outside the wedge at k >= 0.2",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+    pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
+)
 def residual_level_outside_wedge(run: RunResults) -> Finding:
     return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
 
 
 @RESULTS.states(
-    "in both scenarios, it recovers relatively unbiased estimates of the power spectrum within the EoR window "
-    "(Conclusion)",
+    UNBIASED,
     "mean P^R/P^S outside the wedge at k >= 0.2; error of the difference, the EoR being common",
     Equal(1),
     "no bias beyond the errors",
+    pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
 def residual_unbiased_outside_wedge(run: RunResults) -> Finding:
     return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
 
 
 BIAS = "when we include modes inside of the wedge, we encounter negative bias out to ≈ 0.3 h/Mpc"
-BIAS_CAPTION = "our calibrated residual is biased below k ≲ 0.25 h/Mpc"
+BIAS_CAPTION = Sentence("biased-below-0p25", "our calibrated residual is biased below k ≲ 0.25 h/Mpc")
 
 
-@RESULTS.states(BIAS_CAPTION, "mean P^R/P^S of all modes at k <= 0.25", AtMost(1, 2), "a bias beyond the errors")
+@RESULTS.states(
+    BIAS_CAPTION,
+    "mean P^R/P^S of all modes at k <= 0.25",
+    AtMost(1, 2),
+    "a bias beyond the errors",
+    pooled=over_realizations("ratio", "all-modes", 0.0, K_BIAS),
+)
 def residual_biased_with_wedge(run: RunResults) -> Finding:
     return recovered(run.spherical("residual", "all-modes"), run.spherical("eor", "all-modes"), 0.0, K_BIAS)
 
@@ -190,7 +214,13 @@ def bias_with_wedge_ends_below_0p25(run: RunResults) -> Finding:
     return bias_extent(*(run.spherical(name, "all-modes") for name in ("residual", "eor")))
 
 
-NOISE_ONLY = "calibration residuals [without EoR] are an order of magnitude lower than the EoR"
+NOISE_ONLY = Sentence(
+    "residual-without-eor-lower",
+    "calibration residuals [without EoR] are an order of magnitude lower than the EoR",
+)
+BELOW_FOREGROUNDS = Sentence(
+    "90-db-below-foregrounds", "≈ 90 dB below the level of the foregrounds in the power-spectrum domain"
+)
 
 
 def _without_eor(run: RunResults) -> Finding:
@@ -231,7 +261,7 @@ def residual_without_eor_at_noise(run: RunResults) -> Finding:
 
 
 @RESULTS.states(
-    "≈ 90 dB below the level of the foregrounds in the power-spectrum domain",
+    BELOW_FOREGROUNDS,
     "rms P^R without EoR (outside the wedge, k >= 0.2) over the largest P^{S+F+N} of all modes, in dB; "
     "at least as far below",
     AtMost(-85),
@@ -242,7 +272,7 @@ def residual_without_eor_90_db_below_foregrounds(run: RunResults) -> Finding:
 
 
 @RESULTS.states(
-    "≈ 90 dB below the level of the foregrounds in the power-spectrum domain",
+    BELOW_FOREGROUNDS,
     "rms P^R without EoR (outside the wedge, k >= 0.2) over the largest P^{S+F+N} of all modes, in dB; neither "
     "less nor more",
     Within(-95, -85),
@@ -260,8 +290,9 @@ def _below_foregrounds(run: RunResults) -> Finding:
     return Finding(10 * np.log10(found.value / highest), 10 / np.log(10) * found.uncertainty / found.value)
 
 
-POSITIVE = (
-    "our noise residuals show a slight positive bias that is at roughly the same level as the thermal noise at small k"
+POSITIVE = Sentence(
+    "positive-bias",
+    "our noise residuals show a slight positive bias that is at roughly the same level as the thermal noise at small k",
 )
 
 
@@ -279,6 +310,7 @@ def _positive_bias(run: RunResults) -> Finding:
     "mean P^R without EoR at k <= 0.5 outside the wedge, in units of P^S; the run's own solver",
     AtLeast(0, 2),
     "positive beyond the errors",
+    pooled=over_realizations("bias", "outside-wedge", 0.0, K_SMALL),
 )
 def positive_bias_at_small_k(run: RunResults) -> Finding:
     return _positive_bias(run)
@@ -295,7 +327,10 @@ def positive_bias_at_small_k_with_papers_solver(run: RunResults) -> Finding:
     return _positive_bias(run)
 
 
-TAPERED = "our residual does significantly better than a tapered estimator, contaminated by Blackman-Harris sidelobes"
+TAPERED = Sentence(
+    "better-than-taper",
+    "our residual does significantly better than a tapered estimator, contaminated by Blackman-Harris sidelobes",
+)
 
 
 def _better_than_taper(run: RunResults, modes: str) -> Finding:

@@ -1,0 +1,94 @@
+"""Realizations of an experiment as the claims see them: means over all that was drawn, with errors by their scatter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calstudy.experiment.model import Experiment
+from calstudy.experiment.realizations import expand_realizations, members
+from calstudy.instrument.layouts import make_array, redundant_groups
+from calstudy.power.realizations import Design, mean_over_bins
+from calstudy.verdicts.criterion import Finding
+from calstudy.verdicts.statement import Unevaluated
+
+ARRAYS = "realizations.npz"
+
+
+@dataclass(frozen=True)
+class PooledResults:
+    """All realizations of one experiment.
+
+    Attributes
+    ----------
+    experiment
+        With its realizations.
+    arrays
+        Of the figure of the realizations, such as ``outside-wedge.values.bias`` (K, Nk) and ``outside-wedge.k`` (Nk,).
+    """
+
+    experiment: Experiment
+    arrays: Mapping[str, np.ndarray]
+
+    @classmethod
+    def of(cls, experiment: Experiment, folder: Path) -> PooledResults:
+        """Read the arrays from a folder that has them."""
+        with np.load(folder / ARRAYS) as arrays:
+            return cls(experiment, dict(arrays))
+
+    @property
+    def name(self) -> str:
+        """Name of the experiment."""
+        return self.experiment.name
+
+    @property
+    def redundant_fraction(self) -> float:
+        """Part of the baselines that have a redundant partner."""
+        enu = make_array(self.experiment.instrument).enu
+        first, second = np.triu_indices(len(enu), 1)
+        return redundant_groups(enu[second] - enu[first], self.experiment.power.redundancy_tolerance).redundant_fraction
+
+    def mean(self, quantity: str, modes: str, k_min: float = 0.0, k_max: float = np.inf) -> Finding:
+        """Return the mean of a quantity over bins of k and realizations.
+
+        Parameters
+        ----------
+        quantity
+            Of `calstudy.power.realizations.QUANTITIES` or `TRANSFER_QUANTITIES`, or "eor" for P^S over the power that
+            the sky was drawn from.
+        modes
+            "outside-wedge", "inside-wedge" or "all-modes".
+        k_min, k_max
+            Bins that are used, h/Mpc.
+
+        Raises
+        ------
+        Unevaluated
+            If there is none in which it is known in all realizations.
+        """
+        k, array = self.arrays[f"{modes}.k"], self.arrays.get(f"{modes}.values.{quantity}")
+        if quantity == "eor":
+            array = self.arrays[f"{modes}.eor"] / self.arrays[f"{modes}.input"]
+        if array is None:
+            raise Unevaluated(f"the realizations have no {quantity!r}")
+        found = mean_over_bins(array[:, (k >= k_min) & (k <= k_max)], self._design)
+        if not np.isfinite(found.value):
+            raise Unevaluated(f"no modes between k = {k_min:g} and {k_max:g} h/Mpc in all realizations")
+        return found
+
+    @property
+    def _design(self) -> Design:
+        experiment = self.experiment
+        blocks = zip(experiment.realizations, members(experiment), strict=True)
+        draws = [item.draws for item in expand_realizations(experiment)]
+        return Design(draws, [(block.draw, places) for block, places in blocks])
+
+
+def over_realizations(
+    quantity: str, modes: str, k_min: float = 0.0, k_max: float = np.inf
+) -> Callable[[PooledResults], Finding]:
+    """Return what measures a mean over realizations for a statement; parameters as for `PooledResults.mean`."""
+    return lambda run: run.mean(quantity, modes, k_min, k_max)

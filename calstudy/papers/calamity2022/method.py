@@ -1,0 +1,126 @@
+"""Claims on the method itself: its basis, its degeneracies, its loss, and the data it is tested on."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.calibrate.basis import delay_half_widths, make_basis
+from calstudy.calibrate.settings import ForegroundFit
+from calstudy.claims.bins import mean_of_common_errors
+from calstudy.claims.realizations import PooledResults
+from calstudy.claims.results import RunResults
+from calstudy.instrument.layouts import make_array
+from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
+from calstudy.verdicts.criterion import AtMost, Finding, Within
+from calstudy.verdicts.statement import Sentence, Source, Unevaluated
+
+METHOD = Source("CALAMITY", ("minimally_redundant",))
+REDUCTION = Source("Reduction of Simulation Products and Power Spectra", ("minimally_redundant",), True)
+FAR = 0.5
+"""h/Mpc, far from the wedge of all baselines of the paper's arrays."""
+K_WINDOW = 0.2
+HUNDREDTH = 0.01
+"""Of the EoR: less is not counted as loss."""
+
+VECTORS = Sentence(
+    "number-of-vectors",
+    "the number of DPSS vectors required to describe band-limited signals with delay half-width of ≈ τ is N_vec ≈ W",
+)
+
+
+def _vectors_over_bandwidth(run: RunResults, buffered: bool) -> Finding:
+    """Return the number of vectors over 2 N Δν τ, median and scatter over baselines."""
+    instrument, calibration = run.experiment.instrument, run.experiment.calibration
+    if not isinstance(calibration, ForegroundFit):
+        raise Unevaluated(f"{calibration.label} fits no foregrounds")
+    channels, lengths = instrument.channels, pdist(make_array(instrument).enu)
+    frequencies = channels.first + channels.width * np.arange(channels.count)
+    vectors = np.empty(lengths.size)
+    for bucket in make_basis(lengths, frequencies, calibration.basis).buckets:
+        vectors[bucket.members] = bucket.vectors.shape[1]
+    delay = delay_half_widths(lengths, calibration.basis) if buffered else lengths / SPEED_OF_LIGHT
+    found = vectors / (2 * channels.count * channels.width * delay)
+    low, middle, high = np.quantile(found, [0.16, 0.5, 0.84])
+    return Finding(float(middle), float(high - low) / 2, "scatter")
+
+
+@METHOD.states(
+    VECTORS,
+    "vectors of a baseline over its W with the light travel time between its antennas as τ; median",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+)
+def vectors_like_bandwidth_of_horizon(run: RunResults) -> Finding:
+    return _vectors_over_bandwidth(run, buffered=False)
+
+
+@METHOD.states(
+    VECTORS,
+    "vectors of a baseline over its W with the largest delay that is modelled as τ, buffer included; median",
+    Within(0.5, 2),
+    FACTOR_OF_TWO,
+)
+def vectors_like_bandwidth_of_basis(run: RunResults) -> Finding:
+    return _vectors_over_bandwidth(run, buffered=True)
+
+
+@METHOD.states(
+    "doing this limits any increases in variance and signal loss to the foreground wedge",
+    "1 - C²/T, the part of the EoR that is lost outside the wedge at k >= 0.5",
+    AtMost(HUNDREDTH),
+    "none, to a hundredth",
+    pooled=lambda run: _lost(run.mean("squared_coherence", "outside-wedge", FAR)),
+)
+def loss_limited_to_wedge(run: RunResults) -> Finding:
+    found = run.transfer("outside-wedge")
+    far = found.k >= FAR
+    return _lost(mean_of_common_errors(found.squared_coherence[far], found.squared_coherence_error[far]))
+
+
+def _lost(left: Finding) -> Finding:
+    return left._replace(value=1 - left.value)
+
+
+@METHOD.states(
+    "the cost function is completely degenerate with respect to a single complex gain multiplier",
+    "number of directions of the gains in which the cost has no curvature",
+    Within(2, 2),
+    "the real and the imaginary part of one multiplier",
+)
+def one_complex_degeneracy(run: RunResults) -> Finding:
+    raise Unevaluated(
+        "a run does not write the curvature of its cost; step 2.1 of the validation ladder finds that a phase of every "
+        "channel, one real scale, a tilt over the array and what is as smooth as the foregrounds are free"
+    )
+
+
+@REDUCTION.states(
+    "our foreground simulation contains beam interpolation artifacts which set an intrinsic systematics floor at "
+    "≈ -45 dB below the foreground brightness levels",
+    "largest amplitude of foregrounds beyond the wedge over that inside, in dB",
+    Within(-50, -40),
+    "≈ -45 dB, to half an order of magnitude of power",
+)
+def artefacts_at_minus_45_db(run: RunResults) -> Finding:
+    raise Unevaluated(
+        "all variants of a run have EoR or noise above that floor; 'calstudy check floor' measures it for every "
+        "interpolation of the beam"
+    )
+
+
+def _known_input(run: PooledResults) -> Finding:
+    return run.mean("eor", "outside-wedge", K_WINDOW)
+
+
+@REDUCTION.states(
+    "we fringe-stop each residual and average coherently; this leads to negligible signal loss for the baseline "
+    "lengths under consideration",
+    "P^S after the average over the power that the sky was drawn from, outside the wedge, k >= 0.2",
+    Within(0.95, 1.05),
+    "negligible is less than a twentieth",
+    pooled=_known_input,
+)
+def average_loses_nothing(run: RunResults) -> Finding:
+    raise Unevaluated("of one sky, P^S has the sample variance; needs realizations, which know the power put in")
