@@ -69,12 +69,13 @@ class Score:
     bin_edges: np.ndarray = field(metadata={"unit": "h/Mpc"})
     transfer: np.ndarray = field(metadata={"unit": ""})
     transfer_error: np.ndarray = field(metadata={"unit": ""})
-    cross_transfer: np.ndarray = field(metadata={"unit": ""})
     bias: np.ndarray = field(metadata={"unit": ""})
     bias_error: np.ndarray = field(metadata={"unit": ""})
     recovered: np.ndarray = field(metadata={"unit": ""})
     recovered_error: np.ndarray = field(metadata={"unit": ""})
     flux_scale: float = field(metadata={"unit": ""})
+    # Tables of results from before it was measured have none.
+    cross_transfer: np.ndarray = field(default_factory=lambda: np.array(np.nan), metadata={"unit": ""})
 
     def on_other_paths(self, linear: np.ndarray) -> Score:
         """Return scores whose errors of T include its difference from the linear response, (Nk,); NaN adds nothing."""
