@@ -157,7 +157,7 @@ class ComparisonFigure(StudyFigure):
 
 
 class CasesFigure(StudyFigure):
-    """A figure of a comparison: calibrators in worlds. Of its `settings`, `draw` finds those that are equal in all cases.
+    """A figure of a comparison: calibrators in worlds. `draw` finds those of its `settings` that all cases share.
 
     Attributes
     ----------

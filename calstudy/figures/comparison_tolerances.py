@@ -52,8 +52,8 @@ def draw_tolerances(
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
     eor_level
-        Of the EoR below the foregrounds, dB of amplitudes, for tolerances hold for it; None if it is not the same in all
-        cases, or not set relative to the foregrounds.
+        Amplitude of the EoR over that of the foregrounds in dB, to which the bias is relative; None if cases differ in
+        it, or it is not known.
     """
     from matplotlib.lines import Line2D
 
@@ -114,8 +114,8 @@ class ComparisonTolerances(CasesFigure):
 
     version: ClassVar[int] = 2
     caption = (
-        "Bias (left) and transfer function (right) against the severity of faults, with 95 % bars. The bias is in units of "
-        "the EoR at the level that is written above: for ten times less power it is ten times larger."
+        "Bias (left) and transfer function (right) against the severity of faults, with 95 % bars. The bias is in "
+        "units of the EoR, whose level is written above."
     )
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:

@@ -102,9 +102,9 @@ def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGai
     if not used.any():
         raise InputError(f"outputs.inspect.integration = {integration}: it was not calibrated; choose one that was")
     reference = np.where(used, truth.at(integration, fit.numbers), 0)
-    fitted = np.where(used, fit.values[integration], 0)
-    aligned, scale = align(fitted, reference)
-    return AlignedGains(fit.numbers, fit.frequency, reference, fitted, aligned, scale)
+    as_fitted = np.where(used, fit.values[integration], 0)
+    aligned, scale = align(as_fitted, reference)
+    return AlignedGains(fit.numbers, fit.frequency, reference, as_fitted, aligned, scale)
 
 
 def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
