@@ -20,7 +20,7 @@ from calstudy.products.files import read_json
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import SCORE, SUMMARY
 from calstudy.products.score import score as score_task
-from calstudy.products.tolerances import upper_limit
+from calstudy.products.tolerances import COUNTS, upper_limit
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.studies.comparison import Comparison
@@ -30,8 +30,6 @@ from calstudy.studies.study import Budget, make
 from calstudy.verdicts.tables import Table
 
 LOG = "score.log"
-LIMIT = 1.0
-"""A band of k counts if the upper limit of the bias is below this part of the EoR."""
 
 
 class Row(Section):
@@ -160,7 +158,7 @@ class _Standing:
             known = band["bias"] is not None and band["bias_error"] is not None and band["transfer"] is not None
             limit = upper_limit(band["bias"], band["bias_error"]) if known else float("inf")
             limits.append(limit)
-            if limit < LIMIT:
+            if limit < COUNTS:
                 kept.append(band["transfer"])
         return cls(len(kept), len(limits), sum(kept) / len(kept) if kept else 0.0, min(limits))
 
