@@ -90,11 +90,15 @@ def shown(name: str, job: Job) -> Any:
     return FIGURES.make(name).draw(job).shown
 
 
-def test_true_gains_are_the_products_and_the_fit_is_aligned_with_them(made):
+def test_gains_are_the_products_as_fitted_and_besides_aligned_with_the_truth(made):
     found = shown("gains", made.job("gains", "calibration", antennas=[2, 4]))
+    fitted = made.true[[2, 4]] * made.phase / SCALE
     np.testing.assert_array_equal(found.true.values, made.true[[2, 4]])
-    np.testing.assert_allclose(found.recovered.values, made.true[[2, 4]], atol=1e-12)
-    np.testing.assert_allclose(found.residual.values, 0, atol=1e-12)
+    np.testing.assert_allclose(found.recovered.values, fitted, atol=1e-12)
+    np.testing.assert_allclose(found.residual.values, made.true[[2, 4]] - fitted, atol=1e-12)
+    np.testing.assert_allclose(found.aligned_residual.values, 0, atol=1e-12)
+    # The phase cancels in the ratio, the scale does not.
+    np.testing.assert_allclose(found.correction.values, SCALE**2 - 1, atol=1e-12)
     assert found.antennas == (2, 4)
 
 
@@ -123,8 +127,9 @@ def test_an_error_of_one_antenna_is_shown_as_it_is(made, tmp_path):
     # The least-squares scale of seven antennas, one of which is 10 % too large.
     power = np.sum(np.abs(off.true) ** 2, axis=1)
     scale = (1.1 * power[0] + power[1:].sum()) / (1.21 * power[0] + power[1:].sum())
-    np.testing.assert_allclose(found.recovered.values[1], scale * off.true[1], rtol=1e-12)
-    np.testing.assert_allclose(found.correction.values, 1 / (1.1 * scale**2) - 1, atol=1e-12)
+    np.testing.assert_allclose(found.recovered.values[1], off.true[1], rtol=1e-12)
+    np.testing.assert_allclose(found.aligned_residual.values[1], (1 - scale) * off.true[1], rtol=1e-12)
+    np.testing.assert_allclose(found.correction.values, 1 / 1.1 - 1, atol=1e-12)
 
 
 def test_the_model_is_put_on_the_scale_of_the_true_gains(made):

@@ -151,7 +151,7 @@ class ComparisonFigure(StudyFigure):
 
 
 class CasesFigure(StudyFigure):
-    """A figure of a comparison: calibrators in worlds.
+    """A figure of a comparison: calibrators in worlds. `draw` finds those of its `settings` that all cases share.
 
     Attributes
     ----------
@@ -285,7 +285,11 @@ def cases_task(
     """
     with guarded(figure):
         inputs = {name: figure.inputs(graph)["score"] for name, graph in graphs.items()}
-    return _task(figure, stand_ins, labels, inputs)
+        first, *others = [figure.settings(graph) for graph in graphs.values()] or [{}]
+    common = {
+        key: value for key, value in first.items() if all(key in other and other[key] == value for other in others)
+    }
+    return _task(figure, stand_ins, {**labels, **common}, inputs)
 
 
 def observed_task(figure: ObservedFigure, graph: ObservedGraph, stand_ins: Sequence[str]) -> Task:

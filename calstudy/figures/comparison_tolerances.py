@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from calstudy.products.graph import Graph
+
 ROW_HEIGHT = 1.7
 LINEAR = 0.01
 """The axis of the bias is linear up to this, and logarithmic beyond."""
@@ -33,6 +35,7 @@ def draw_tolerances(
     cases: Mapping[str, Mapping[str, Case]],
     calibrators: Sequence[str],
     stand_ins: Sequence[str] = (),
+    eor_level: float | None = None,
 ) -> Figure:
     """Draw the bias on the left and T on the right against the severity of each fault, with 95 % bars.
 
@@ -48,6 +51,9 @@ def draw_tolerances(
         Their labels, in order.
     stand_ins
         See `calstudy.plotting.style.note_stand_ins`.
+    eor_level
+        Amplitude of the EoR over that of the foregrounds in dB, to which the bias is relative; None if cases differ in
+        it, or it is not known.
     """
     from matplotlib.lines import Line2D
 
@@ -68,7 +74,9 @@ def draw_tolerances(
             positions = _positions(fault)
             axes.set_xticks(positions, [f"{severity:g}" for severity in fault.severities])
             axes.set_xticks([], minor=True)
-    grid[0, 0].set_title(rf"$k = {BAND[0]:g}$–${BAND[1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
+    band = rf"$k = {BAND[0]:g}$–${BAND[1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$"
+    level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB of the foregrounds"
+    grid[0, 0].set_title(band + level, loc="left")
     scored = {name for found in cases.values() for name in found}
     looks = {name: look(place) for place, name in enumerate(calibrators) if name in scored}
     handles = [Line2D([], [], linewidth=0.7, **its) for its in looks.values()]
@@ -104,7 +112,15 @@ def _draw_points(
 class ComparisonTolerances(CasesFigure):
     """Bias and T against the severity of each fault: of worlds with labels such as ``positions: 2 cm``."""
 
-    caption = "Bias (left) and transfer function (right) against the severity of faults, with 95 % bars."
+    version: ClassVar[int] = 2
+    caption = (
+        "Bias (left) and transfer function (right) against the severity of faults, with 95 % bars. The bias is in "
+        "units of the EoR, whose level is written above."
+    )
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return the level of the EoR, to which all biases are relative."""
+        return {"eor_level": graph.experiment.corruption.eor_level}
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
         """Draw a row for each fault; raises InputError if the worlds name none."""
@@ -113,4 +129,5 @@ class ComparisonTolerances(CasesFigure):
             raise InputError(
                 f"figure {self.label!r}: no world has a label with a fault and a number, such as 'positions: 2 cm'"
             )
-        return draw_tolerances(found, cases, job.settings["calibrators"], job.settings["notes"])
+        labels, notes = job.settings["calibrators"], job.settings["notes"]
+        return draw_tolerances(found, cases, labels, notes, job.settings.get("eor_level"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 ANTENNA_COLOURS = ((style.BLUE, "#003A5C"), (style.ORANGE, "#7A5300"))
 """Colours of true and of recovered gains, for each antenna."""
+RATIO_LOOK: dict[str, Any] = {"color": style.BLACK, "linestyle": ":"}
 
 
 @dataclass(frozen=True)
@@ -34,25 +35,27 @@ class GainComparison:
     antennas
         The two antenna numbers.
     true, recovered, residual
-        Injected gains, solutions and true - recovered, spectra of shape (2, Nfreqs).
+        Injected gains, solutions as fitted and true - recovered, spectra of shape (2, Nfreqs).
+    aligned_residual
+        True gains less the solutions that are aligned with them, free of what no fit can know.
     correction
-        The gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, (Nfreqs,).
+        The gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, as fitted, (Nfreqs,).
     """
 
     antennas: tuple[int, int]
     true: TwoDomains
     recovered: TwoDomains
     residual: TwoDomains
+    aligned_residual: TwoDomains
     correction: TwoDomains
 
 
 def compare_gains(
-    antennas: tuple[int, int], frequency: np.ndarray, true: np.ndarray, recovered: np.ndarray
+    antennas: tuple[int, int], frequency: np.ndarray, true: np.ndarray, recovered: np.ndarray, aligned: np.ndarray
 ) -> GainComparison:
     """Compare true and recovered gains, (2, Nfreqs) complex, on channels `frequency` (Nfreqs,) Hz.
 
-    The recovered gains must have their degeneracies fixed (overall scale and phase), or residuals mean nothing. Where
-    there is no solution both are zero.
+    Where there is no solution all are zero.
 
     Parameters
     ----------
@@ -60,18 +63,21 @@ def compare_gains(
         The two antenna numbers.
     frequency
         Channel centres, Hz, (Nfreqs,).
-    true, recovered
-        Gains, complex, (2, Nfreqs).
+    true, recovered, aligned
+        Gains: injected, as fitted, and fitted with the scale and the phase of each channel that come closest to the
+        truth; complex, (2, Nfreqs).
     """
-    if np.shape(true) != (2, frequency.size) or np.shape(recovered) != (2, frequency.size):
+    if any(np.shape(gains) != (2, frequency.size) for gains in (true, recovered, aligned)):
         raise ValueError(
-            f"gains have shapes {np.shape(true)} and {np.shape(recovered)}, expected two antennas and "
-            f"{frequency.size} channels"
+            f"gains have shapes {np.shape(true)}, {np.shape(recovered)} and {np.shape(aligned)}, expected two antennas "
+            f"and {frequency.size} channels"
         )
     products = [gains[0] * np.conj(gains[1]) for gains in (true, recovered)]
     known = products[1] != 0
     ratio = np.divide(products[0], products[1], out=np.ones(frequency.size, complex), where=known) - 1
-    spectra = (in_two_domains(frequency, values) for values in (true, recovered, true - recovered, ratio))
+    spectra = (
+        in_two_domains(frequency, values) for values in (true, recovered, true - recovered, true - aligned, ratio)
+    )
     return GainComparison(antennas, *spectra)
 
 
@@ -79,24 +85,37 @@ def compare_gains(
 def draw_gains(comparison: GainComparison, stand_ins: Sequence[str] = ()) -> Figure:
     """Draw real parts against frequency (left) and transforms' amplitudes against delay (right).
 
-    True gains are solid, recovered dashed, residuals dotted; the gain-correction ratio is black and dotted.
+    True gains are solid, recovered dashed, residuals as fitted dotted, and aligned thin and solid; the gain-correction
+    ratio is black and dotted.
     """
-    figure, (*gains, residuals), delays = frequency_and_delay(rows=3)
+    figure, (*gains, as_fitted, aligned), delays = frequency_and_delay(rows=4)
     for index, (bright, dark) in enumerate(ANTENNA_COLOURS):
+        true, recovered, residual, aligned_residual = _looks(bright, dark)
         axes = gains[index]
-        _draw_both(axes, delays, comparison.true, index, {"color": bright, "linestyle": "-", "linewidth": 0.9})
-        _draw_both(axes, delays, comparison.recovered, index, {"color": dark, "linestyle": "--", "linewidth": 0.7})
-        _draw_both(residuals, delays, comparison.residual, index, {"color": bright, "linestyle": ":", "linewidth": 1.0})
+        _draw_both(axes, delays, comparison.true, index, true)
+        _draw_both(axes, delays, comparison.recovered, index, recovered)
+        _draw_both(as_fitted, delays, comparison.residual, index, residual)
+        _draw_both(aligned, delays, comparison.aligned_residual, index, aligned_residual)
         axes.set_ylabel(rf"Re $g_{{{comparison.antennas[index]}}}$")
     ratio = comparison.correction
-    black: dict[str, Any] = {"color": style.BLACK, "linestyle": ":"}
-    residuals.plot(ratio.frequency / 1e6, ratio.real, **black)
-    delays.plot(ratio.delay * 1e9, np.abs(ratio.transform), **black)
-    residuals.set_ylabel("Re residual")
+    as_fitted.plot(ratio.frequency / 1e6, ratio.real, **RATIO_LOOK)
+    delays.plot(ratio.delay * 1e9, np.abs(ratio.transform), **RATIO_LOOK)
+    as_fitted.set_ylabel("Re residual,\nas fitted", linespacing=1.0)
+    aligned.set_ylabel("Re residual,\naligned", linespacing=1.0)
     delay_panel(delays, comparison.true.delay, r"$|\widetilde{g}(\tau)|$")
     _add_legend(figure, comparison.antennas)
     style.note_stand_ins(figure, stand_ins)
     return figure
+
+
+def _looks(bright: str, dark: str) -> tuple[dict[str, Any], ...]:
+    """Return how gains of an antenna look: true, recovered, and what is left as fitted and aligned."""
+    return (
+        {"color": bright, "linestyle": "-", "linewidth": 0.9},
+        {"color": dark, "linestyle": "--", "linewidth": 0.7},
+        {"color": bright, "linestyle": ":", "linewidth": 1.0},
+        {"color": dark, "linestyle": "-", "linewidth": 0.5},
+    )
 
 
 def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: dict[str, Any]) -> None:
@@ -107,18 +126,16 @@ def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: 
 def _add_legend(figure: Figure, antennas: tuple[int, int]) -> None:
     from matplotlib.lines import Line2D
 
-    handles = []
-    for number, (bright, dark) in zip(antennas, ANTENNA_COLOURS, strict=True):
-        looks: tuple[tuple[str, dict[str, Any]], ...] = (
-            ("true", {"color": bright, "linestyle": "-"}),
-            ("recovered", {"color": dark, "linestyle": "--"}),
-            ("residual", {"color": bright, "linestyle": ":"}),
-        )
-        handles += [Line2D([], [], label=rf"$g_{{{number}}}$ {name}", **look) for name, look in looks]
+    names = ("true", "recovered, as fitted", "residual as fitted", "residual aligned")
+    handles = [
+        Line2D([], [], label=rf"$g_{{{number}}}$ {name}", **look)
+        for number, colours in zip(antennas, ANTENNA_COLOURS, strict=True)
+        for name, look in zip(names, _looks(*colours), strict=True)
+    ]
     a, b = antennas
-    ratio = rf"$g_{{{a}}}g_{{{b}}}^*/(\hat{{g}}_{{{a}}}\hat{{g}}_{{{b}}}^*)-1$"
-    handles.append(Line2D([], [], color=style.BLACK, linestyle=":", label=ratio))
-    figure.legend(handles=handles, loc="outside upper center", ncols=7, columnspacing=1.1)
+    ratio = rf"$g_{{{a}}}g_{{{b}}}^*/(\hat{{g}}_{{{a}}}\hat{{g}}_{{{b}}}^*)-1$, as fitted"
+    handles.append(Line2D([], [], label=ratio, **RATIO_LOOK))
+    figure.legend(handles=handles, loc="outside upper center", ncols=5, columnspacing=1.1)
 
 
 def inspected(graph: Graph) -> dict[str, Any]:
@@ -141,13 +158,20 @@ def inspected_calibration(graph: Graph) -> dict[str, Task]:
 class Gains(StudyFigure):
     """True and fitted gains of two antennas in one integration."""
 
-    caption = "Gains of two antennas: true, recovered, and their ratio."
+    version: ClassVar[int] = 2
+    caption = (
+        "Gains of two antennas: true, recovered, what is left as fitted and free of the phase of each channel and the "
+        "scale, which no data determine (aligned), and their ratio."
+    )
     variants = ("residual",)
     needs_calibration = True
     tolerances = (
         # The errors of the gains lie at small delays, far above their rms.
-        (r"(recovered|residual)\.transform", Drawn(rms_of("residual"), "the rms error of the gains", largest=12.0)),
-        (r"(recovered|residual)\..*", Drawn(rms_of("residual"), "the rms error of the gains")),
+        (
+            r"(recovered|residual|aligned_residual)\.transform",
+            Drawn(rms_of("residual"), "the rms error of the gains", largest=12.0),
+        ),
+        (r"(recovered|residual|aligned_residual)\..*", Drawn(rms_of("residual"), "the rms error of the gains")),
         (r"correction\..*", Drawn(departure_from_mean, "the rms of the ratio about its mean")),
     )
 
@@ -168,5 +192,6 @@ class Gains(StudyFigure):
         rows = gains.rows(numbers)
         for row, number in zip(rows, numbers, strict=True):
             require_used(gains.fitted[row] != 0, [number], job.settings["integration"])
-        comparison = compare_gains(tuple(numbers), gains.frequency, gains.true[rows], gains.fitted[rows])
+        shown = (values[rows] for values in (gains.true, gains.fitted, gains.aligned))
+        comparison = compare_gains(tuple(numbers), gains.frequency, *shown)
         return Drawing(draw_gains(comparison, stand_ins=job.settings["notes"]), comparison)

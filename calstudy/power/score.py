@@ -13,17 +13,20 @@ from T is a part of the error of T.
 
 Noise is in the errors of the last two, and not in their means, because spectra are crossed between two realizations of
 the noise. Errors are found by leaving out antennas (`calstudy.power.clusters`).
+
+Two calibrations of the same data have the same sky, gains and noise. Most of what makes their scores scatter is common
+to both, so that the error of a difference is found by leaving out the same antennas in both.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calstudy.power.clusters import clusters_in_k
-from calstudy.power.spectra import DelaySpectra
+from calstudy.power.clusters import clusters_in_k, linear_error
+from calstudy.power.spectra import DelaySpectra, of_common_units
 
 BANDS = (0.1, 0.2, 0.5, 1.0)
 """Edges in h/Mpc of the bands in which calibrations are compared."""
@@ -83,6 +86,27 @@ class Score:
         return replace(self, transfer_error=np.hypot(self.transfer_error, spread))
 
 
+@dataclass(frozen=True)
+class Difference:
+    """How the scores of two calibrations of the same data differ in Nk bins of |k|, outside the wedge.
+
+    Attributes
+    ----------
+    bin_edges
+        (Nk + 1,), h/Mpc.
+    transfer, transfer_error
+        T s^2 of the first less that of the second, and its standard deviation, (Nk,).
+    bias, bias_error
+        The same of s^2 P^R0 / P^S.
+    """
+
+    bin_edges: np.ndarray
+    transfer: np.ndarray
+    transfer_error: np.ndarray
+    bias: np.ndarray
+    bias_error: np.ndarray
+
+
 def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
     """Return the scores in bins of |k| outside the wedge; `edges` and `buffer` are as in `clusters_in_k`.
 
@@ -108,3 +132,47 @@ def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scal
         recovered_error=recovered_error,
         flux_scale=flux_scale,
     )
+
+
+def difference(
+    calibrations: tuple[CalibratedSpectra, CalibratedSpectra],
+    edges: ArrayLike,
+    buffer: float,
+    flux_scales: tuple[float, float],
+) -> Difference:
+    """Return how the scores of two calibrations of the same data differ, of the units that both have.
+
+    Parameters
+    ----------
+    calibrations
+        Their spectra.
+    edges, buffer
+        As for `score`.
+    flux_scales
+        s of both; NaN if not known.
+
+    Raises
+    ------
+    InputError
+        If they have no unit in common.
+    """
+    limits = np.asarray(edges, dtype=float)
+    names = [item.name for item in fields(CalibratedSpectra)]
+    common = of_common_units(
+        {f"{name} {place}": getattr(one, name) for place, one in enumerate(calibrations) for name in names}
+    )
+    clusters = clusters_in_k(common["signal 0"], limits, buffer, inside=False)
+    sums = {name: clusters.powers(one) for name, one in common.items()}
+    found = []
+    for name in ("response", "residual_without_eor"):
+        powers, signals, values = [], [], []
+        for place, factor in enumerate((flux_scales[0] ** 2, -(flux_scales[1] ** 2))):
+            power, signal = sums[f"{name} {place}"], sums[f"signal {place}"]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                value = factor * power.total / signal.total
+                powers.append((factor / signal.total, power))
+                # As for a ratio, deviations are those from the mean ratio, which add up to zero.
+                signals.append((-value / signal.total, signal))
+            values.append(value)
+        found += [values[0] + values[1], linear_error((*powers, *signals))]
+    return Difference(limits, *found)

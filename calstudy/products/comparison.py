@@ -10,19 +10,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.base.resources import Cost
-from calstudy.products import score
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.products import score, spectra
 from calstudy.products.files import read_json
-from calstudy.products.tolerances import BAND, LIMIT, faults, tolerance
+from calstudy.products.graph import size_of
+from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Job, Stage, Task
 from calstudy.verdicts.tables import Table, number
 
 if TYPE_CHECKING:
-    from calstudy.power.score import Score
+    from calstudy.power.score import CalibratedSpectra, Score
 
 CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
 """What is compared in bands of k, and how it is headed."""
+DIFFERENCES = ("transfer", "transfer_error", "bias", "bias_error")
+SPECTRA = ("signal", "response", "residual", "residual_without_eor")
+"""What the scores are made from, and what differences of two of them are."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,11 @@ def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Task]
     notes
         What stands in for the papers' own ingredients.
     """
-    return Task(COMPARISON, "comparison", {"title": title, **labels, "notes": list(notes)}, scores)
+    powers = {f"{case}:{name}": task.inputs[name] for case, task in scores.items() for name in SPECTRA}
+    # All cases are measured alike.
+    buffers = {task.settings["power"].wedge_buffer for task in scores.values()}
+    settings = {"title": title, **labels, "notes": list(notes), "wedge_buffer": max(buffers, default=0.0)}
+    return Task(COMPARISON, "comparison", settings, {**scores, **powers})
 
 
 def read_cases(job: Job) -> dict[str, dict[str, Case]]:
@@ -84,20 +92,91 @@ def _read(folder: Path) -> Case:
     return Case(bins, bands, read_json(folder / score.SUMMARY))
 
 
+def best(found: Mapping[str, Case], band: int) -> str | None:
+    """Return the best calibrator of a world in a band of k, or None if nothing is known there.
+
+    It has the largest T of those whose bias is below the EoR with two standard deviations; if all are above, the
+    smallest upper limit of the bias.
+    """
+    limits = {
+        name: upper_limit(float(case.bands.bias[band]), float(case.bands.bias_error[band]))
+        for name, case in found.items()
+        if np.isfinite(case.bands.transfer[band])
+    }
+    known = {name: limit for name, limit in limits.items() if np.isfinite(limit)}
+    below = [name for name, limit in known.items() if limit < COUNTS]
+    if below:
+        return max(below, key=lambda name: float(found[name].bands.transfer[band]))
+    return min(known, key=lambda name: known[name], default=None)
+
+
+def _read_spectra(job: Job, case: str) -> CalibratedSpectra:
+    from calstudy.power.score import CalibratedSpectra
+
+    return CalibratedSpectra(**{name: spectra.read_delay_spectra(job.inputs[f"{case}:{name}"]) for name in SPECTRA})
+
+
+def differences(job: Job, world: str, found: Mapping[str, Case]) -> dict[str, list[dict[str, Any]]]:
+    """Return T and bias of every calibrator less those of the best in each band, with paired errors.
+
+    Both are of the same sky, gains and noise, and the error is that of leaving out the same antennas in both.
+
+    Parameters
+    ----------
+    job
+        With the spectra of all cases.
+    world
+        Its label.
+    found
+        The cases there, by calibrator.
+
+    Returns
+    -------
+    By calibrator, for each band what ``best`` is called, and ``transfer`` and ``bias`` with errors; None if not known.
+    """
+    from calstudy.power.score import BANDS, difference
+
+    row = job.settings["worlds"].index(world)
+    names = {name: case_name(row, place) for place, name in enumerate(job.settings["calibrators"]) if name in found}
+    scales = {name: float(case.bands.flux_scale) for name, case in found.items()}
+    leaders = [best(found, band) for band in range(len(BANDS) - 1)]
+    result: dict[str, list[dict[str, Any]]] = {
+        name: [{"k": list(BANDS[band : band + 2]), "best": leader} for band, leader in enumerate(leaders)]
+        for name in found
+    }
+    for leader in dict.fromkeys(name for name in leaders if name is not None):
+        reference = _read_spectra(job, names[leader])
+        for name, bands in result.items():
+            pair = (reference if name == leader else _read_spectra(job, names[name]), reference)
+            less = difference(pair, BANDS, job.settings["wedge_buffer"], (scales[name], scales[leader]))
+            for band, entry in enumerate(bands):
+                if entry["best"] == leader:
+                    entry |= {key: _known(getattr(less, key)[band]) for key in DIFFERENCES}
+    return result
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
 def make_tables(job: Job) -> Mapping[str, Any]:
     """Write comparison.csv, comparison.json and comparison.md."""
     import json
 
     cases = read_cases(job)
+    less = {world: differences(job, world, found) for world, found in cases.items()}
     with (job.output / CSV).open("w", newline="", encoding="utf-8") as file:
         rows = list(_csv_rows(cases))
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    summaries = {world: {name: case.summary for name, case in found.items()} for world, found in cases.items()}
+    summaries = {
+        world: {name: {**case.summary, "differences": less[world][name]} for name, case in found.items()}
+        for world, found in cases.items()
+    }
     text = json.dumps(summaries, indent=1, ensure_ascii=False, allow_nan=False)
     (job.output / JSON).write_text(text + "\n", encoding="utf-8")
-    (job.output / MARKDOWN).write_text(_markdown(cases, job.settings), encoding="utf-8")
+    (job.output / MARKDOWN).write_text(_markdown(cases, less, job.settings), encoding="utf-8")
     return {}
 
 
@@ -127,7 +206,11 @@ def _statuses(summary: Mapping[str, Any]) -> str:
     return ", ".join(f"{count} {status}" for status, count in summary["by_status"].items())
 
 
-def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, Any]) -> str:
+def _markdown(
+    cases: Mapping[str, Mapping[str, Case]],
+    less: Mapping[str, Mapping[str, Sequence[Mapping[str, Any]]]],
+    settings: Mapping[str, Any],
+) -> str:
     lines = [
         f"# Calibrators compared: {settings['title']}",
         "",
@@ -140,6 +223,10 @@ def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, An
         "process that solved, libraries and what earlier work left included: an upper bound, but for programs that a "
         "calibrator starts (DP3), which are not in it.",
         "",
+        "Calibrators see the same sky, gains and noise, so that a difference of two is known better than either: the "
+        "errors of differences are found by leaving out the same antennas in both. The best in a band has the largest "
+        "T of those with |bias| + 2σ below the EoR; if none is, the smallest |bias| + 2σ.",
+        "",
         *(f"Stand-in: {note}." for note in settings["notes"]),
         *([""] if settings["notes"] else []),
     ]
@@ -149,6 +236,8 @@ def _markdown(cases: Mapping[str, Mapping[str, Case]], settings: Mapping[str, An
         if found:
             summaries = {name: case.summary for name, case in found.items()}
             lines += [_sky_models(found), "", score_table(summaries).markdown()]
+        if len(found) > 1:
+            lines += ["Less the best of each band:", "", _difference_table(less[world]).markdown()]
         refused = [(name, why) for place, name, why in settings["refusals"] if place == world]
         lines += [f"- {name} cannot work here: {why}" for name, why in refused] + ([""] if refused else [])
     return "\n".join(lines).rstrip() + "\n"
@@ -222,6 +311,24 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(headings, rows)
 
 
+def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
+    """Return differences from the best calibrator as a table, a row for each calibrator."""
+    bands = [band["k"] for band in next(iter(less.values()))]
+    headings = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
+    rows = [
+        (
+            name,
+            *(
+                "best" if band["best"] == name else _cell(band.get(key), band.get(f"{key}_error"))
+                for key in ("transfer", "bias")
+                for band in found
+            ),
+        )
+        for name, found in less.items()
+    ]
+    return Table(("calibrator", *headings), rows)
+
+
 def _cost_cells(summary: Mapping[str, Any]) -> tuple[str, str]:
     """Return processor seconds and memory; of gains from files nobody knows what they took."""
     # Scores of earlier versions have wall time under another name, which is not comparable.
@@ -239,4 +346,12 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.2g} %"
 
 
-COMPARISON = Stage(name="comparison", version=1, make=make_tables, cost=lambda task: Cost(2, disk=1e6))
+def _cost(task: Task) -> Cost:
+    cases = len(task.settings["worlds"]) * len(task.settings["calibrators"])
+    size = size_of(task)
+    # Spectra of two cases, and what their units owe to two antennas each.
+    held = 2 * len(SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
+    return Cost(2 + cases * (0.5 + held * 1e-8), LIBRARIES_MEMORY + held, 1e6)
+
+
+COMPARISON = Stage(name="comparison", version=2, make=make_tables, cost=_cost)

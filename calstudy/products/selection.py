@@ -50,26 +50,27 @@ class Gains:
 
 @dataclass(frozen=True)
 class AlignedGains:
-    """True and fitted gains of one integration, all antennas, the fit brought closest to the truth.
+    """True and fitted gains of one integration, all antennas, the fit as it is and brought closest to the truth.
 
     Attributes
     ----------
     numbers, frequency
         Antenna numbers (Nants,) and channel centres (Nfreqs,), Hz.
-    true, fitted
+    true, fitted, aligned
         Complex, (Nants, Nfreqs); zero where there is no solution.
     scale
-        What the fitted gains were multiplied by; the fitted model is to be divided by its square.
+        What the aligned gains were multiplied by; the fitted model is to be divided by its square.
     """
 
     numbers: np.ndarray
     frequency: np.ndarray
     true: np.ndarray
     fitted: np.ndarray
+    aligned: np.ndarray
     scale: float
 
     def rows(self, numbers: Sequence[int]) -> np.ndarray:
-        """Return where antennas are in `true` and `fitted`."""
+        """Return where antennas are in the gains."""
         return np.searchsorted(self.numbers, numbers)
 
 
@@ -101,8 +102,9 @@ def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGai
     if not used.any():
         raise InputError(f"outputs.inspect.integration = {integration}: it was not calibrated; choose one that was")
     reference = np.where(used, truth.at(integration, fit.numbers), 0)
-    aligned, scale = align(np.where(used, fit.values[integration], 0), reference)
-    return AlignedGains(fit.numbers, fit.frequency, reference, aligned, scale)
+    as_fitted = np.where(used, fit.values[integration], 0)
+    aligned, scale = align(as_fitted, reference)
+    return AlignedGains(fit.numbers, fit.frequency, reference, as_fitted, aligned, scale)
 
 
 def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:

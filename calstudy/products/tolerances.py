@@ -21,6 +21,8 @@ LIMIT = 0.1
 """Bias over the EoR that is tolerated."""
 BAND = (0.2, 0.5)
 """Band of k, h/Mpc, in which it is."""
+COUNTS = 1.0
+"""A band of k counts if the upper limit of the bias is below this part of the EoR."""
 SIGMAS = 2.0
 """A bias of fewer standard deviations may be none."""
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")

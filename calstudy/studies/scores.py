@@ -25,7 +25,7 @@ from calstudy.products.files import read_json
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import MEASURED, SUMMARY
 from calstudy.products.score import score as score_task
-from calstudy.products.tolerances import upper_limit
+from calstudy.products.tolerances import COUNTS, upper_limit
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.studies.comparison import Comparison
@@ -37,8 +37,6 @@ from calstudy.verdicts.tables import Table, one_line, plain_text
 LOG = "score.log"
 VERIFIED = "verified.txt"
 """Lines of a SHA-256 of a file of scores, and who scored its gains or program again; kept by who keeps the page."""
-LIMIT = 1.0
-"""A band of k counts if the upper limit of the bias is below this part of the EoR."""
 Label = Annotated[str, StringConstraints(pattern=r"^[\w(][\w.,:;()+\-−±%=°'² ]*$", max_length=80)]
 """Letters, digits, spaces and common signs in one line, which mean nothing in Markdown or HTML."""
 Measured = Annotated[float, Field(ge=-1e30, le=1e30)] | None
@@ -234,7 +232,7 @@ class _Standing:
             limit = upper_limit(band["bias"], band["bias_error"]) if known else float("inf")
             limits.append(limit)
             # No calibration leaves more than all of the signal, or less than none.
-            if limit < LIMIT and -band["transfer_error"] <= band["transfer"] <= 1 + band["transfer_error"]:
+            if limit < COUNTS and -band["transfer_error"] <= band["transfer"] <= 1 + band["transfer_error"]:
                 kept.append(band["transfer"])
         return cls(len(kept), len(limits), sum(kept) / len(kept) if kept else 0.0, min(limits))
 

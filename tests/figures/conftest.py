@@ -152,7 +152,7 @@ def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra)
             "solver comparison": lambda: draw_solver_comparison(
                 {"one": (make_column(4), excised), "two": (excised, make_column(3, empty=1))}, **note
             ),
-            "gains": lambda: draw_gains(compare_gains((0, 1), FREQUENCY, *gains), **note),
+            "gains": lambda: draw_gains(compare_gains((0, 1), FREQUENCY, *gains, gains[1]), **note),
             "model": lambda: draw_model(visibility_comparison, **note),
             "data": lambda: draw_data(visibility_comparison, **note),
             "baselines": lambda: draw_baselines(baseline_spectra, **note),

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calstudy.calibrate.degeneracy import align
 from calstudy.figures.baselines import draw_baselines
 from calstudy.figures.data import draw_data
 from calstudy.figures.gains import compare_gains, draw_gains
@@ -50,8 +51,10 @@ def test_correction_is_blind_to_what_calibration_cannot_know():
     rng = np.random.default_rng(31)
     true = 1 + 0.1 * complex_normal(rng, 2, 384)
     recovered = true * np.exp(1j * rng.uniform(0, 6.28, 384))
-    comparison = compare_gains((0, 1), FREQUENCY, true, recovered)
+    aligned, _ = align(recovered, true)
+    comparison = compare_gains((0, 1), FREQUENCY, true, recovered, aligned)
     assert np.abs(comparison.residual.values).max() > 0.5
+    np.testing.assert_allclose(comparison.aligned_residual.values, 0, atol=1e-12)
     np.testing.assert_allclose(comparison.correction.values, 0, atol=1e-12)
     np.testing.assert_allclose(comparison.correction.transform, 0, atol=1e-12)
 
@@ -60,7 +63,7 @@ def test_smooth_gain_errors_stay_at_low_delay_though_gains_do_not():
     rng = np.random.default_rng(32)
     true = 1 + 0.1 * complex_normal(rng, 2, 384)
     smooth = 1 + 0.1 * np.cos(2 * np.pi * FREQUENCY * 60e-9)
-    comparison = compare_gains((0, 1), FREQUENCY, true, true * smooth)
+    comparison = compare_gains((0, 1), FREQUENCY, true, true * smooth, true * smooth)
     high = np.abs(comparison.true.delay) > 500e-9
     assert np.abs(comparison.correction.transform[high]).max() < 1e-4
     assert np.median(np.abs(comparison.residual.transform[:, high])) > 1e-4
@@ -69,27 +72,30 @@ def test_smooth_gain_errors_stay_at_low_delay_though_gains_do_not():
 
 def test_gains_are_drawn_as_the_caption_says():
     rng = np.random.default_rng(33)
-    true, recovered = 1 + 0.1 * complex_normal(rng, 2, 2, 384)
-    figure = draw_gains(compare_gains((0, 1), FREQUENCY, true, recovered))
-    *gains, residuals, delays = sorted(figure.axes, key=lambda axes: axes.get_xlabel() == "delay (ns)")
+    true, recovered, aligned = 1 + 0.1 * complex_normal(rng, 3, 2, 384)
+    figure = draw_gains(compare_gains((0, 1), FREQUENCY, true, recovered, aligned))
+    *gains, as_fitted, free, delays = sorted(figure.axes, key=lambda axes: axes.get_xlabel() == "delay (ns)")
     for index, axes in enumerate(gains):
         solid, dashed = axes.get_lines()
         assert (solid.get_linestyle(), dashed.get_linestyle()) == ("-", "--")
         np.testing.assert_allclose(xy(solid), (FREQUENCY / 1e6, true[index].real))
         np.testing.assert_allclose(xy(dashed), (FREQUENCY / 1e6, recovered[index].real))
-        residual = residuals.get_lines()[index]
-        assert residual.get_linestyle() == ":"
+        residual, thin = (panel.get_lines()[index] for panel in (as_fitted, free))
+        assert (residual.get_linestyle(), thin.get_linestyle()) == (":", "-")
         np.testing.assert_allclose(residual.get_ydata(), (true - recovered)[index].real)
+        np.testing.assert_allclose(thin.get_ydata(), (true - aligned)[index].real)
+    assert [panel.get_ylabel().split("\n")[1] for panel in (as_fitted, free)] == ["as fitted", "aligned"]
     ratio = true[0] * true[1].conj() / (recovered[0] * recovered[1].conj()) - 1
-    np.testing.assert_allclose(residuals.get_lines()[2].get_ydata(), ratio.real)
-    assert residuals.get_lines()[2].get_color() == "#000000"
+    np.testing.assert_allclose(as_fitted.get_lines()[2].get_ydata(), ratio.real)
+    assert as_fitted.get_lines()[2].get_color() == "#000000"
     expected = in_two_domains(FREQUENCY, ratio)
     np.testing.assert_allclose(xy(delays.get_lines()[-1]), (expected.delay * 1e9, np.abs(expected.transform)))
 
 
 def test_gains_of_other_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"shapes \(3, 384\) and \(2, 384\), expected two antennas and 384 channels"):
-        compare_gains((0, 1), FREQUENCY, np.ones((3, 384)), np.ones((2, 384)))
+    expected = r"shapes \(3, 384\), \(2, 384\) and \(2, 384\), expected two antennas and 384 channels"
+    with pytest.raises(ValueError, match=expected):
+        compare_gains((0, 1), FREQUENCY, np.ones((3, 384)), np.ones((2, 384)), np.ones((2, 384)))
 
 
 @pytest.mark.parametrize("draw", [draw_model, draw_data])

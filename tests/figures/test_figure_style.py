@@ -16,7 +16,14 @@ from matplotlib.text import Text
 
 from calstudy.plotting import style
 
-DIMENSIONLESS = {r"Re $g_{0}$", r"Re $g_{1}$", "Re residual", r"$|\widetilde{g}(\tau)|$", "number of antennas"}
+DIMENSIONLESS = {
+    r"Re $g_{0}$",
+    r"Re $g_{1}$",
+    "Re residual,\nas fitted",
+    "Re residual,\naligned",
+    r"$|\widetilde{g}(\tau)|$",
+    "number of antennas",
+}
 
 
 def all_axes(figure: Figure) -> list:

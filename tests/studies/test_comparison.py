@@ -219,3 +219,19 @@ def test_the_file_in_the_run_folder_is_the_same_comparison(compared, tmp_path):
     found = compare_figures(reference.figures, read_run(compared.folder).figures, reference.tolerances)
     assert found
     assert all(item.status == "same" for item in found)
+
+
+def test_differences_are_from_the_best_of_each_band_and_better_known_than_scores(compared, summaries):
+    for world, found in summaries.items():
+        for band in range(len(BANDS) - 1):
+            [best] = {case["differences"][band]["best"] for case in found.values()}
+            for name, case in found.items():
+                less, own, other = case["differences"][band], case["bands"][band], found[best]["bands"][band]
+                assert less["transfer"] == pytest.approx(own["transfer"] - other["transfer"], abs=1e-9)
+                if name == best:
+                    assert less["transfer_error"] == less["bias_error"] == 0
+    # With weights that hardly matter, both see the same noise.
+    less, own = summaries["ideal"]["trusting"]["differences"][1], summaries["ideal"]
+    assert less["bias_error"] < np.hypot(*(own[name]["bands"][1]["bias_error"] for name in (less["best"], "trusting")))
+    text = (compared.folder / "tables" / "comparison.md").read_text()
+    assert text.count("Less the best of each band:") == len(WORLDS)

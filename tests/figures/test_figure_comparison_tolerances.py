@@ -1,0 +1,38 @@
+"""Tolerances say of which level of the EoR they are."""
+
+import numpy as np
+import pytest
+
+from calstudy.figures.comparison_tolerances import draw_tolerances
+from calstudy.power.score import BANDS, Score
+from calstudy.products.comparison import Case
+from calstudy.products.tolerances import faults
+
+EDGES = np.array(BANDS)
+WORLDS = {"ideal": 0.0, "positions: 1 cm": 0.3, "positions: 10 cm": 30.0}
+
+
+def made_up(bias: float) -> Case:
+    bins = EDGES.size - 1
+    ones = np.ones(bins)
+    bands = Score(
+        k=(EDGES[1:] + EDGES[:-1]) / 2,
+        bin_edges=EDGES,
+        transfer=0.9 * ones,
+        transfer_error=0.01 * ones,
+        bias=bias * ones,
+        bias_error=0.01 * ones,
+        recovered=ones,
+        recovered_error=0.01 * ones,
+        flux_scale=1.0,
+    )
+    return Case(bands, bands, {})
+
+
+@pytest.mark.parametrize(("level", "title"), [(-40.0, "$, EoR at $-40$ dB of the foregrounds"), (None, "{-1}$")])
+def test_the_level_of_the_eor_stands_above_the_figure_if_all_cases_have_one(level, title):
+    cases = {world: {"one": made_up(bias)} for world, bias in WORLDS.items()}
+    figure = draw_tolerances(faults(list(WORLDS)), cases, ["one"], eor_level=level)
+    bias, _ = figure.axes
+    assert bias.get_title(loc="left").endswith(title)
+    np.testing.assert_allclose(bias.get_lines()[0].get_ydata(), list(WORLDS.values()))

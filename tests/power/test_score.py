@@ -1,0 +1,116 @@
+"""Differences of calibrations of the same data: what is common to both is not in their error."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from calstudy.power.delay import delays
+from calstudy.power.score import CalibratedSpectra, Difference, difference, score
+from calstudy.power.spectra import DelaySpectra
+
+ANTENNAS = 16
+PAIRS = np.array(list(itertools.combinations(range(ANTENNAS), 2)))
+CHANNELS, DELAYS = 1e5, 8
+EDGES, BUFFER = (0.0, 100.0), -1.0
+DRAWS = 200
+
+
+def spectra(visibilities: np.ndarray) -> DelaySpectra:
+    """Spectra of each baseline crossed with itself, (Nbls, Nd) complex amplitudes in delay."""
+    power = np.abs(visibilities) ** 2
+    units = np.repeat(np.arange(len(PAIRS)), 2)
+    return DelaySpectra(
+        power=power.astype(complex),
+        vectors=np.column_stack([PAIRS, np.zeros(len(PAIRS))]).astype(float),
+        n_pairs=np.ones(len(PAIRS), int),
+        n_polarizations=1,
+        delay=delays(DELAYS, CHANNELS),
+        k_perp=np.full(len(PAIRS), 0.1),
+        k_parallel=np.linspace(0.1, 1, DELAYS),
+        frequency=180e6,
+        omega_pp=0.1,
+        taper="none",
+        share_unit=units,
+        share_antenna=PAIRS.ravel(),
+        share_pairs=np.ones(units.size, int),
+        share_power=power[units].astype(complex),
+    )
+
+
+def complex_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+
+def calibrated(signal: np.ndarray, antennas: np.ndarray, left: np.ndarray) -> CalibratedSpectra:
+    """What a calibration leaves that multiplies the EoR by errors of the antennas, and leaves foregrounds besides."""
+    response = signal * (antennas[PAIRS[:, 0]] * antennas[PAIRS[:, 1]])[:, None]
+    return CalibratedSpectra(spectra(signal), spectra(response), spectra(response + left), spectra(left))
+
+
+def of_draw(seed: int, apart: float) -> tuple[CalibratedSpectra, CalibratedSpectra]:
+    """Two calibrations of one draw of the sky, whose errors are the same but for a part `apart` of them."""
+    rng = np.random.default_rng(seed)
+    signal, left = (complex_normal(rng, len(PAIRS), DELAYS) for _ in range(2))
+    errors = 0.3 * rng.normal(size=ANTENNAS)
+    others = [apart * 0.3 * rng.normal(size=ANTENNAS) for _ in range(2)]
+    first, second = (
+        calibrated(signal, 1 + errors + other, left * (1 + other[PAIRS].sum(axis=1))[:, None]) for other in others
+    )
+    return first, second
+
+
+def less(pair: tuple[CalibratedSpectra, CalibratedSpectra], scales: tuple[float, float] = (1.0, 1.0)) -> Difference:
+    return difference(pair, EDGES, BUFFER, scales)
+
+
+def test_a_calibration_does_not_differ_from_itself():
+    one, _ = of_draw(0, 0.1)
+    found = less((one, one), (1.02, 1.02))
+    assert found.transfer == found.transfer_error == found.bias == found.bias_error == 0
+
+
+def test_a_difference_is_that_of_the_scores_free_of_either_flux_scale():
+    pair, scales = of_draw(1, 0.5), (1.02, 0.97)
+    alone = [score(one, EDGES, BUFFER, scale) for one, scale in zip(pair, scales, strict=True)]
+    found = less(pair, scales)
+    for name in ("transfer", "bias"):
+        expected = getattr(alone[0], name) - getattr(alone[1], name)
+        assert getattr(found, name) == pytest.approx(expected, rel=1e-9)
+
+
+def test_against_a_perfect_calibration_the_error_is_that_of_the_score():
+    """T of 1 has no error, nor has a bias of 0: nothing is common."""
+    one, _ = of_draw(2, 0.5)
+    signal = one.signal
+    nothing = spectra(np.zeros((len(PAIRS), DELAYS)))
+    found, alone = less((one, CalibratedSpectra(signal, signal, signal, nothing))), score(one, EDGES, BUFFER, 1.0)
+    assert found.transfer_error == pytest.approx(alone.transfer_error, rel=1e-9)
+    assert found.bias_error == pytest.approx(alone.bias_error, rel=1e-9)
+
+
+@pytest.mark.parametrize("apart", [0.03, 1.0])
+def test_paired_errors_are_the_scatter_of_draws_and_far_below_those_of_scores_that_differ_little(apart):
+    draws = [of_draw(seed, apart) for seed in range(DRAWS)]
+    found = [less(pair) for pair in draws]
+    alone = [score(one, EDGES, BUFFER, 1.0) for one in draws[0]]
+    for name in ("transfer", "bias"):
+        values, errors = (np.array([getattr(one, f"{name}{kind}")[0] for one in found]) for kind in ("", "_error"))
+        # The scatter of 200 draws is known to 5 %; limits are four times that, as for the errors of a single score.
+        assert np.sqrt(np.mean(errors**2)) / values.std(ddof=1) == pytest.approx(1.0, abs=0.2)
+        in_quadrature = np.hypot(*(getattr(one, f"{name}_error")[0] for one in alone))
+        assert errors[0] < (10 * apart * in_quadrature if apart < 0.1 else 1.5 * in_quadrature)
+
+
+def test_a_difference_is_of_the_baselines_that_both_have():
+    first, second = of_draw(3, 0.5)
+    kept = np.flatnonzero((PAIRS != 5).all(axis=1))
+    names = ("response", "residual", "residual_without_eor")
+    fewer = CalibratedSpectra(second.signal, *(getattr(second, name).of_units(kept) for name in names))
+    both = [
+        CalibratedSpectra(*(getattr(one, name).of_units(kept) for name in ("signal", *names)))
+        for one in (first, second)
+    ]
+    found, expected = less((first, fewer)), less((both[0], both[1]))
+    assert found.transfer == pytest.approx(expected.transfer, rel=1e-12)
+    assert found.transfer_error == pytest.approx(expected.transfer_error, rel=1e-12)
