@@ -45,7 +45,8 @@ def complex_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def calibrated(signal: np.ndarray, antennas: np.ndarray, left: np.ndarray) -> CalibratedSpectra:
     """What a calibration leaves that multiplies the EoR by errors of the antennas, and leaves foregrounds besides."""
     response = signal * (antennas[PAIRS[:, 0]] * antennas[PAIRS[:, 1]])[:, None]
-    return CalibratedSpectra(spectra(signal), spectra(response), spectra(response + left), spectra(left))
+    cross = spectra(signal.conj() * response)
+    return CalibratedSpectra(spectra(signal), spectra(response), cross, spectra(response + left), spectra(left))
 
 
 def of_draw(seed: int, apart: float) -> tuple[CalibratedSpectra, CalibratedSpectra]:
