@@ -222,7 +222,7 @@ def test_the_file_in_the_run_folder_is_the_same_comparison(compared, tmp_path):
 
 
 def test_differences_are_from_the_best_of_each_band_and_better_known_than_scores(compared, summaries):
-    for world, found in summaries.items():
+    for found in summaries.values():
         for band in range(len(BANDS) - 1):
             [best] = {case["differences"][band]["best"] for case in found.values()}
             for name, case in found.items():
