@@ -314,7 +314,7 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
 def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
     """Return differences from the best calibrator as a table, a row for each calibrator."""
     bands = [band["k"] for band in next(iter(less.values()))]
-    headings = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
+    headings = [f"Δ{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
     rows = [
         (
             name,
