@@ -16,9 +16,9 @@ EDGES, BUFFER = (0.0, 100.0), -1.0
 DRAWS = 200
 
 
-def spectra(visibilities: np.ndarray) -> DelaySpectra:
-    """Spectra of each baseline crossed with itself, (Nbls, Nd) complex amplitudes in delay."""
-    power = np.abs(visibilities) ** 2
+def spectra(visibilities: np.ndarray, others: np.ndarray | None = None) -> DelaySpectra:
+    """Spectra of each baseline crossed with itself, of (Nbls, Nd) complex amplitudes in delay, or of these and others."""
+    power = (visibilities.conj() * (visibilities if others is None else others)).real
     units = np.repeat(np.arange(len(PAIRS)), 2)
     return DelaySpectra(
         power=power.astype(complex),
@@ -45,8 +45,8 @@ def complex_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def calibrated(signal: np.ndarray, antennas: np.ndarray, left: np.ndarray) -> CalibratedSpectra:
     """What a calibration leaves that multiplies the EoR by errors of the antennas, and leaves foregrounds besides."""
     response = signal * (antennas[PAIRS[:, 0]] * antennas[PAIRS[:, 1]])[:, None]
-    cross = spectra(signal.conj() * response)
-    return CalibratedSpectra(spectra(signal), spectra(response), cross, spectra(response + left), spectra(left))
+    powers = (spectra(part) for part in (response + left, left))
+    return CalibratedSpectra(spectra(signal), spectra(response), spectra(signal, response), *powers)
 
 
 def of_draw(seed: int, apart: float) -> tuple[CalibratedSpectra, CalibratedSpectra]:
@@ -85,7 +85,10 @@ def test_against_a_perfect_calibration_the_error_is_that_of_the_score():
     one, _ = of_draw(2, 0.5)
     signal = one.signal
     nothing = spectra(np.zeros((len(PAIRS), DELAYS)))
-    found, alone = less((one, CalibratedSpectra(signal, signal, signal, nothing))), score(one, EDGES, BUFFER, 1.0)
+    found, alone = (
+        less((one, CalibratedSpectra(signal, signal, signal, signal, nothing))),
+        score(one, EDGES, BUFFER, 1.0),
+    )
     assert found.transfer_error == pytest.approx(alone.transfer_error, rel=1e-9)
     assert found.bias_error == pytest.approx(alone.bias_error, rel=1e-9)
 
