@@ -17,7 +17,7 @@ DRAWS = 200
 
 
 def spectra(visibilities: np.ndarray, others: np.ndarray | None = None) -> DelaySpectra:
-    """Spectra of each baseline crossed with itself, of (Nbls, Nd) complex amplitudes in delay, or of these and others."""
+    """Spectra of each baseline with itself, of (Nbls, Nd) complex amplitudes in delay, or of these times others."""
     power = (visibilities.conj() * (visibilities if others is None else others)).real
     units = np.repeat(np.arange(len(PAIRS)), 2)
     return DelaySpectra(
@@ -109,7 +109,7 @@ def test_paired_errors_are_the_scatter_of_draws_and_far_below_those_of_scores_th
 def test_a_difference_is_of_the_baselines_that_both_have():
     first, second = of_draw(3, 0.5)
     kept = np.flatnonzero((PAIRS != 5).all(axis=1))
-    names = ("response", "residual", "residual_without_eor")
+    names = ("response", "cross", "residual", "residual_without_eor")
     fewer = CalibratedSpectra(second.signal, *(getattr(second, name).of_units(kept) for name in names))
     both = [
         CalibratedSpectra(*(getattr(one, name).of_units(kept) for name in ("signal", *names)))
