@@ -216,5 +216,5 @@ def _cost(task: Task) -> Cost:
     return Cost(0.7 + disk * 5e-9, LIBRARIES_MEMORY + 3 * disk, disk)
 
 
-CALIBRATE_CHUNK = Stage(name="calibrate-chunk", version=5, make=calibrate_chunk, cost=_cost_of_chunk)
+CALIBRATE_CHUNK = Stage(name="calibrate-chunk", version=6, make=calibrate_chunk, cost=_cost_of_chunk)
 CALIBRATE = Stage(name="calibrate", version=2, make=assemble, cost=_cost)
