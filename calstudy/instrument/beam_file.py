@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
 from calstudy.base.downloads import default_directory, download
 from calstudy.base.errors import InputError
+from calstudy.base.package_files import PackageFile
 
-FILE = "mwa_full_embedded_element_pattern.h5"
+PACKAGED = PackageFile("mwa_pb", "data/mwa_full_embedded_element_pattern.h5")
+FILE = PACKAGED.path.name
 URL = f"http://ws.mwatelescope.org/static/{FILE}"
 SHA256 = "a7649c6e03b8128a1de4614c2f363af5fa44f3890ae27bf893d56ca337bc48ee"
 """SHA-256 of the file in mwa_pb 1.1, which was downloaded from the same address when the package was built."""
@@ -43,7 +44,7 @@ def find_beam() -> Path:
     InputError
         If there is neither.
     """
-    packaged = Path(str(files("mwa_pb") / "data" / FILE))
+    packaged = PACKAGED.path
     if packaged.is_file():
         return packaged
     downloaded = default_directory() / FILE

@@ -6,13 +6,13 @@ import csv
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.package_files import PackageFile
 from calstudy.instrument import settings as section
 from calstudy.instrument.hera import SPACING, core_positions, outrigger_positions
 from calstudy.instrument.sites import SITES, Place, east_north_up, place_of
@@ -40,6 +40,7 @@ MWA_TILES: dict[str, tuple[str, ...]] = {
     "mwa-extended": _tiles(OUTER_RECEIVERS) + LONG_BASELINE_TILES,
     "mwa-phase1": _tiles(range(1, 17)),
 }
+MWA_POSITIONS = PackageFile("pyuvdata", "data/mwa_ant_pos.csv")
 MWA_CONFIGURATIONS = (COMPACT_TILES, MWA_TILES["mwa-extended"], MWA_TILES["mwa-phase1"])
 
 # Optimal Golomb rulers by order (all their differences are distinct; length proved shortest).
@@ -175,10 +176,7 @@ def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
 
 def _mwa(settings: section.MwaLayout) -> Layout:
     """Tiles from the observatory positions that pyuvdata carries (ECEF relative to the array centre)."""
-    # Not importlib.resources, which would import the package: a second of every plan.
-    package = find_spec("pyuvdata")
-    assert package is not None, "a dependency"
-    with (Path(str(package.origin)).parent / "data" / "mwa_ant_pos.csv").open() as table:
+    with MWA_POSITIONS.path.open() as table:
         relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
     whole = next(tiles for tiles in MWA_CONFIGURATIONS if set(tiles) >= set(MWA_TILES[settings.kind]))
     tiles = MWA_TILES[settings.kind][: settings.count]

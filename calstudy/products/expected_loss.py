@@ -116,4 +116,4 @@ def _cost(task: Task) -> Cost:
     return Cost(6 + 0.8 * task.settings["probes"] * work, LIBRARIES_MEMORY + 1.5e9 * work, 1e6)
 
 
-EXPECTED_LOSS = Stage(name="expected-loss", version=3, make=expect, cost=_cost)
+EXPECTED_LOSS = Stage(name="expected-loss", version=4, make=expect, cost=_cost)

@@ -15,7 +15,7 @@ from calstudy.studies.sweep import Sweep
 
 
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
-    """Run the study of a reference folder, and return the run's folder.
+    """Run the study of a reference folder, and return the run's folder; products of other code are made again.
 
     Parameters
     ----------
@@ -34,4 +34,4 @@ def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: C
     study = load_study(reference / EXPERIMENT, None, overrides)
     if isinstance(study, Sweep):
         raise InputError(f"{reference}: is a sweep, which has no reference results")
-    return run_study(study, budget, console).folder
+    return run_study(study, budget, console, strict=True).folder

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import InputError
-from calstudy.run.store import RECORD, Product, Store
+from calstudy.run.store import Product, Store
 
 MANIFEST = "manifest.json"
 
@@ -65,9 +65,8 @@ def list_runs(folder: Path) -> list[RunEntry]:
 
 def products(store: Store) -> Iterator[Product]:
     """Yield all complete products of a store."""
-    for record in sorted(store.root.glob(f"*/*/{RECORD}")):
-        product = store.find(record.parent.parent.name, record.parent.name)
-        if product is not None:
+    for address in store.addresses():
+        if (product := store.find(*address)) is not None:
             yield product
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from importlib.resources import files
 from pathlib import Path
 
 import healpy
@@ -15,10 +14,11 @@ from pyradiosky import SkyModel
 from scipy.interpolate import RectBivariateSpline
 
 from calstudy.base.errors import InputError
+from calstudy.base.package_files import PackageFile
 from calstudy.sky import settings as section
 
 HASLAM_FREQUENCY = 408e6
-HASLAM_FILE = files("mwa_pb") / "data" / "radio408.RaDec.fits"
+HASLAM_FILE = PackageFile("mwa_pb", "data/radio408.RaDec.fits")
 # The map is in tenths of a kelvin, on a grid of 20 arcmin in B1950 coordinates, its middle at (0, 0).
 HASLAM_UNIT, HASLAM_STEP = 0.1, np.deg2rad(1 / 3)
 # The cosmic microwave background (Fixsen 2009, K) is in the map, and does not follow the power law of the Galaxy.
@@ -36,7 +36,7 @@ def brightness_temperature(settings: section.HaslamMap | section.SyntheticDiffus
         If the installed mwa_pb is without its copy of the Haslam map.
     """
     if isinstance(settings, section.HaslamMap):
-        return healpy.ud_grade(_haslam(Path(str(HASLAM_FILE))), settings.nside)
+        return healpy.ud_grade(_haslam(HASLAM_FILE.path), settings.nside)
     return _synthetic(settings)
 
 

@@ -6,7 +6,6 @@ import logging
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 
 from calstudy.base.errors import InputError
+from calstudy.base.package_files import PackageFile
 from calstudy.base.plugins import load_function, user_code
 from calstudy.sky import gleam
 from calstudy.sky import settings as section
@@ -25,6 +25,7 @@ from calstudy.sky.diffuse import add_skies, describe, make_diffuse
 
 LOG = logging.getLogger(__name__)
 
+G4JY = PackageFile("mwa_pb", "data/G4Jy_catalogue_allEGCcolumns.fits")
 # G4Jy (White et al. 2020) is complete above about this flux at 200 MHz, south of +30° and away from the Galactic plane.
 COMPLETE_FLUX = 4.0
 # With any higher flux limit the same sources are drawn, so that G4Jy components replace the same ones.
@@ -143,7 +144,7 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
 @lru_cache(maxsize=1)
 def _components(faintest: float, seed: int, index_scatter: float) -> tuple[Catalogue, int]:
     """Return G4Jy components and then synthetic sources, down to a flux in Jy, and the number of the former."""
-    real = read_gleam_table(Path(str(files("mwa_pb") / "data" / "G4Jy_catalogue_allEGCcolumns.fits")))
+    real = read_gleam_table(G4JY.path)
     synthetic = _population(faintest, seed, index_scatter)
     covered = _in_g4jy_area(synthetic)
     synthetic = synthetic.select(~covered | (synthetic.flux < COMPLETE_FLUX))

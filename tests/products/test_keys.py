@@ -6,6 +6,7 @@ import pytest
 from tiny import tiny
 
 from calstudy.base.identity import identity
+from calstudy.corrupt.interface import Effect
 from calstudy.experiment.files import override, validate
 from calstudy.products import calibration, corruption, signal_loss, simulation, spectra
 from calstudy.products.graph import Graph
@@ -211,6 +212,29 @@ def test_a_plug_in_counts_by_the_content_of_its_file(tmp_path):
     assert key(share=0.4) != before
     path.write_text(code.replace("0.5", "0.25"))
     assert key() != before
+
+
+def test_a_plug_in_counts_with_the_modules_that_it_imports_from_its_folder(tmp_path):
+    files = {
+        "quieter": "from calstudy.corrupt.interface import Effect\nfrom shares import share\n\n\n"
+        "class Quieter(Effect):\n    def apply(self, visibilities, observation, truth):\n        return share() * visibilities\n",
+        "shares": "from parts import half\n\n\ndef share():\n    return half\n",
+        "parts": "half = 0.5\n",
+        "unused": "half = 0.5\n",
+    }
+    for name, code in files.items():
+        (tmp_path / f"{name}.py").write_text(code)
+
+    def effect() -> Effect:
+        return validate(override(tiny(tmp_path), "corruption.effects", ["quieter.py"]), tmp_path).corruption.effects[0]
+
+    before = identity(effect())
+    assert effect().apply(1.0, None, {}) == 0.5
+    (tmp_path / "unused.py").write_text("half = 0.25\n")
+    assert identity(effect()) == before
+    (tmp_path / "parts.py").write_text("half = 0.25\n")
+    assert identity(effect()) != before
+    assert effect().apply(1.0, None, {}) == 0.25
 
 
 def test_a_calibration_is_one_task_however_many_products_need_it():
