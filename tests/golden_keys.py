@@ -4,7 +4,8 @@
 
 It has a line for each experiment and stage: how many products there are, a digest of the labels and keys of all of
 them, and their cost in a plan: seconds, the largest memory and the disk, bytes. A change of the code that moves no line
-makes the same products with the same names from the same settings.
+makes the same products with the same names from the same settings. Run times are left out: they have the machine in
+their keys.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ def now() -> dict[tuple[str, str], str]:
     return {
         (name, stage): _line(tasks)
         for name in experiment_names()
+        if name != "runtime"
         for stage, tasks in _by_stage(load_study(Path(name)).tasks).items()
     }
 

@@ -217,7 +217,8 @@ def test_a_plug_in_counts_by_the_content_of_its_file(tmp_path):
 def test_a_plug_in_counts_with_the_modules_that_it_imports_from_its_folder(tmp_path):
     files = {
         "quieter": "from calstudy.corrupt.interface import Effect\nfrom shares import share\n\n\n"
-        "class Quieter(Effect):\n    def apply(self, visibilities, observation, truth):\n        return share() * visibilities\n",
+        "class Quieter(Effect):\n    def apply(self, visibilities, observation, truth):\n"
+        "        return share() * visibilities\n",
         "shares": "from parts import half\n\n\ndef share():\n    return half\n",
         "parts": "half = 0.5\n",
         "unused": "half = 0.5\n",
