@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calstudy.base import downloads, mwa_files
+from calstudy.base import downloads, mwa_files, package_files
 from calstudy.base.downloads import download
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
@@ -81,7 +81,7 @@ def test_without_a_network_it_says_what_to_do(server, tmp_path):
 def test_files_of_the_package_are_those_that_would_be_fetched(name, monkeypatch, tmp_path):
     file = MWA_FILES[name]
     assert sha256(file.find()) == file.sha256
-    monkeypatch.setattr(mwa_files, "find_spec", lambda _: None)
+    monkeypatch.setattr(package_files, "find_spec", lambda _: None)
     monkeypatch.setattr(mwa_files, "default_directory", lambda: tmp_path / "cache")
     with pytest.raises(InputError, match=f"calstudy data fetch {name}', install mwa_pb 1.1, or"):
         file.find()

@@ -211,6 +211,21 @@ def test_nothing_is_deleted_unasked_and_what_runs_were_made_from_is_kept(used_st
     assert keys(used_store) == {"a", "b"}
 
 
+def test_a_store_is_verified_and_what_is_damaged_is_named(used_store, capsys):
+    assert "4 products" in output_of(capsys, "store", "--verify")
+    (used_store.folder("average", "a") / "data.bin").write_bytes(b"y" * 1000)
+    (used_store.folder("average", "b") / "product.json").unlink()
+    (used_store.root / "average" / ".building-e-1").mkdir()
+    for deleted in ("damaged", "deleted"):
+        options = ["--delete"] if deleted == "deleted" else []
+        status = cli.app(["store", "--verify", *options], standalone_mode=False)
+        told = capsys.readouterr().out
+        assert status == 1
+        assert re.findall(rf"{deleted}: average (\w)", told) == ["a", "b"]
+    assert keys(used_store) == {"c", "d"}
+    assert "2 products" in output_of(capsys, "store", "--verify")
+
+
 def test_runs_are_listed(used_store, capsys):
     listed = output_of(capsys, "runs")
     assert "mine-1234" in listed

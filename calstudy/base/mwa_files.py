@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from calstudy.base.downloads import default_directory, download
 from calstudy.base.errors import InputError
+from calstudy.base.package_files import PackageFile
 
 REPOSITORY = (
     "https://raw.githubusercontent.com/MWATelescope/mwa_pb/9fe85fd505277c1b7bb9201dcfcb8d6438a16b5c/mwa_pb/data"
@@ -20,8 +21,8 @@ class MwaFile:
 
     Attributes
     ----------
-    name
-        Of the file.
+    packaged
+        The file in the package.
     content
         What it is, for messages.
     fetched_as
@@ -34,12 +35,17 @@ class MwaFile:
         What can be done without it, for messages.
     """
 
-    name: str
+    packaged: PackageFile
     content: str
     fetched_as: str
     url: str
     sha256: str
     instead: str
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return Path(self.packaged.name).name
 
     def fetch(self, directory: Path | None = None, progress: bool = True) -> Path:
         """Download the file, or verify an existing copy.
@@ -68,8 +74,10 @@ class MwaFile:
         InputError
             If there is neither.
         """
-        folders = [*_package_data(), default_directory()]
-        found = next((folder / self.name for folder in folders if (folder / self.name).is_file()), None)
+        places = [default_directory() / self.name]
+        with suppress(InputError):
+            places.insert(0, self.packaged.path)
+        found = next((place for place in places if place.is_file()), None)
         if found is None:
             raise InputError(
                 f"{self.content} is missing: the package mwa_pb, which has it, is not installed or is without it; "
@@ -78,14 +86,8 @@ class MwaFile:
         return found
 
 
-def _package_data() -> list[Path]:
-    """Return the data folder of mwa_pb, which is not imported, if it is installed."""
-    spec = find_spec("mwa_pb")
-    return [Path(place) / "data" for place in (spec.submodule_search_locations or ())] if spec else []
-
-
 BEAM = MwaFile(
-    "mwa_full_embedded_element_pattern.h5",
+    PackageFile("mwa_pb", "data/mwa_full_embedded_element_pattern.h5"),
     "instrument.beam: the MWA's beam (Sokolowski et al. 2017, 133 MB)",
     "beam",
     "http://ws.mwatelescope.org/static/mwa_full_embedded_element_pattern.h5",
@@ -93,7 +95,7 @@ BEAM = MwaFile(
     "set instrument.beam.path to your own copy",
 )
 G4JY = MwaFile(
-    "G4Jy_catalogue_allEGCcolumns.fits",
+    PackageFile("mwa_pb", "data/G4Jy_catalogue_allEGCcolumns.fits"),
     "sky.foregrounds: the G4Jy catalogue (White et al. 2020)",
     "g4jy",
     f"{REPOSITORY}/G4Jy_catalogue_allEGCcolumns.fits",
@@ -101,7 +103,7 @@ G4JY = MwaFile(
     "use another kind of sky.foregrounds, such as gleam or file",
 )
 HASLAM = MwaFile(
-    "radio408.RaDec.fits",
+    PackageFile("mwa_pb", "data/radio408.RaDec.fits"),
     "sky.diffuse: the 408 MHz map (Haslam et al. 1982)",
     "haslam",
     f"{REPOSITORY}/radio408.RaDec.fits",

@@ -1,16 +1,33 @@
-"""The files that calstudy publishes: experiments, and their reference results.
+"""Files of packages: experiments and their reference results, which calstudy publishes, and data of other packages.
 
-In a checkout they are its folders ``experiments`` and ``figures``, to which ``calstudy/published`` links; an installed
-package has copies.
+What calstudy publishes is in a checkout its folders ``experiments`` and ``figures``, to which ``calstudy/published``
+links; an installed package has copies.
 """
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 from calstudy.base.errors import InputError
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "published"
+
+
+class PackageFile(NamedTuple):
+    """A data file that an installed package brings; products that depend on it have its SHA-256 in their record."""
+
+    package: str
+    name: str
+
+    @property
+    def path(self) -> Path:
+        """Where it is; the package is not imported, which can take a second."""
+        found = find_spec(self.package)
+        if found is None or found.origin is None:
+            raise InputError(f"the package {self.package} is not installed; it brings {self.name}")
+        return Path(found.origin).parent / self.name
 
 
 def published(kind: str) -> Path:

@@ -43,6 +43,8 @@ from calstudy.base.files import sha256
 from calstudy.base.schema import Section, fault
 
 FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
+FILE_MODULE = "calstudy_plugin_"
+"""What the names of modules that were read from a file start with."""
 NESTED = "nested"
 """Type of the validation error that contains the faults of a plug-in's own settings."""
 
@@ -297,7 +299,10 @@ class Registry(Generic[P]):
         """Return the identity of a plug-in's code: its name or package with a version, or the digest of its file."""
         file = FILE_REFERENCE.fullmatch(reference)
         if file is not None:
-            return f"sha256:{digest_file(Path(file['path']))}:{file['name'] or ''}"
+            path = Path(file["path"])
+            beside = {name: digest_file(found) for name, found in beside_of(path).items()}
+            others = "".join(f":{name}={digest}" for name, digest in sorted(beside.items()))
+            return f"sha256:{digest_file(path)}:{file['name'] or ''}{others}"
         if reference in self._modules:
             version = self.find(reference).version
             return reference if version == 1 else f"{reference}@{version}"
@@ -332,25 +337,47 @@ def without_code_of_files(instead: str) -> Iterator[None]:
         _REFUSED.reset(token)
 
 
+def beside_of(path: Path) -> dict[str, Path]:
+    """Return the modules that a Python file imports from its own folder, and those that these import, by name."""
+    found: dict[str, Path] = {}
+    waiting = list(_imported(path))
+    while waiting:
+        name = waiting.pop()
+        place = path.parent.joinpath(*name.split("."))
+        for candidate in (place.with_suffix(".py"), place / "__init__.py"):
+            if candidate.is_file() and candidate != path and name not in found:
+                found[name] = candidate
+                waiting += _imported(candidate)
+    return found
+
+
+def _imported(path: Path) -> Iterator[str]:
+    """Yield the names of all modules that a file may import, and of the packages that they are in."""
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+    except (ValueError, SyntaxError):
+        return  # Whoever runs it is told.
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [item.name for item in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{item.name}" for item in node.names)]
+        else:
+            continue
+        for name in names:
+            parts = name.split(".")
+            yield from (".".join(parts[: count + 1]) for count in range(len(parts)))
+
+
 def load_file(path: Path) -> ModuleType:
     """Run a Python file as a module, once for each version of its content, and return the module.
 
-    Raises InputError if the file cannot be read or is not valid Python, if running it raises an error (the message
-    names the line), or if code of files is refused.
+    It can import modules of its folder, which are run again if the content of one has changed. Raises InputError if the
+    file cannot be read or is not valid Python, if running it raises an error (the message names the line), or if code
+    of files is refused.
     """
-    if instead := _REFUSED.get():
-        raise InputError(f"{str(path)!r} is code, which is not run here; {instead}")
-    try:
-        text = path.read_text(encoding="utf-8")
-        ast.parse(text)
-    except OSError as error:
-        raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{str(path)!r} is not a text file in UTF-8") from None
-    except (SyntaxError, ValueError) as error:
-        line = f"line {error.lineno}: {error.msg}" if isinstance(error, SyntaxError) else str(error)
-        raise InputError(f"{str(path)!r} is not valid Python ({line})") from None
-    name = f"calstudy_plugin_{path.stem}_{hashlib.sha256(f'{path}{text}'.encode()).hexdigest()[:12]}"
+    content, beside = _read_code(path)
+    name = f"{FILE_MODULE}{path.stem}_{hashlib.sha256(f'{path}{content}'.encode()).hexdigest()[:12]}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
@@ -358,6 +385,12 @@ def load_file(path: Path) -> ModuleType:
         raise InputError(f"{str(path)!r} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    for other, found in beside.items():
+        if getattr(sys.modules.get(other), "__file__", None) == str(found):
+            del sys.modules[other]
+    if beside and str(path.parent) not in sys.path:
+        # At the end, so that no file beside it stands for an installed package.
+        sys.path.append(str(path.parent))
     try:
         with user_code(path.name):
             spec.loader.exec_module(module)
@@ -365,6 +398,25 @@ def load_file(path: Path) -> ModuleType:
         del sys.modules[name]
         raise
     return module
+
+
+def _read_code(path: Path) -> tuple[str, dict[str, Path]]:
+    """Return the content of a Python file with digests of the modules beside it, and these modules; see `load_file`."""
+    if instead := _REFUSED.get():
+        raise InputError(f"{str(path)!r} is code, which is not run here; {instead}")
+    try:
+        text = path.read_text(encoding="utf-8")
+        ast.parse(text)
+        beside = beside_of(path)
+        content = "".join([text, *(f"{name} {digest_file(found)}" for name, found in sorted(beside.items()))])
+    except OSError as error:
+        raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{str(path)!r} is not a text file in UTF-8") from None
+    except (SyntaxError, ValueError) as error:
+        line = f"line {error.lineno}: {error.msg}" if isinstance(error, SyntaxError) else str(error)
+        raise InputError(f"{str(path)!r} is not valid Python ({line})") from None
+    return content, beside
 
 
 def load_function(path: Path, name: str) -> Callable[..., Any]:

@@ -87,6 +87,9 @@ Finished = Annotated[
         help="Take members of a collection from finished runs, or references, in this folder; may be repeated.",
     ),
 ]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Make products again that are of other code or other versions of packages.")
+]
 Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster instead.")]
 
 
@@ -115,6 +118,7 @@ def run(
     scheduler: Scheduler = None,
     output: Output = None,
     finished: Finished = None,
+    strict: Strict = False,
 ) -> None:
     """Run an experiment or a collection: simulate, corrupt, calibrate, measure power spectra, draw figures.
 
@@ -130,7 +134,7 @@ def run(
     study = load_study(file, scale, changes)
     if finished:
         study = with_finished(study, finished, console)
-    show_run(run_study(study, Budget(workers, max_memory, scheduler), console), console)
+    show_run(run_study(study, Budget(workers, max_memory, scheduler), console, strict), console)
 
 
 @app.command()
@@ -141,6 +145,7 @@ def plan(
     workers: Workers = None,
     max_memory: MaxMemory = None,
     finished: Finished = None,
+    strict: Strict = False,
     as_json: AsJson = False,
 ) -> None:
     """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
@@ -153,7 +158,7 @@ def plan(
     if finished:
         # Of JSON nothing else is on standard output.
         study = with_finished(study, finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
-    found = describe_plan(study, Budget(workers, max_memory))
+    found = describe_plan(study, Budget(workers, max_memory), strict)
     if as_json:
         typer.echo(json.dumps(found, indent=1))
     else:

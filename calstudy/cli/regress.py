@@ -42,9 +42,10 @@ def regress(
 ) -> None:
     """Make reference results again and compare every array with its tolerance; exit status 1 if any is beyond it.
 
-    Products that are in the store are not made again; --set outputs.store=DIR chooses another, or a fresh one. What
-    moved is listed, by how much and by how many sigma, and written to regression.json in the run's folder. Nothing is
-    overwritten without --update; with --against and --update, a folder that does not exist becomes a new reference.
+    Products in the store are made again only if they are of other code or other versions of packages; --set
+    outputs.store=DIR chooses another store, or a fresh one. What moved is listed, by how much and by how many sigma,
+    and written to regression.json in the run's folder. Nothing is overwritten without --update; with --against and
+    --update, a folder that does not exist becomes a new reference.
     """
     from calstudy.base.package_files import reference_folder
     from calstudy.regression.reference import accept, find_references

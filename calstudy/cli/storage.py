@@ -13,7 +13,7 @@ from rich.console import Console
 from calstudy.base.errors import InputError
 
 if TYPE_CHECKING:
-    from calstudy.run.store import Product
+    from calstudy.run.store import Product, Store
 
 RunsFolder = Annotated[Path, typer.Argument(help="Folder of run folders.")]
 StoreFolder = Annotated[Path, typer.Argument(help="Folder of products.")]
@@ -23,7 +23,11 @@ Unreferenced = Annotated[
     bool, typer.Option("--unreferenced", help="Only products that no run in the folder --runs refers to.")
 ]
 Runs = Annotated[Path, typer.Option(help="Folder of runs, for --unreferenced.")]
+Verify = Annotated[
+    bool, typer.Option("--verify", help="Read all products, and list those that are damaged; exit status 1 if any is.")
+]
 Delete = Annotated[bool, typer.Option("--delete", help="List the products that are chosen, and delete them.")]
+EXIT_DAMAGED = 1
 SECONDS = {"h": 3600.0, "d": 86_400.0}
 
 
@@ -50,14 +54,14 @@ def store(
     larger_than: LargerThan = None,
     unreferenced: Unreferenced = False,
     runs: Runs = Path("runs"),
+    verify: Verify = False,
     delete: Delete = False,
 ) -> None:
     """Show what is in a store by stage, or delete chosen products.
 
     A deleted product is made again by the next run that needs it. Folders that killed runs left are listed too, and
-    deleted with --older-than. Without --delete nothing is changed; with it, at
-    least one of --older-than, --larger-than and --unreferenced must say which products are meant. Do not delete
-    during a run.
+    deleted with --older-than. Without --delete nothing is changed; with it, at least one of --older-than,
+    --larger-than, --unreferenced and --verify must say which products are meant. Do not delete during a run.
     """
     from calstudy.run.inventory import age_of, leftovers, list_runs, products
     from calstudy.run.inventory import unreferenced as without_run
@@ -65,9 +69,14 @@ def store(
 
     if not folder.is_dir():
         raise InputError(f"{folder}: no such store")
+    if verify:
+        if older_than is not None or larger_than is not None or unreferenced:
+            raise InputError("--verify: reads the whole store; leave out the options that choose products")
+        _verify(Store(folder), delete)
+        return
     oldest, smallest = _age(older_than), _bytes(larger_than)
     if delete and older_than is None and larger_than is None and not unreferenced:
-        raise InputError("--delete: say which products by --older-than, --larger-than or --unreferenced")
+        raise InputError("--delete: say which products by --older-than, --larger-than, --unreferenced or --verify")
     where, chosen = Store(folder), list(products(Store(folder)))
     if unreferenced:
         chosen = without_run(chosen, list_runs(runs))
@@ -83,11 +92,29 @@ def store(
         for item in left:
             shutil.rmtree(item.path, ignore_errors=True)
             console.print(f"deleted: {item.path}", markup=False)
+    _delete(chosen, where, console)
+
+
+def _delete(chosen: list[Product], store: Store, console: Console) -> None:
     for product in chosen:
         stage, key = str(product.record["stage"]), str(product.record["key"])
-        with where.lock(stage, key):
-            where.discard(stage, key)
+        with store.lock(stage, key):
+            store.discard(stage, key)
         console.print(f"deleted: {stage} ({product.record['label']}), {_size(product.size)}, {key}", markup=False)
+
+
+def _verify(store: Store, delete: bool) -> None:
+    """Read all products against their records; name what is damaged, and delete it if that is wanted."""
+    console, addresses = Console(highlight=False, soft_wrap=True), store.addresses()
+    damaged = [address for address in addresses if store.verify(*address) is None]
+    for stage, key in damaged:
+        if delete:
+            with store.lock(stage, key):
+                store.discard(stage, key)
+        console.print(f"{'deleted' if delete else 'damaged'}: {stage} {key}", markup=False)
+    console.print(f"{len(addresses)} products in {store.root}: {len(damaged)} damaged", markup=False)
+    if damaged:
+        raise typer.Exit(EXIT_DAMAGED)
 
 
 def _show(chosen: list[Product], folder: Path, console: Console) -> None:

@@ -77,6 +77,7 @@ def _error(reference: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 class MemberBiasFigure(ComparisonFigure):
     """The foregrounds that calibration leaves over the EoR, for every member of a collection."""
 
+    version: ClassVar[int] = 2
     titles: ClassVar[Mapping[str, str]] = {}
     caption = (
         "Absolute value of the bias of each member outside the wedge with 95 % bars; open symbols: 95 % upper limit "

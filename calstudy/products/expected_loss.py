@@ -198,5 +198,5 @@ def _cost(task: Task) -> Cost:
     return Cost(6 + 0.8 * task.settings.get("probes", 1) * work, LIBRARIES_MEMORY + 1.5e9 * work, 1e6)
 
 
-EXPECTED_LOSS = Stage(name="expected-loss", version=3, make=expect, cost=_cost)
+EXPECTED_LOSS = Stage(name="expected-loss", version=4, make=expect, cost=_cost)
 LINEAR_RESPONSE = Stage(name="linear-response", version=1, make=respond, cost=_cost)

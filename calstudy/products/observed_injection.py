@@ -303,9 +303,9 @@ def _cost_of_expectation(task: Task) -> Cost:
     return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * samples * COMPLEX128, 1e6)
 
 
-SIMULATE_EOR = Stage(name="observed-eor", version=2, make=simulate_eor, cost=_cost_of_eor)
+SIMULATE_EOR = Stage(name="observed-eor", version=3, make=simulate_eor, cost=_cost_of_eor)
 SET_LEVEL = Stage(name="observed-level", version=1, make=set_level, cost=_cost_of_average)
 INJECT = Stage(name="inject", version=1, make=inject, cost=_cost_of_data)
 AVERAGE_EOR = Stage(name="observed-eor-average", version=1, make=average_eor, cost=_cost_of_average)
 OBSERVED_TRANSFER = Stage(name="observed-transfer", version=2, make=measure, cost=lambda task: Cost(4, disk=1e6))
-EXPECT = Stage(name="observed-expected-loss", version=1, make=expect, cost=_cost_of_expectation)
+EXPECT = Stage(name="observed-expected-loss", version=2, make=expect, cost=_cost_of_expectation)

@@ -299,5 +299,5 @@ def _cost(task: Task) -> Cost:
     return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 4 * disk, disk)
 
 
-SIMULATE_CHUNK = Stage(name="simulate-chunk", version=3, make=simulate_chunk, cost=_cost_of_chunk)
+SIMULATE_CHUNK = Stage(name="simulate-chunk", version=4, make=simulate_chunk, cost=_cost_of_chunk)
 SIMULATE = Stage(name="simulate", version=3, make=assemble, cost=_cost)

@@ -17,9 +17,11 @@ from calstudy.studies.sweep import Sweep
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
     """Run the study of a reference folder with ``path=value`` overrides, and return the run's folder.
 
+    Products of other code are made again.
+
     Raise InputError if the experiment is a sweep, or as the run raises it.
     """
     study = load_study(reference / EXPERIMENT, None, overrides)
     if isinstance(study, Sweep):
         raise InputError(f"{reference}: is a sweep, which has no reference results")
-    return run_study(study, budget, console).folder
+    return run_study(study, budget, console, strict=True).folder

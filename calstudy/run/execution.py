@@ -18,8 +18,9 @@ from calstudy.base.errors import InputError
 from calstudy.base.identity import digest_json
 from calstudy.base.resources import cores
 from calstudy.run.perform import WorkOrder, perform
+from calstudy.run.provenance import of_other_code
 from calstudy.run.store import Product, Store
-from calstudy.run.task import Task
+from calstudy.run.task import Task, unique
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -42,11 +43,14 @@ class Schedule:
         Products that the run needs and that are intact.
     damaged
         Tasks whose product was there, but not as it was written; they are in `todo`.
+    again
+        Keys of intact products of other code that are to be made again; their tasks are in `todo`.
     """
 
     todo: tuple[Task, ...]
     ready: dict[str, Product]
     damaged: tuple[Task, ...]
+    again: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,13 @@ class Workers:
     scheduler: str | None = None
 
 
-def schedule(targets: Iterable[Task], store: Store, given: Container[str] = ()) -> Schedule:
+def found_of(tasks: Iterable[Task], store: Store) -> dict[str, Product]:
+    """Return the products of tasks that are in a store, by key, without reading their files."""
+    products = {task.key: store.find(task.stage.name, task.key) for task in tasks}
+    return {key: product for key, product in products.items() if product is not None}
+
+
+def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False) -> Schedule:
     """Find out what must be made: the targets and what they need, as far as it is not in the store, intact.
 
     Parameters
@@ -79,7 +89,14 @@ def schedule(targets: Iterable[Task], store: Store, given: Container[str] = ()) 
         Where it is looked for.
     given
         Keys of products that will be there.
+    strict
+        Whether products that are of other code or other versions of packages are made again.
     """
+    other: Container[str] = ()
+    if strict:
+        tasks = unique(targets)
+        other = of_other_code(tasks, found_of(tasks, store))
+    again: set[str] = set()
     todo: dict[str, Task] = {}
     ready: dict[str, Product] = {}
     damaged: list[Task] = []
@@ -88,10 +105,12 @@ def schedule(targets: Iterable[Task], store: Store, given: Container[str] = ()) 
         if task.key in todo or task.key in ready or task.key in given:
             return
         product = store.verify(task.stage.name, task.key)
-        if product is not None:
+        if product is not None and task.key not in other:
             ready[task.key] = product
             return
-        if store.exists(task.stage.name, task.key):
+        if product is not None:
+            again.add(task.key)
+        elif store.exists(task.stage.name, task.key):
             damaged.append(task)
         for needed in task.needs.values():
             visit(needed)
@@ -99,7 +118,7 @@ def schedule(targets: Iterable[Task], store: Store, given: Container[str] = ()) 
 
     for task in targets:
         visit(task)
-    return Schedule(tuple(todo.values()), ready, tuple(damaged))
+    return Schedule(tuple(todo.values()), ready, tuple(damaged), frozenset(again))
 
 
 def _write_errors_to(path: Path) -> None:
@@ -204,8 +223,8 @@ class _Queue:
     before: products are files, and temporary ones may have been dropped.
     """
 
-    def __init__(self, tasks: Sequence[Task], store: Store, client: Client) -> None:
-        self._store, self._client = store, client
+    def __init__(self, tasks: Sequence[Task], store: Store, client: Client, again: Container[str]) -> None:
+        self._store, self._client, self._again = store, client, again
         self._priority = {task.key: -place for place, task in enumerate(tasks)}
         self._tasks = {task.key: task for task in tasks}
         self._missing = {
@@ -233,7 +252,7 @@ class _Queue:
     def _future(self, task: Task) -> Future:
         return self._client.submit(
             _announce_and_perform,
-            WorkOrder.of(task, self._store),
+            WorkOrder.of(task, self._store, task.key in self._again),
             key=f"{task.stage.name}-{task.key}-{digest_json(str(self._store.root))[:8]}",
             priority=self._priority[task.key],
             pure=False,
@@ -246,6 +265,7 @@ def execute(
     workers: Workers,
     done: Callable[[Task, Product], None] = lambda task, product: None,
     told: Callable[[str], None] = logger.warning,
+    again: Container[str] = (),
 ) -> dict[str, Product]:
     """Make the products of `tasks`, which are in an order that respects their inputs.
 
@@ -261,6 +281,8 @@ def execute(
         Called after each product.
     told
         Called with a sentence for each wait for the lock of another run.
+    again
+        Keys of products that are made even if they are there.
 
     Returns
     -------
@@ -276,12 +298,12 @@ def execute(
     if not tasks:
         return products
     if ranks.count() > 1:
-        return _execute_here(tasks, store, done)
+        return _execute_here(tasks, store, done, again)
     from distributed import CancelledError, KilledWorker, as_completed
 
     with _client(workers) as client:
         client.subscribe_topic(WAITS, lambda event: told(event[1]))
-        queue = _Queue(tasks, store, client)
+        queue = _Queue(tasks, store, client, again)
         futures = queue.first()
         completed = as_completed(futures)
         for future in completed:
@@ -311,11 +333,13 @@ def execute(
     return products
 
 
-def _execute_here(tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None]) -> dict[str, Product]:
+def _execute_here(
+    tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None], again: Container[str]
+) -> dict[str, Product]:
     """Make products one after the other in the main thread, where MPI may be used."""
     products = {}
     for task in tasks:
-        products[task.key] = perform(WorkOrder.of(task, store))
+        products[task.key] = perform(WorkOrder.of(task, store, task.key in again))
         done(task, products[task.key])
     return products
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import InputError
-from calstudy.run.store import PLAIN, RECORD, Product, Store
+from calstudy.run.store import Product, Store
 
 MANIFEST = "manifest.json"
 
@@ -67,11 +67,8 @@ def list_runs(folder: Path) -> list[RunEntry]:
 
 def products(store: Store) -> Iterator[Product]:
     """Yield all complete products of a store."""
-    for record in sorted(store.root.glob(f"*/*/{RECORD}")):
-        if not all(PLAIN.fullmatch(folder.name) for folder in (record.parent, record.parent.parent)):
-            continue
-        product = store.find(record.parent.parent.name, record.parent.name)
-        if product is not None:
+    for address in store.addresses():
+        if (product := store.find(*address)) is not None:
             yield product
 
 

@@ -14,6 +14,7 @@ from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.resources import Usage
 from calstudy.base.schema import plain
+from calstudy.run.provenance import git_commit, libraries, lineage, made_with, processor
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Job, Stage, Task
 
@@ -31,10 +32,11 @@ class WorkOrder:
     inputs: Mapping[str, tuple[str, str]]
     store: Path
     temporary: bool
+    again: bool
 
     @classmethod
-    def of(cls, task: Task, store: Store) -> WorkOrder:
-        """Return the order for `task`."""
+    def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
+        """Return the order for `task`, whose product is made `again` if it is there."""
         return cls(
             stage=task.stage,
             key=task.key,
@@ -43,6 +45,7 @@ class WorkOrder:
             inputs={name: (needed.stage.name, needed.key) for name, needed in task.needs.items()},
             store=store.root,
             temporary=task.temporary,
+            again=again,
         )
 
 
@@ -63,7 +66,7 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
         )
     try:
         with store.lock(order.stage.name, order.key, told):
-            existing = store.verify(order.stage.name, order.key)
+            existing = None if order.again else store.verify(order.stage.name, order.key)
             return existing if existing is not None else _make(order, store)
     except InputError:
         raise
@@ -88,7 +91,7 @@ def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:
     return refusal_of_disk(error)
 
 
-def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Path]:
+def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Product]:
     products = {name: store.verify(*address) for name, address in order.inputs.items()}
     damaged = [f"{order.inputs[name][0]}/{order.inputs[name][1]}" for name, found in products.items() if found is None]
     if damaged:
@@ -96,7 +99,7 @@ def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Path]:
             f"{order.stage.name} ({order.label}): its input {damaged[0]} was removed or damaged while the run was "
             "going on; run again to rebuild it"
         )
-    return {name: product.path for name, product in products.items() if product is not None}
+    return {name: product for name, product in products.items() if product is not None}
 
 
 def _make(order: WorkOrder, store: Store) -> Product:
@@ -105,7 +108,9 @@ def _make(order: WorkOrder, store: Store) -> Product:
     logging.captureWarnings(True)
     with store.building(order.stage.name, order.key) as folder:
         with Usage() as usage:
-            notes = order.stage.make(Job(settings=order.settings, inputs=inputs, output=folder))
+            paths = {name: product.path for name, product in inputs.items()}
+            notes = order.stage.make(Job(settings=order.settings, inputs=paths, output=folder))
+        own = made_with(order.stage.make, order.settings)
         record = {
             "stage": order.stage.name,
             "stage_version": order.stage.version,
@@ -116,6 +121,11 @@ def _make(order: WorkOrder, store: Store) -> Product:
             "notes": notes,
             "temporary": order.temporary,
             "calstudy": __version__,
+            "made_with": own,
+            "lineage": lineage(own, [product.record["lineage"] for product in inputs.values()]),
+            "git_commit": git_commit(),
+            "processor": processor(),
+            "libraries": libraries(),
             "started": started.isoformat(timespec="seconds"),
             "seconds": round(usage.seconds, 3),
             "cpu_seconds": round(usage.cpu_seconds, 3),

@@ -1,54 +1,140 @@
-"""Where results come from: versions, commit, machine, seeds."""
+"""Where results come from: source, versions, data files of packages, commit, machine, seeds."""
 
 from __future__ import annotations
 
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 
 from calstudy import __version__
+from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
+from calstudy.base.identity import digest_json
+from calstudy.base.kept_arrays import kept_arrays
+from calstudy.base.package_files import PackageFile
 from calstudy.base.resources import cores
+from calstudy.run.source import source_of
+from calstudy.run.store import Product
+from calstudy.run.task import Task
 
 PACKAGES = (
     "numpy",
     "scipy",
     "astropy",
+    "astropy-iers-data",
+    "numba",
     "pyuvdata",
     "pyuvsim",
     "pyradiosky",
     "hera_pspec",
+    "hera-calibration",
+    "hera_qm",
     "tensorflow",
     "fftvis",
+    "matvis",
     "finufft",
     "healpy",
     "dask",
     "mwa_pb",
     "matplotlib",
 )
+IMPORTED_AS = {"astropy-iers-data": "astropy", "hera-calibration": "hera_cal"}
+"""Names by which packages are imported, where they are others; the tables of the first are read by astropy."""
 
 
 def package_versions() -> dict[str, str | None]:
     """Return the versions of the packages that results depend on; None for one that is not installed."""
-    versions: dict[str, str | None] = {"calstudy": __version__}
-    for name in PACKAGES:
-        versions[name] = _version(name)
-    # Without CUDA the same module comes in a package of another name.
-    versions["tensorflow"] = versions["tensorflow"] or _version("tensorflow-cpu")
-    return versions
+    return {"calstudy": __version__, **{name: _version(name) for name in PACKAGES}}
 
 
+@cache
 def _version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:
+        # Without CUDA the same module comes in a package of another name.
+        return _version("tensorflow-cpu") if package == "tensorflow" else None
+
+
+def made_with(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what decides a product besides its key: the source, and versions and data files of packages that it uses.
+
+    Parameters
+    ----------
+    make, settings
+        Of the stage and of the task.
+    """
+    source = source_of(make, settings)
+    versions = {name: _version(name) for name in PACKAGES if IMPORTED_AS.get(name, name) in source.packages}
+    files = {f"{file.package}/{file.name}": _digest_of(file) for file in sorted(source.files)}
+    return {"source": source.digest, "versions": versions, "files": files}
+
+
+@cache
+def _digest_of(packaged: PackageFile) -> str | None:
+    """Return the SHA-256 of a file of a package, or None if it is not there; large ones take a second to read."""
+    try:
+        path = packaged.path
+    except InputError:
         return None
+    if not path.is_file():
+        return None
+    state = path.stat()
+    file = {"path": str(path), "modified": state.st_mtime_ns, "size": state.st_size}
+    return str(kept_arrays("sha256", file, lambda: {"sha256": np.asarray(sha256(path))})["sha256"])
 
 
+def lineage(own: Mapping[str, Any], needs: Iterable[str]) -> str:
+    """Return the digest of what a product is made with, from `made_with`, and of the lineages of what it needs.
+
+    How many pieces it is put together of does not count.
+    """
+    return digest_json([own, sorted(set(needs))])
+
+
+def lineages(tasks: Iterable[Task]) -> dict[str, str]:
+    """Return the lineages that products would have that are made now, by key; every task comes after what it needs."""
+    found: dict[str, str] = {}
+    for task in tasks:
+        needs = [found[needed.key] for needed in task.needs.values()]
+        found[task.key] = lineage(made_with(task.stage.make, task.settings), needs)
+    return found
+
+
+def of_other_code(tasks: Sequence[Task], products: Mapping[str, Product]) -> frozenset[str]:
+    """Return the keys of products that have another lineage than they would have if they were made now.
+
+    Parameters
+    ----------
+    tasks
+        Every one after what it needs.
+    products
+        By key; there need not be one for every task.
+    """
+    current = lineages(tasks)
+    return frozenset(key for key, product in products.items() if product.record["lineage"] != current.get(key))
+
+
+def other_code(stages: Sequence[str]) -> str | None:
+    """Say in a sentence how many products, by their stages, are of other code, or return None if there are none."""
+    if not stages:
+        return None
+    counts = ", ".join(f"{stage} {count}" for stage, count in Counter(stages).items())
+    return (
+        f"{len(stages)} products in the store are of other code of calstudy or other versions of packages, or made "
+        f"from such ({counts}); 'calstudy run --strict' makes them again"
+    )
+
+
+@cache
 def git_commit() -> str | None:
     """Return the commit of the checkout that calstudy runs from, with ``-dirty`` if it was changed, or None."""
     checkout = Path(__file__).resolve().parents[2]
@@ -73,6 +159,15 @@ def processor() -> str:
         lines = []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()
+
+
+@cache
+def libraries() -> list[str]:
+    """Return the BLAS libraries that are loaded, each with its version and the kind of processor that it works for."""
+    from threadpoolctl import threadpool_info
+
+    found = (item for item in threadpool_info() if item["user_api"] == "blas")
+    return sorted({f"{item['internal_api']} {item['version']} {item.get('architecture', '')}" for item in found})
 
 
 def machine() -> dict[str, Any]:

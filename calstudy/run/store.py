@@ -1,8 +1,8 @@
 """The store of products: content-addressed folders, written atomically, checked before use.
 
 A product is a folder ``<store>/<stage>/<key>/`` of files in standard formats plus ``product.json``, its record: what
-made it, from what, and the SHA-256 of every file. A folder that exists is complete, for it is filled under another name
-and renamed; a folder whose files no longer match its record is damaged, and is made again.
+made it, from what, and the SHA-256 of every file and of the record itself. A folder that exists is complete, for it is
+filled under another name and renamed; a folder that no longer fits its record is damaged, and is made again.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ from filelock import FileLock, Timeout
 
 from calstudy.base.errors import InputError, error_number
 from calstudy.base.files import sha256
+from calstudy.base.identity import digest_json
 
-RECORD = "product.json"
+RECORD, DIGEST = "product.json", "digest"
+"""The record of a product, and its field that has the digest of all others."""
 SILENT_WAIT, LONGEST_WAIT = 5.0, 24 * 3600.0
 """Seconds after which a wait for a lock is told, and after which it ends."""
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -121,14 +123,15 @@ class Store:
         return self.root / stage / key
 
     def find(self, stage: str, key: str) -> Product | None:
-        """Return the product if it exists with all its files at their recorded sizes, without reading them."""
+        """Return the product if its record is intact and all files have their recorded sizes; they are not read."""
         folder = self.folder(stage, key)
         try:
             record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+            told = record.pop(DIGEST)
             sizes = {name: (folder / name).stat().st_size for name in record["files"]}
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
-        if not all(_inside(name) for name in sizes):
+        if told != digest_json(record) or not all(_inside(name) for name in sizes):
             return None
         if record.get("key") != key or any(sizes[name] != entry["bytes"] for name, entry in record["files"].items()):
             return None
@@ -153,6 +156,11 @@ class Store:
             return self.folder(stage, key).exists()
         except OSError:
             return False  # A name that no file can have, or a folder that may not be read.
+
+    def addresses(self) -> list[tuple[str, str]]:
+        """Return stage and key of all that is in the store, intact or damaged."""
+        found = (path for path in sorted(self.root.glob("[!.]*/[!.]*")) if path.is_dir())
+        return [(path.parent.name, path.name) for path in found]
 
     def discard(self, stage: str, key: str) -> None:
         """Remove a product, if it is there; it vanishes at once under its name."""
@@ -242,9 +250,10 @@ class Store:
             for path in sorted(folder.rglob("*"))
             if path.is_file()
         }
-        complete = {**record, "files": files}
+        # As it will be read: JSON has no tuples, and no keys but text.
+        complete = json.loads(json.dumps({**record, "files": files}, allow_nan=False))
         with (folder / RECORD).open("w", encoding="utf-8") as file:
-            json.dump(complete, file, indent=1, sort_keys=True, allow_nan=False)
+            json.dump({**complete, DIGEST: digest_json(complete)}, file, indent=1, sort_keys=True)
             file.flush()
             os.fsync(file.fileno())
         final = self.folder(record["stage"], record["key"])

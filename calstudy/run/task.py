@@ -69,8 +69,9 @@ class Task:
     inputs
         The tasks whose products it reads, by the names it knows them under.
     pieces
-        Tasks whose products it puts together, likewise. Its settings and inputs say all that decides the result: how
-        it is cut into pieces changes it by rounding at most, and is not part of the key.
+        Tasks whose products it puts together, likewise. Its settings and inputs, and by which stages the pieces are
+        made, say all that decides the result: into how many pieces it is cut changes it by rounding at most, and is not
+        part of the key.
     temporary
         Whether the product may be dropped once what needs it is made.
     """
@@ -84,9 +85,11 @@ class Task:
 
     @cached_property
     def key(self) -> str:
-        """The content address: a digest of stage, version, the identity of the settings, and the inputs' keys."""
+        """The content address: a digest of stage, version, settings, the inputs' keys, and the stages of the pieces."""
         inputs = {name: task.key for name, task in self.inputs.items()}
-        return digest_json([self.stage.name, self.stage.version, identity(self.settings), inputs])
+        stages = sorted({(task.stage.name, task.stage.version) for task in unique(self.pieces.values())})
+        own = [self.stage.name, self.stage.version, identity(self.settings), inputs]
+        return digest_json([*own, stages] if stages else own)
 
     @property
     def needs(self) -> dict[str, Task]:

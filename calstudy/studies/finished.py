@@ -173,7 +173,8 @@ def _put(task: Task, run: FinishedRun, store: Store) -> None:
         try:
             for name in entry["files"]:
                 shutil.copyfile(run.folder / TABLES / name, folder / name)
-            record = {key: value for key, value in entry.items() if key not in ("files", "made_by_this_run")}
+            kept = {key: value for key, value in entry.items() if key not in ("files", "made_by_this_run")}
+            record = {"lineage": "", **kept}
             origin = {key: run.manifest.get(key) for key in ("name", "finished", "git_commit")}
             store.seal(folder, {**record, "stage": stage, "temporary": False, "from_run": origin})
         except OSError as error:

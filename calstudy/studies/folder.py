@@ -16,7 +16,7 @@ from uuid import uuid4
 
 from calstudy.base.errors import InputError, exit_status
 from calstudy.base.identity import digest_json
-from calstudy.run.provenance import git_commit, machine, package_versions
+from calstudy.run.provenance import git_commit, machine, of_other_code, other_code, package_versions
 from calstudy.run.store import Product
 from calstudy.run.task import Task
 from calstudy.verdicts.tables import CLAIMS_FILES
@@ -137,6 +137,7 @@ def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
         "git_commit": git_commit(),
         "versions": package_versions(),
         "machine": machine(),
+        "other_code": other_code([entry["stage"] for entry in fields.get("products", ()) if "made_with" in entry]),
         **fields,
     }
     write(folder / MANIFEST, _as_json(manifest))
@@ -152,14 +153,18 @@ def _as_json(manifest: Mapping[str, Any]) -> str:
     return text.removesuffix("\n}") + f',\n "products": [\n  {lines}\n ]\n}}'
 
 
-RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_bytes", "started", "inputs")
+RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_bytes", "started", "inputs", "lineage")
 """Fields of a product's record that a manifest repeats."""
+MADE_WITH = ("made_with", "git_commit", "processor", "libraries")
+"""The same for products of other code."""
 
 
 def product_entries(
     tasks: Sequence[Task], products: Mapping[str, Product], made: Sequence[Task], tables: Sequence[Task] = ()
 ) -> list[dict[str, Any]]:
     """Return what a manifest says of every product: what it was made from, what it took, and by which run.
+
+    A product that is of other code or other versions of packages than the run has what it was made with.
 
     Parameters
     ----------
@@ -173,6 +178,7 @@ def product_entries(
         The tasks whose files are the tables of the run folder. Their entries have the SHA-256 of each file.
     """
     keys, published = {task.key for task in made}, {task.key for task in tables}
+    other = of_other_code(tasks, {task.key: products[task.key] for task in tasks if task.key in products})
     entries = []
     for task in tasks:
         if task.key in products:
@@ -180,5 +186,7 @@ def product_entries(
             entry = {"stage": task.stage.name, **{field: record[field] for field in RECORDED}}
             if task.key in published:
                 entry["files"] = {name: file["sha256"] for name, file in record["files"].items()}
+            if task.key in other:
+                entry |= {field: record.get(field) for field in MADE_WITH}
             entries.append({**entry, "made_by_this_run": task.key in keys})
     return entries

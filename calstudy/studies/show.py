@@ -19,7 +19,7 @@ from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.folder import MANIFEST
-from calstudy.studies.study import Budget, Run, Study
+from calstudy.studies.study import Budget, Run, Study, said_of_other_code
 from calstudy.verdicts.sentences import tally_of_sentences
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
 
@@ -38,7 +38,7 @@ def _gigabytes(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e7 else f"{count / 1e6:.1f} MB"
 
 
-def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
+def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[str, Any]:
     """Return what a run would make and take, as plain JSON types; seconds on one core, and bytes.
 
     Parameters
@@ -47,6 +47,8 @@ def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
         What is planned.
     budget
         Workers and memory.
+    strict
+        As for `calstudy.studies.study.run_study`.
 
     Raises
     ------
@@ -55,7 +57,7 @@ def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
     """
     study, workers = study.fitted(budget)
     store = Store(study.outputs.store)
-    plan = schedule(study.targets, store, study.given)
+    plan = schedule(study.targets, store, study.given, strict)
     if plan.todo:
         require_writable(store.root, f"outputs.store = {str(store.root)!r}")
     require_writable(study.folder.parent, f"outputs.runs = {str(study.folder.parent)!r}")
@@ -87,6 +89,7 @@ def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
         "disk_while_running": largest_disk(study.targets, plan.todo),
         "disk_kept": sum(task.cost.disk for task in plan.todo if not task.temporary),
         "damaged": [f"{task.stage.name} ({task.label})" for task in plan.damaged],
+        "other_code": said_of_other_code(study.targets, plan, store),
         "stand_ins": list(study.stand_ins),
         "notes": notes,
         "sites": sites(study.tasks),
@@ -114,6 +117,8 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
     console.print(table)
     for product in plan["damaged"]:
         console.print(f"damaged, will be made again: {product}", markup=False)
+    for sentence in plan["other_code"]:
+        console.print(sentence, markup=False)
     _show_total(plan, console)
     for heading, lines in (("stand-in", "stand_ins"), ("note", "notes"), ("site", "sites")):
         for line in plan[lines]:

@@ -15,8 +15,9 @@ from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.report.page import write_report
-from calstudy.run.execution import Lifetimes, Workers, drop, execute, schedule
+from calstudy.run.execution import Lifetimes, Schedule, Workers, drop, execute, found_of, schedule
 from calstudy.run.progress import report
+from calstudy.run.provenance import of_other_code, other_code
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
 from calstudy.studies.folder import LOG, log_to, open_folder
@@ -186,7 +187,7 @@ def fitted_parts(parts: Mapping[str, S], budget: Budget) -> dict[str, tuple[S, i
     return fits
 
 
-def make(targets: Sequence[Task], store: Store, workers: Workers, console: Console) -> Made:
+def make(targets: Sequence[Task], store: Store, workers: Workers, console: Console, strict: bool = False) -> Made:
     """Make products and all that they need, as far as it is not in the store, and report the progress.
 
     A store that can only be read serves if it holds everything.
@@ -201,17 +202,22 @@ def make(targets: Sequence[Task], store: Store, workers: Workers, console: Conso
         Who makes them.
     console
         Where the progress is written.
+    strict
+        Whether products of other code or other versions of packages are made again, and not used.
 
     Raises
     ------
     InputError
         If the store must be written and cannot be, or a stage refuses its input.
     """
-    plan = schedule(targets, store)
+    plan = schedule(targets, store, strict=strict)
     if plan.todo:
         store.prepare()
-    for task in plan.damaged:
-        message = f"{task.stage.name} ({task.label}): the product in the store is damaged, and is made again"
+    messages = [
+        f"{task.stage.name} ({task.label}): the product in the store is damaged, and is made again"
+        for task in plan.damaged
+    ]
+    for message in [*messages, *said_of_other_code(targets, plan, store)]:
         logger.warning(message)
         console.print(message, markup=False)
     lifetimes = Lifetimes(targets, plan.todo)
@@ -228,15 +234,20 @@ def make(targets: Sequence[Task], store: Store, workers: Workers, console: Conso
             logger.warning(text)
             console.print(text, markup=False)
 
-        products = execute(plan.todo, store, workers, done, told)
-    products |= plan.ready
-    for task in unique(targets):
-        if task.key not in products and (found := store.find(task.stage.name, task.key)) is not None:
-            products[task.key] = found
-    return Made(products, plan.todo)
+        products = execute(plan.todo, store, workers, done, told, plan.again)
+    return Made({**found_of(unique(targets), store), **products}, plan.todo)
 
 
-def run_study(study: Study, budget: Budget | None = None, console: Console | None = None) -> Run:
+def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) -> list[str]:
+    """Return a sentence if products that are not made again are of other code or other versions of packages."""
+    tasks, todo = unique(targets), {task.key for task in plan.todo}
+    used = {key: product for key, product in found_of(tasks, store).items() if key not in todo}
+    other = of_other_code(tasks, used)
+    sentence = other_code([task.stage.name for task in tasks if task.key in other])
+    return [] if sentence is None else [sentence]
+
+
+def run_study(study: Study, budget: Budget | None = None, console: Console | None = None, strict: bool = False) -> Run:
     """Make what a study asks for, reusing every product that is in the store.
 
     Parameters
@@ -247,6 +258,8 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
         Workers and memory.
     console
         Where progress is written; nowhere if None.
+    strict
+        Whether products of other code or other versions of packages are made again, and not used.
 
     Raises
     ------
@@ -261,7 +274,7 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
         for folder in study.folders:
             open_folder(folder)
             logs.enter_context(log_to(folder / LOG))
-        made = make(study.targets, store, Workers(count, study.folder / LOG, budget.scheduler), console)
+        made = make(study.targets, store, Workers(count, study.folder / LOG, budget.scheduler), console, strict)
         return _filled(study, made)
 
 

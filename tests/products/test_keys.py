@@ -6,10 +6,11 @@ import pytest
 from tiny import tiny
 
 from calstudy.base.identity import identity
+from calstudy.corrupt.interface import Effect
 from calstudy.experiment.files import override, validate
 from calstudy.products import calibration, corruption, signal_loss, simulation, spectra
 from calstudy.products.graph import Graph
-from calstudy.run.task import Task
+from calstudy.run.task import Task, unique
 from calstudy.studies.experiment import ExperimentStudy
 
 BASE = {
@@ -132,12 +133,19 @@ def test_the_same_field_in_another_unit_is_the_same_product():
     assert keys("instrument.channels.width", "80 kHz") == keys("instrument.channels.width", "0.08 MHz")
 
 
-def test_another_version_of_a_stage_is_another_product(monkeypatch):
+def behind(task: Task) -> set[str]:
+    """Return the names of all stages that a product is made by."""
+    return {found.stage.name for found in unique([task])}
+
+
+@pytest.mark.parametrize("name", sorted({task.stage.name for task in tasks_of(BASE)}))
+def test_another_version_of_a_stage_alone_changes_everything_made_from_its_products(name, monkeypatch):
+    made_from = {(task.stage.name, task.label): name in behind(task) for task in tasks_of(BASE)}
+    stage = next(task.stage for task in tasks_of(BASE) if task.stage.name == name)
     before = keys()
-    monkeypatch.setitem(vars(spectra.POWER), "version", spectra.POWER.version + 1)
+    monkeypatch.setitem(vars(stage), "version", stage.version + 1)
     after = keys()
-    assert {stage for (stage, label), key in after.items() if before[stage, label] != key} == AVERAGED
-    assert before["agreement", "calibration against truth"] == after["agreement", "calibration against truth"]
+    assert {address: before[address] != after[address] for address in before} == made_from
 
 
 def test_every_task_comes_after_what_it_needs_and_once():
@@ -204,6 +212,30 @@ def test_a_plug_in_counts_by_the_content_of_its_file(tmp_path):
     assert key(share=0.4) != before
     path.write_text(code.replace("0.5", "0.25"))
     assert key() != before
+
+
+def test_a_plug_in_counts_with_the_modules_that_it_imports_from_its_folder(tmp_path):
+    files = {
+        "quieter": "from calstudy.corrupt.interface import Effect\nfrom shares import share\n\n\n"
+        "class Quieter(Effect):\n    def apply(self, visibilities, observation, truth):\n"
+        "        return share() * visibilities\n",
+        "shares": "from parts import half\n\n\ndef share():\n    return half\n",
+        "parts": "half = 0.5\n",
+        "unused": "half = 0.5\n",
+    }
+    for name, code in files.items():
+        (tmp_path / f"{name}.py").write_text(code)
+
+    def effect() -> Effect:
+        return validate(override(tiny(tmp_path), "corruption.effects", ["quieter.py"]), tmp_path).corruption.effects[0]
+
+    before = identity(effect())
+    assert effect().apply(1.0, None, {}) == 0.5
+    (tmp_path / "unused.py").write_text("half = 0.25\n")
+    assert identity(effect()) == before
+    (tmp_path / "parts.py").write_text("half = 0.25\n")
+    assert identity(effect()) != before
+    assert effect().apply(1.0, None, {}) == 0.25
 
 
 def test_a_calibration_is_one_task_however_many_products_need_it():

@@ -1,5 +1,6 @@
 """The store: products are whole or absent, damage is seen, and nobody makes a product twice."""
 
+import json
 import multiprocessing
 import os
 import signal
@@ -22,6 +23,10 @@ def make_product(store: Store, content: bytes = b"visibilities", key: str = KEY)
     with store.lock("stage", key), store.building("stage", key) as folder:
         (folder / "data.bin").write_bytes(content)
         store.seal(folder, {"stage": "stage", "key": key, "notes": {}})
+
+
+def change_record(path: Path, **fields: object) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **fields}))
 
 
 @pytest.fixture
@@ -56,8 +61,10 @@ def test_a_product_does_not_exist_before_it_is_sealed(store):
         lambda path: (path.parent / "product.json").write_text("{"),
         lambda path: (path.parent / "product.json").unlink(),
         lambda path: (path.parent / "product.json").write_text("[]"),
+        lambda path: change_record(path.parent / "product.json", notes={"status": "converged"}),
+        lambda path: change_record(path.parent / "product.json", digest="0" * 32),
     ],
-    ids=["bit flip", "truncated", "missing", "broken record", "no record", "strange record"],
+    ids=["bit flip", "truncated", "missing", "broken record", "no record", "strange record", "notes", "digest"],
 )
 def test_a_damaged_product_is_not_verified_and_is_replaced(store, damage):
     make_product(store)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Mapping
-from importlib.util import find_spec
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from calstudy.base.package_files import PackageFile
 from calstudy.instrument.layouts import Layout, NamedLayout
 from calstudy.instrument.sites import SITES, east_north_up
 
@@ -33,6 +32,7 @@ MWA_TILES: dict[str, tuple[str, ...]] = {
     "mwa-extended": _tiles(OUTER_RECEIVERS) + LONG_BASELINE_TILES,
     "mwa-phase1": _tiles(range(1, 17)),
 }
+MWA_POSITIONS = PackageFile("pyuvdata", "data/mwa_ant_pos.csv")
 MWA_CONFIGURATIONS = (COMPACT_TILES, MWA_TILES["mwa-extended"], MWA_TILES["mwa-phase1"])
 
 
@@ -47,10 +47,7 @@ class MwaLayout(NamedLayout):
 
     def make(self) -> Layout:
         """Return the tiles, at positions (ECEF relative to the array centre) of the observatory."""
-        # Not importlib.resources, which would import the package: a second of every plan.
-        package = find_spec("pyuvdata")
-        assert package is not None, "a dependency"
-        with (Path(str(package.origin)).parent / "data" / "mwa_ant_pos.csv").open() as table:
+        with MWA_POSITIONS.path.open() as table:
             relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
         whole = next(tiles for tiles in MWA_CONFIGURATIONS if set(tiles) >= set(MWA_TILES[self.kind]))
         tiles = MWA_TILES[self.kind][: self.count]

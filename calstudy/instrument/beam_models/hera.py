@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from importlib.metadata import distribution
 from pathlib import Path
 from typing import Literal
 
+from calstudy.base.package_files import PackageFile
 from calstudy.instrument.interface import STAND_IN, Beam, BeamModel
 from calstudy.instrument.settings import Channels
 
 FILES = {
-    "fagnoni": ("hera_pspec", "hera_pspec/data/HERA_NF_efield.beamfits"),
-    "nic-cst": ("pyuvsim", "pyuvsim/data/HERA_NicCST.beamfits"),
+    "fagnoni": PackageFile("hera_pspec", "data/HERA_NF_efield.beamfits"),
+    "nic-cst": PackageFile("pyuvsim", "data/HERA_NicCST.beamfits"),
 }
-"""Distribution of each model, and the file in it."""
+"""The file of each model."""
 
 
 class HeraBeam(BeamModel):
@@ -35,8 +35,7 @@ class HeraBeam(BeamModel):
 
     @property
     def _file(self) -> Path:
-        distribution_name, path = FILES[self.model]
-        return Path(str(distribution(distribution_name).locate_file(path)))
+        return FILES[self.model].path
 
     def require_usable(self, channels: Channels) -> None:
         """Read the file, and check that its frequencies enclose the channels."""

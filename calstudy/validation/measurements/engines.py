@@ -7,7 +7,7 @@ The closed form: one source of flux I at s, seen by dishes of power beam A, give
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from astropy import units
@@ -53,6 +53,7 @@ OFFSETS = ((0.0, 0.0), (6.0, 20.0), (15.0, 200.0), (40.0, 310.0))
 class Engines(Measurement):
     """The largest differences of the engines from pyuvsim, over the rms, and from the closed form."""
 
+    version: ClassVar[int] = 2
     engines: Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
     sources: int = Field(ge=1, description="Brightest sources of the whole sky.")
     antennas: int = Field(ge=2, le=36, description="First tiles of the minimally redundant array.")
