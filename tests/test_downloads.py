@@ -15,6 +15,7 @@ from calstudy.base import downloads
 from calstudy.base.downloads import download
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
+from calstudy.base.package_files import PackageFile
 from calstudy.cli.main import app
 from calstudy.instrument import beam_file
 
@@ -78,7 +79,7 @@ def test_without_a_network_it_says_what_to_do(server, tmp_path):
 
 def test_the_packaged_beam_is_the_one_that_would_be_fetched(monkeypatch, tmp_path):
     assert sha256(beam_file.find_beam()) == beam_file.SHA256
-    monkeypatch.setattr(beam_file, "files", lambda _: tmp_path)
+    monkeypatch.setattr(beam_file, "PACKAGED", PackageFile("mwa_pb", "data/missing.h5"))
     monkeypatch.setattr(beam_file, "default_directory", lambda: tmp_path / "cache")
     with pytest.raises(InputError, match="calstudy data fetch beam"):
         beam_file.find_beam()

@@ -15,9 +15,11 @@ import numpy as np
 import psutil
 
 from calstudy import __version__
+from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.base.identity import digest_json
 from calstudy.base.kept_arrays import kept_arrays
+from calstudy.base.package_files import PackageFile
 from calstudy.base.resources import cores
 from calstudy.run.source import source_of
 from calstudy.run.store import Product
@@ -72,18 +74,19 @@ def made_with(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[str
     """
     source = source_of(make, settings)
     versions = {name: _version(name) for name in PACKAGES if IMPORTED_AS.get(name, name) in source.packages}
-    files = {f"{file.package}/{file.name}": _digest_of(file.path) for file in sorted(source.files)}
+    files = {f"{file.package}/{file.name}": _digest_of(file) for file in sorted(source.files)}
     return {"source": source.digest, "versions": versions, "files": files}
 
 
 @cache
-def _digest_of(path: Path) -> str | None:
-    """Return the SHA-256 of a file of a package, or None if it is not there; large ones take a second to read."""
-    if not path.is_file():
+def _digest_of(file: PackageFile) -> str | None:
+    """Return the SHA-256 of a file of a package, or None if it is not there; kept, for the largest takes a second."""
+    try:
+        path, state = file.path, file.path.stat()
+    except (InputError, OSError):
         return None
-    state = path.stat()
-    file = {"path": str(path), "modified": state.st_mtime_ns, "size": state.st_size}
-    return str(kept_arrays("sha256", file, lambda: {"sha256": np.asarray(sha256(path))})["sha256"])
+    identity = {"path": str(path), "modified": state.st_mtime_ns, "size": state.st_size}
+    return str(kept_arrays("sha256", identity, lambda: {"sha256": np.asarray(sha256(path))})["sha256"])
 
 
 def lineage(own: Mapping[str, Any], needs: Iterable[str]) -> str:
@@ -113,7 +116,7 @@ def of_other_code(tasks: Sequence[Task], products: Mapping[str, Product]) -> fro
     products
         By key; there need not be one for every task.
     """
-    current = lineages(tasks)
+    current = lineages(tasks) if products else {}
     return frozenset(key for key, product in products.items() if product.record["lineage"] != current.get(key))
 
 

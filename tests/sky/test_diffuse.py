@@ -11,6 +11,7 @@ from pyradiosky import SkyModel
 from pyradiosky.utils import jy_to_ksr
 
 from calstudy.base.errors import InputError
+from calstudy.base.package_files import PackageFile
 from calstudy.sky import diffuse
 from calstudy.sky import settings as section
 from calstudy.sky.foregrounds import make_foregrounds
@@ -143,7 +144,7 @@ def test_a_map_alone():
     assert found.stand_in == "diffuse emission: the Haslam map at nside 16, T proportional to nu^-2.55"
 
 
-def test_a_missing_map_is_told(monkeypatch, tmp_path):
-    monkeypatch.setattr(diffuse, "HASLAM_FILE", tmp_path / "radio408.fits")
+def test_a_missing_map_is_told(monkeypatch):
+    monkeypatch.setattr(diffuse, "HASLAM_FILE", PackageFile("mwa_pb", "data/missing.fits"))
     with pytest.raises(InputError, match="use kind: synthetic"):
         diffuse.make_diffuse(FINEST)
