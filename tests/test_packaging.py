@@ -100,6 +100,7 @@ def test_tensorflow_of_any_package_is_recorded(monkeypatch):
         return installed[name]
 
     monkeypatch.setattr(provenance, "version", version)
+    monkeypatch.setattr(provenance, "_version", provenance._version.__wrapped__)
     assert provenance.package_versions()["tensorflow"] == "2.21.0"
     installed["tensorflow"] = "2.22.0"
     assert provenance.package_versions()["tensorflow"] == "2.22.0"

@@ -79,17 +79,14 @@ def made_with(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[str
 
 
 @cache
-def _digest_of(packaged: PackageFile) -> str | None:
-    """Return the SHA-256 of a file of a package, or None if it is not there; large ones take a second to read."""
+def _digest_of(file: PackageFile) -> str | None:
+    """Return the SHA-256 of a file of a package, or None if it is not there; kept, for the largest takes a second."""
     try:
-        path = packaged.path
-    except InputError:
+        path, state = file.path, file.path.stat()
+    except (InputError, OSError):
         return None
-    if not path.is_file():
-        return None
-    state = path.stat()
-    file = {"path": str(path), "modified": state.st_mtime_ns, "size": state.st_size}
-    return str(kept_arrays("sha256", file, lambda: {"sha256": np.asarray(sha256(path))})["sha256"])
+    identity = {"path": str(path), "modified": state.st_mtime_ns, "size": state.st_size}
+    return str(kept_arrays("sha256", identity, lambda: {"sha256": np.asarray(sha256(path))})["sha256"])
 
 
 def lineage(own: Mapping[str, Any], needs: Iterable[str]) -> str:
@@ -119,7 +116,7 @@ def of_other_code(tasks: Sequence[Task], products: Mapping[str, Product]) -> fro
     products
         By key; there need not be one for every task.
     """
-    current = lineages(tasks)
+    current = lineages(tasks) if products else {}
     return frozenset(key for key, product in products.items() if product.record["lineage"] != current.get(key))
 
 
