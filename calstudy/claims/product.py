@@ -145,13 +145,11 @@ def evaluate_run_times(job: Job) -> Mapping[str, Any]:
 
 
 def _write(job: Job, found: Evaluation) -> dict[str, Any]:
-    from calstudy.verdicts.sentences import tally_of_sentences
-    from calstudy.verdicts.tables import write_claims
+    from calstudy.verdicts.tables import tally, write_claims
 
     write_claims(found.verdicts, job.output, job.settings["title"], job.settings.get("notes", ()), found.without_role)
     contradicted = [claim.name for claim in found.verdicts if claim.verdict == "contradicted"]
-    tally = tally_of_sentences(found.verdicts)
-    return {"verdicts": tally, "contradicted": contradicted, "without_role": list(found.without_role)}
+    return {"verdicts": tally(found.verdicts), "contradicted": contradicted, "without_role": list(found.without_role)}
 
 
 EVALUATE = Stage(name="claims", version=12, make=evaluate, cost=lambda task: Cost(1, disk=1e5))

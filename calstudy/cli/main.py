@@ -184,7 +184,6 @@ def claims(
     and with another one claims-by-solver.json and claims-by-solver.md.
     """
     from calstudy.claims.folders import evaluate_folder
-    from calstudy.verdicts.sentences import tally_of_sentences
     from calstudy.verdicts.tables import show_verdicts, to_json
 
     console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or (), run_code)
@@ -192,8 +191,7 @@ def claims(
         typer.echo(to_json(evaluated.claims))
         return
     if evaluated.claims:
-        tally = tally_of_sentences(evaluated.claims)
-        show_verdicts(evaluated.claims, evaluated.title, console, summary=tally)
+        show_verdicts(evaluated.claims, evaluated.title, console)
     for sentence in evaluated.without_role:
         console.print(sentence, markup=False)
 

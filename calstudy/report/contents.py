@@ -14,7 +14,7 @@ from calstudy.report import measured
 from calstudy.report.charts import Chart, read_charts
 from calstudy.report.headline import Number, read_claims, read_excess, read_headline
 from calstudy.run.progress import duration
-from calstudy.verdicts.sentences import tally_of_sentences
+from calstudy.verdicts.tables import marked, tally
 from calstudy.verdicts.tables import measured as number_measured
 
 MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
@@ -241,12 +241,19 @@ def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None
         reasons = [text for item in products for text in item.get("notes", {}).get("without_role", [])]
         return Table(CLAIMS_TITLE, (), (), " ".join(reasons)) if reasons else None
     rows = [
-        (claim.section, claim.sentence, claim.quantity, number_measured(claim), claim.threshold, claim.verdict)
+        (
+            claim.section,
+            marked(claim, claim.sentence),
+            claim.quantity,
+            number_measured(claim),
+            claim.threshold,
+            claim.verdict,
+        )
         for claim in evaluated
     ]
     others = len(claims) - len(evaluated)
     lacking = f" {others} further claims were not evaluated; claims.md says why." if others else ""
-    note = f"{tally_of_sentences(claims)}.{lacking}"
+    note = f"{tally(claims)}.{lacking}"
     columns = ("section", "the paper says", "measured is", "measured", "must be", "verdict")
     return Table(CLAIMS_TITLE, columns, rows, note, verdicts=(5,))
 

@@ -20,7 +20,6 @@ from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.folder import MANIFEST
 from calstudy.studies.study import Budget, Run, Study, said_of_other_code
-from calstudy.verdicts.sentences import tally_of_sentences
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
 
 NAMED = 8
@@ -225,7 +224,7 @@ def _show_claims(folder: Path, console: Console) -> None:
             text = f"claim contradicted: {verdict.name}: {measured(verdict)}, must be {verdict.threshold}"
             console.print(text, markup=False)
     if verdicts:
-        console.print(f"claims: {tally_of_sentences(verdicts)}: {folder / CLAIMS_MARKDOWN}", markup=False)
+        console.print(f"claims: {tally(verdicts)}: {folder / CLAIMS_MARKDOWN}", markup=False)
     elif path.is_file():
         text = "claims: none, for the run plays no role in the papers that it names; for the reasons see"
         console.print(f"{text} {folder / CLAIMS_MARKDOWN}", markup=False)

@@ -118,7 +118,9 @@ def count(words: Sequence[str], kinds: Iterable[str]) -> str:
 
 
 def tally(verdicts: Sequence[Verdict]) -> str:
-    """Count the outcomes of criteria that are limits of our own in one line."""
+    """Count outcomes in one line: of statements by the sentences of their papers, of limits of our own one by one."""
+    if any(verdict.sentence_id for verdict in verdicts):
+        return tally_of_sentences(verdicts)
     return count([verdict.verdict for verdict in verdicts], LIMIT_OUTCOMES)
 
 
@@ -178,11 +180,15 @@ def _cells(verdict: Verdict) -> tuple[str, ...]:
     return *_named(verdict), number_and_quantity, verdict.threshold, verdict.why, verdict.verdict
 
 
+def marked(verdict: Verdict, text: str) -> str:
+    """Return a text on a verdict with a mark if the statement tests the simulation alone."""
+    return f"{text} (simulation alone)" if verdict.tests_simulation else text
+
+
 def _named(verdict: Verdict) -> tuple[str, str]:
     """Return the name, marked if it tests the simulation alone, and the sentence with its id."""
-    marked = " (simulation alone)" if verdict.tests_simulation else ""
     shared = verdict.sentence_id and verdict.sentence_id != verdict.name
-    return verdict.name + marked, f"{verdict.sentence} [{verdict.sentence_id}]" if shared else verdict.sentence
+    return marked(verdict, verdict.name), f"{verdict.sentence} [{verdict.sentence_id}]" if shared else verdict.sentence
 
 
 def show_verdicts(
@@ -213,7 +219,7 @@ def show_verdicts(
         if verdict.verdict == "not evaluated":
             lacking.setdefault(verdict.reason, []).append(verdict.name)
             continue
-        tested = f"[bold]{escape(verdict.name)}[/bold]\n{escape(verdict.sentence)}"
+        tested = f"[bold]{escape(marked(verdict, verdict.name))}[/bold]\n{escape(verdict.sentence)}"
         value = f"{escape(measured(verdict))}\n[dim]{escape(verdict.quantity)}[/dim]"
         table.add_row(tested, value, escape(verdict.threshold), coloured(verdict.verdict))
     console.print(table)
@@ -244,7 +250,7 @@ def write_claims(
         Sentences on why there are no verdicts on a paper, written below the table.
     """
     (folder / CLAIMS_JSON).write_text(to_json(verdicts) + "\n", encoding="utf-8")
-    summary = tally_of_sentences(verdicts) if verdicts else "No claims."
+    summary = None if verdicts else "No claims."
     text = to_markdown(verdicts, f"Claims of the paper: {title}", ("claim", "the paper"), summary, notes)
     (folder / CLAIMS_MARKDOWN).write_text("\n".join([text, *without_role]).rstrip() + "\n", encoding="utf-8")
 
@@ -280,7 +286,7 @@ def write_claims_by_solver(
     text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / BY_SOLVER_JSON).write_text(text + "\n", encoding="utf-8")
     lines = [f"# Claims of the paper, by solver: {title}", ""]
-    lines += [f"- {name}: {tally_of_sentences([row[place] for row in rows])}" for place, name in enumerate(columns)]
+    lines += [f"- {name}: {tally([row[place] for row in rows])}" for place, name in enumerate(columns)]
     lines += ["", f"The verdict differs: {', '.join(_differing(rows)) or 'nowhere'}.", ""]
     lines += [f"Stand-in: {note}." for note in notes] + ([""] if notes else [])
     headings = ("claim", "the paper", "measured is", "must be", *(cell for name in columns for cell in (name, "")))

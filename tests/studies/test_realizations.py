@@ -29,6 +29,7 @@ from calstudy.studies.load import load_study
 from calstudy.studies.realizations import Realizations
 from calstudy.studies.show import describe_plan, show_plan, show_run
 from calstudy.studies.study import Budget, Run, run_study
+from calstudy.verdicts.tables import from_json
 
 DRAWN = True
 
@@ -217,19 +218,45 @@ def test_a_run_leaves_tables_a_figure_and_verdicts(finished):
     assert "criteria: " in console.export_text()
 
 
+PAPER = """
+from calstudy.claims.paper import Paper
+from calstudy.claims.realizations import over_realizations
+from calstudy.verdicts.criterion import Within
+from calstudy.verdicts.statement import Source
+
+
+@Source("Results", ("any",)).states(
+    "it is recovered", "P^R / P^S", Within(-9, 9), "wide", pooled=over_realizations("ratio", "outside-wedge", 0.2)
+)
+def recovered(run):
+    raise AssertionError("is measured on realizations")
+
+
+@Source("Results", ("any",)).states("gains are", "g", Within(-9, 9), "wide")
+def gains(run):
+    raise AssertionError("is about single runs")
+
+
+class Any(Paper):
+    roles = {"any": "a run"}
+
+    def statements(self):
+        return [recovered, gains]
+"""
+
+
 def test_claims_are_those_that_realizations_measure(finished, folder, tmp_path):
     """The numbers of the folder's arrays, those of the product of the run, and those of its table."""
-    claims = {claim.name: claim for claim in evaluate_folder(finished.folder, ["calamity2022"]).claims}
-    level, unbiased = claims["residual-level-outside-wedge"], claims["residual-unbiased-outside-wedge"]
-    assert (level.runs, level.measured) == ((finished.name,), unbiased.measured)
-    data = small(folder, papers=["calamity2022"], outputs__runs=str(tmp_path))
+    (tmp_path / "any.py").write_text(PAPER)
+    (claim,) = evaluate_folder(finished.folder, [str(tmp_path / "any.py")]).claims
+    assert (claim.name, claim.runs, claim.verdict) == ("recovered", (finished.folder.name.split("-")[0],), "supported")
+    data = small(folder, papers=[str(tmp_path / "any.py")], outputs__runs=str(tmp_path / "runs"))
     again = run_study(Realizations(validate(data, folder)), Budget(workers=1))
-    made = {claim["name"]: claim["measured"] for claim in json.loads((again.folder / "claims.json").read_text())}
-    assert made == {name: claim.measured for name, claim in claims.items()}
+    assert from_json((again.folder / "claims.json").read_text()) == [claim]
     with (finished.folder / "tables" / "realizations.csv").open(newline="") as table:
         rows = [row for row in csv.DictReader(table) if row["region"] == "outside-wedge"]
     ratios = [float(row["ratio mean"]) for row in rows if float(row["k [h/Mpc]"]) >= 0.2]
-    assert level.measured == pytest.approx(np.nanmean(ratios), rel=1e-6)
+    assert claim.measured == pytest.approx(np.nanmean(ratios), rel=1e-6)
 
 
 def test_the_plan_counts_the_disk_that_is_held_at_one_time(folder, tmp_path):
@@ -316,7 +343,8 @@ def test_the_shipped_file_draws_what_the_docs_say(scale):
     assert isinstance(study, Collection)
     assert len(study.parts) == 3
     assert [task.label for task in study.figures] == ["realizations-comparison"]
-    assert study.claims is None
+    # The minimally redundant array and the redundant one are compared with the paper.
+    assert study.claims.settings["roles"] == study.roles
     for part in study.parts.values():
         assert isinstance(part, Realizations)
         draws = {part_: block.count for block in part.experiment.realizations for part_ in block.draw}

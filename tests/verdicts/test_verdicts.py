@@ -162,6 +162,11 @@ def test_sentences_are_counted_and_statements_on_the_simulation_apart(tmp_path):
     text = (tmp_path / CLAIMS_MARKDOWN).read_text()
     assert tally_of_sentences(verdicts) in text.splitlines()
     assert "| fifth (simulation alone) | this and that [both] |" in text
+    console = Console(record=True, width=200)
+    show_verdicts(verdicts, "run", console)
+    shown = console.export_text()
+    assert tally_of_sentences(verdicts) in shown
+    assert shown.count("(simulation alone)") == 2
 
 
 def test_what_is_missing_is_said():
