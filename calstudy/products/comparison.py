@@ -25,7 +25,7 @@ CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
 """What is compared in bands of k, and how it is headed."""
 DIFFERENCES = ("transfer", "transfer_error", "bias", "bias_error")
-SPECTRA = ("signal", "response", "residual", "residual_without_eor")
+SPECTRA = ("signal", "response", "cross", "residual", "residual_without_eor")
 """What the scores are made from, and what differences of two of them are."""
 
 
