@@ -57,6 +57,7 @@ def leakage_exceeds_signal_thousandfold(run: RunResults) -> Finding:
     roles=("all_beams",),
 )
 def known_beams_leave_less_than_signal(run: RunResults) -> Finding:
+    require_long_baselines(run, MODES[1])
     return bias(run, *MODES)
 
 

@@ -8,8 +8,8 @@ Of the calibrated residual R of data with the EoR, and R0 of data without it, th
 - the recovered power P^R / P^S, as measured.
 
 A fit that stops before its minimum leaves a part of the signal that depends on where it started and stopped. The linear
-response of the fit (`calstudy.calibrate.expected_loss`) does not depend on these. Where it is known, its difference
-from T is a part of the error of T.
+response of the fit (`calstudy.calibrate.expected_loss`) does not depend on these. Scores have it beside T, whose error
+does not include their difference.
 
 Noise is in the errors of the last two, and not in their means, because spectra are crossed between two realizations of
 the noise. Errors are found by leaving out antennas (`calstudy.power.clusters`).
@@ -20,7 +20,7 @@ to both, so that the error of a difference is found by leaving out the same ante
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,8 +58,8 @@ class Score:
     transfer, transfer_error
         T s^2, free of the flux scale s, and its standard deviation, (Nk,); NaN if s is not known.
     cross_transfer
-        C s, the coefficient of the regression of the response on the EoR, (Nk,); NaN if s is not known. It equals T s^2
-        if the fit is at its minimum and its weights are those of the spectra.
+        C s, the coefficient of the regression of the response on the EoR, (Nk,); NaN if s is not known. At the minimum
+        of a fit with free foregrounds and the weights of the spectra it equals T s^2; with a finite prior it is larger.
     bias, bias_error
         s^2 P^R0 / P^S, free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     recovered, recovered_error
@@ -79,11 +79,6 @@ class Score:
     flux_scale: float = field(metadata={"unit": ""})
     # Tables of results from before it was measured have none.
     cross_transfer: np.ndarray = field(default_factory=lambda: np.array(np.nan), metadata={"unit": ""})
-
-    def on_other_paths(self, linear: np.ndarray) -> Score:
-        """Return scores whose errors of T include its difference from the linear response, (Nk,); NaN adds nothing."""
-        spread = np.where(np.isfinite(linear), self.transfer - linear, 0.0)
-        return replace(self, transfer_error=np.hypot(self.transfer_error, spread))
 
 
 @dataclass(frozen=True)

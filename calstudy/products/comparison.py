@@ -216,7 +216,8 @@ def _markdown(
         "",
         "T is the part of the EoR's power that is left, and the bias the power of the residual without EoR over that "
         "of the EoR, both free of the flux scale s, outside the wedge, in bands of k in h/Mpc, with one standard "
-        "deviation. The gain error is the median over antennas and integrations of the rms over channels, "
+        "deviation. *Linear* is T of the linear response of the fit, where T differs from it by more than its error. "
+        "The gain error is the median over antennas and integrations of the rms over channels, "
         "free of what no fit can know, and as fitted. χ² is per sample of data that were not fitted, in units of the "
         "noise. The processor time of an integration, all polarizations and threads together, is the median over "
         "solves, so that compilation in the first does not decide. The memory is the largest resident memory of the "
@@ -295,7 +296,8 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     headings = ("calibrator", *measured, "s", "gain error", "as fitted", "χ²", "solves", *cost)
     rows = []
     for name, summary in found.items():
-        values = [_cell(band[key], band[f"{key}_error"]) for key in ("transfer", "bias") for band in summary["bands"]]
+        values = [_transfer_cell(band) for band in summary["bands"]]
+        values += [_cell(band["bias"], band["bias_error"]) for band in summary["bands"]]
         rows.append(
             (
                 name,
@@ -309,6 +311,14 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
             )
         )
     return Table(headings, rows)
+
+
+def _transfer_cell(band: Mapping[str, Any]) -> str:
+    """Write T and, if it differs from the linear response by more than its error, this as well."""
+    cell, linear = _cell(band["transfer"], band["transfer_error"]), band.get("linear_transfer")
+    if linear is None or band["transfer"] is None or abs(band["transfer"] - linear) <= band["transfer_error"]:
+        return cell
+    return f"{cell} (linear {linear:.2f})"
 
 
 def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:

@@ -72,8 +72,6 @@ def make_score(job: Job) -> Mapping[str, Any]:
     save_spectrum(job.output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
     bands = measure(measured, EDGES, power.wedge_buffer, scale)
     linear = _linear_transfer(job, measured)
-    if linear is not None:
-        bands = bands.on_other_paths(linear)
     save_spectrum(job.output / BANDS, bands)
     summary = {
         "bands": _in_bands(bands, linear),
@@ -222,4 +220,4 @@ def _cost(task: Task) -> Cost:
     return Cost(0.5 + size.samples * 1.5e-7, LIBRARIES_MEMORY + 8 * part * COMPLEX128, 1e6)
 
 
-SCORE = Stage(name="score", version=3, make=make_score, cost=_cost)
+SCORE = Stage(name="score", version=4, make=make_score, cost=_cost)
