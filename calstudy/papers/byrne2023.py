@@ -68,6 +68,7 @@ def sensitivity_improves_hundredfold(sky_based: RunResults, delay_weighted: RunR
 class Byrne2023(Paper):
     """Statements on delay-weighted calibration."""
 
+    version: ClassVar[int] = 2
     citation = (
         "Byrne, R. 2023, Delay-weighted calibration: precision calibration for 21 cm cosmology with resilience to sky "
         "model error, arXiv:2208.04406"

@@ -64,6 +64,7 @@ def known_beams_leave_less_than_signal(run: RunResults) -> Finding:
 class Chokshi2024(Paper):
     """Statements on deformed beams."""
 
+    version: ClassVar[int] = 2
     citation = (
         "Chokshi, A., et al. 2024, The necessity of individually validated beam models for an interferometric epoch of "
         "reionization detection, arXiv:2409.19875"

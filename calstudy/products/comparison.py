@@ -364,4 +364,4 @@ def _cost(task: Task) -> Cost:
     return Cost(2 + cases * (0.5 + held * 1e-8), LIBRARIES_MEMORY + held, 1e6)
 
 
-COMPARISON = Stage(name="comparison", version=2, make=make_tables, cost=_cost)
+COMPARISON = Stage(name="comparison", version=3, make=make_tables, cost=_cost)
