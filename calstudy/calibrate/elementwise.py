@@ -14,15 +14,7 @@ LEAST_FUSED = 1_000_000
 class BaselineProducts:
     """The products of the elimination and of its Gauss-Newton matrix on some baselines.
 
-    Parameters
-    ----------
-    tensors
-        Of the fit.
-
-    Attributes
-    ----------
-    fused
-        Whether the products are compiled. Batches with equal numbers of baselines share one compilation.
+    They are compiled if `fused`; batches with equal numbers of baselines share one compilation.
     """
 
     def __init__(self, tensors: FitTensors) -> None:
