@@ -143,7 +143,7 @@ class _DelayFit:
         return scores
 
     def _window_scores(self, spectra: np.ndarray) -> np.ndarray:
-        """Return the part of the power of v in a Gaussian about each delay, minus its mean, (Nbls, Ndelays), float32.
+        """Return the power fraction of v in a Gaussian about each delay, minus the mean, (Nbls, Ndelays), float32.
 
         The convolution is a product with exp(-(2 pi k dnu sigma)^2 / 2) over the lags k of the autocorrelation in
         frequency.
@@ -292,8 +292,7 @@ def _sky_gradient(delays: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def _offsets(scores: np.ndarray, antennas: np.ndarray, delays: np.ndarray) -> np.ndarray:
-    """Return the offset of each delay from its step, (Nants,): the maximum of the sum of parabolas through the scores.
-    """
+    """Return the offset of each delay from its step, (Nants,): the maximum of the sum of parabolas through scores."""
     n_delays, n_antennas = scores.shape[1], delays.size
     at = (delays[antennas[:, 0]] - delays[antennas[:, 1]])[:, None] + np.array([-1, 0, 1])
     below, middle, above = np.take_along_axis(scores, at % n_delays, axis=1).T.astype(float)

@@ -255,8 +255,7 @@ class GainResponse:
         return eta
 
     def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
-        """Return the part of W y that gains absorb, after removal of the foregrounds' response to it, (Nbls, Nfreqs).
-        """
+        """Return the part of W y that gains absorb, less the foregrounds' response to it, (Nbls, Nfreqs)."""
         first, second = self._antennas
         gradient = tangent.slope.conj() * left
         descent = np.zeros(self._shape, complex)

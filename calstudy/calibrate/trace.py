@@ -14,16 +14,9 @@ from calstudy.calibrate.solvers.reduced import newton_decrement_at
 
 
 class Checkpoint(NamedTuple):
-    """An estimate on the way.
+    """An intermediate estimate: gains (Nants, Nfreqs) and model (Nbls, Nfreqs), complex128, with degeneracies fixed.
 
-    Attributes
-    ----------
-    n_steps
-        Steps taken.
-    gains, model
-        Shapes (Nants, Nfreqs) and (Nbls, Nfreqs), complex128, degeneracies fixed.
-    newton_decrement, decrement_rms
-        How far from the minimum, as in `calstudy.calibrate.solution.Solution`.
+    The decrements are as in `calstudy.calibrate.solution.Solution`.
     """
 
     n_steps: int
