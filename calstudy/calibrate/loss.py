@@ -150,8 +150,7 @@ class JointLoss:
         return self.coefficients(self._tensors.sum_pairs_over_group(of_parts))
 
     def coefficients(self, models: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """Return A^T F of each bucket, the transpose of `foreground_model`, for models (2, Nmodels, Nfreqs), float64.
-        """
+        """Return A^T F of each bucket for models (2, Nmodels, Nfreqs), float64; the transpose of `foreground_model`."""
         parts = zip(self._tensors.slices, self._tensors.bases, strict=True)
         return tuple(
             tf.cast(_coefficients(models[:, first:last], basis), self._dtype) for (first, last), basis in parts

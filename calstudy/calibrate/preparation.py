@@ -39,8 +39,8 @@ class PreparedFit:
         Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior. Weights that
         come from the gains are those of unity gains.
     used
-        Mask of the calibrated samples, bool, of the same shape: all that have weight, also on baselines that are not
-        fitted.
+        Mask of the calibrated samples, bool, of the same shape: all unflagged samples with weight, also on baselines
+        outside the range to which gains are fitted.
     start
         Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
     sky
@@ -88,15 +88,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
 def problem_at(
     prepared: PreparedFit, settings: GainFit, times: slice, polarization: int, gains: np.ndarray
 ) -> CalibrationProblem | str:
-    """Return the problem whose solution are some gains, with the weights that they make; or why there is none.
-
-    Parameters
-    ----------
-    prepared, settings, times, polarization
-        As for `make_problem`.
-    gains
-        The solution, complex, (Nants, Nfreqs).
-    """
+    """Return the problem whose solution are gains (Nants, Nfreqs), with the weights from them, or why there is none."""
     problem = make_problem(prepared, settings, times, polarization)
     if isinstance(problem, str) or not isinstance(settings.weights, GainWeights):
         return problem

@@ -1,22 +1,22 @@
-"""Elimination of the foregrounds: the best ones for given gains in closed form, and what is left for the gains.
+"""Elimination of the foregrounds: the best ones for given gains in closed form, and the reduced problem for the gains.
 
 For gains g and a baseline p = (a, b) write G_p = g_a g_b* and D_p = w_p |G_p|^2. With a Gaussian prior of mean m and
 covariance C on the foregrounds F, the fit minimizes
 
     sum w |V - G F|^2 + (F - m)^H C^-1 (F - m).
 
-C is known by its root: F_p = m_p + A_R (s z_R + t d_p) with vectors A_R of the model R of the baseline, coefficients
+C is given by its root: F_p = m_p + A_R (s z_R + t d_p) with vectors A_R of the model R of the baseline, coefficients
 z_R that the baselines of R share, and coefficients d_p of its own, all of unit variance, and deviations s and t. An
-infinite deviation is no prior at all: the foregrounds are A z, m does not matter, and A may be orthonormal (CALAMITY).
+infinite deviation is no prior at all: the foregrounds are A z, m has no effect, and A may be orthonormal (CALAMITY).
 
 The fit is linear least squares in z and d (variable projection, Golub & Pereyra 1973). With N_p = A^T D_p A, the own
-coefficients have the normal matrix t^2 N_p + 1. Putting their solution back leaves P_p = D_p - t^2 D_p A (t^2 N_p +
-1)^-1 A^T D_p in place of D_p for the shared ones, whose normal matrix is s^2 sum_p A^T P_p A + 1, and what is left for
-the gains is K in place of P, made in the same way. The gradient and the Gauss-Newton matrix for a relative change eta
-of the gains, g (1 + eta), are those of a fit with fixed foregrounds, but for K in place of D in the matrix.
+coefficients have the normal matrix t^2 N_p + 1. Inserting their solution replaces D_p by P_p = D_p - t^2 D_p A (t^2 N_p
++ 1)^-1 A^T D_p for the shared ones, whose normal matrix is s^2 sum_p A^T P_p A + 1. Inserting their solution in the
+same way replaces P by K for the gains. The gradient and the Gauss-Newton matrix for a relative change eta of the gains,
+g (1 + eta), are those of a fit with fixed foregrounds, with K in place of D in the matrix.
 
-Models m that have their coefficients in common count as one, whose channels are those of all of them, one after the
-other: N = sum_m A_m^T D_m A_m.
+Models m with common coefficients are treated as one, whose channels are those of all of them in sequence: N = sum_m
+A_m^T D_m A_m.
 """
 
 from __future__ import annotations
@@ -256,14 +256,9 @@ class Projector:
     def _eliminate_one(
         self, piece: Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
     ) -> tuple[tf.Tensor, tf.Tensor, Roots]:
-        """Return F - m on the baselines, the prior's share of the loss, and the roots, where a model has one kind.
+        """Eliminate one kind of coefficients; return F - m on the baselines, the prior's part of the loss, and roots.
 
-        Parameters
-        ----------
-        curvature, matched
-            D and G* w V - D m of its baselines.
-        deviations
-            See `_project`.
+        `curvature` and `matched` are D and G* w V - D m of the baselines of the batch; for `deviations` see `_project`.
         """
         owner, vectors = piece.owner, piece.vectors
         if owner is not None:
