@@ -72,8 +72,8 @@ class OtherPackage(WeightedFit):
         """Return gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how each solve ended.
 
         The data are of one polarization, with weight in each group of integrations. `start` is None in the first pass.
-        If weights come from the gains, later passes have the gains of the previous one as `start`; the weights of
-        `measured` are still those of unity gains (`Measured.weighted_by`).
+        If weights come from the gains, `start` are the gains of the previous pass; the weights are then those of
+        `measured` over |g_a g_b|^2 of these gains (`Measured.weighted_by`).
         """
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
@@ -163,7 +163,7 @@ def _in_passes(outcome: Outcome, change: float, unsettled: bool, passes: int) ->
 
 
 def _turned(gains: np.ndarray) -> np.ndarray:
-    """Return gains, zero where there are none, whose sum over antennas is real and positive in every channel."""
+    """Rotate gains so that their sum over antennas is real and positive in every channel; unknown ones are zero."""
     flat = gains.reshape(len(gains), -1)
     return fix_phase(flat, np.ones_like(flat)).reshape(gains.shape)
 

@@ -152,14 +152,9 @@ def _average(gains: np.ndarray) -> np.ndarray:
 
 
 def _undetermined(antennas: np.ndarray, groups: RedundantGroups) -> str | None:
-    """Return what redundancy leaves open besides one amplitude, one phase and a phase gradient, or None.
+    """Describe degrees of freedom that redundancy leaves besides amplitude, phase and phase gradient, or return None.
 
-    Parameters
-    ----------
-    antennas
-        (Nbls, 2).
-    groups
-        Of these baselines. Each has an unknown visibility, which is eliminated.
+    `antennas` are those of each baseline, (Nbls, 2). Each group has an unknown visibility, which is eliminated.
     """
     present, places = np.unique(antennas, return_inverse=True)
     first, second = places.reshape(-1, 2).T

@@ -35,16 +35,9 @@ STEPS_PER_CALL = 50
 
 
 class Descent(NamedTuple):
-    """What changes from step to step.
+    """Parameters and moments of the gradient after a step, and the parameters with the lowest loss so far.
 
-    Attributes
-    ----------
-    parameters
-        Where the descent is.
-    moments
-        First and second moment of the gradient, each of the shape of the parameters.
-    best, best_loss
-        The parameters with the lowest loss so far, and that loss.
+    The moments, first and second, have the shape of the parameters.
     """
 
     parameters: Parameters

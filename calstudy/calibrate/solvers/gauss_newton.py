@@ -326,7 +326,7 @@ class GaussNewton:
         return state.preconditioner if state.kernels.dtype == tf.float32 else None
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
-        """Bring the antenna blocks to the damping of the state, or make them, and let them predict the next step."""
+        """Adapt the antenna blocks to the damping of the state, or compute them, and predict the next step."""
         preconditioner = state.preconditioner
         kernels = state.kernels
         # Smooth gains couple all channels from the start.
@@ -350,7 +350,7 @@ class GaussNewton:
 
 
 class _Step(NamedTuple):
-    """A step eta, the decrease of the loss that it promises, and whether its preconditioner is out of date."""
+    """A step eta, the decrease of the loss that its quadratic model predicts, and whether its preconditioner is old."""
 
     eta: tf.Tensor
     promised: float

@@ -307,15 +307,7 @@ _kernels = lru_cache(maxsize=6)(ReducedKernels)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
-    """Return the relative Newton decrement of the reduced problem at given gains (see `Solution`).
-
-    Parameters
-    ----------
-    problem
-        Data and weights.
-    gains
-        Where any solver stopped, (Nants, Nfreqs).
-    """
+    """Return the relative Newton decrement of the reduced problem at gains (Nants, Nfreqs) (see `Solution`)."""
     kernels = compiled(problem.structure, problem.frozen)
     reduced = kernels.reduce(problem, gains)
     projection = kernels.project(reduced.gains, *reduced.data)
