@@ -168,7 +168,7 @@ StudyName = Annotated[str, AfterValidator(_usable_name), Field(description="Name
 
 
 class Experiment(Section):
-    """One study: instrument, sky, corruption of the data, calibration, and measured quantities."""
+    """One study: instrument, sky, corruption of the data, calibration under test, and measured quantities."""
 
     name: StudyName
     description: str = ""

@@ -131,7 +131,7 @@ class GaussNewtonState:
 
     @property
     def decrease_to_come(self) -> float:
-        """Relative decrease of the loss by all further steps: a geometric series with the ratio of the last two.
+        """Relative decrease of the loss by all further steps: a geometric series from the last and predicted decreases.
 
         Before the first step it is that of the next step alone.
         """
