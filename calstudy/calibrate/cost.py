@@ -95,7 +95,7 @@ def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
     # The problem's complex visibilities and weights, and the solver's pairs of them.
     data = (2 + 1) * 2 * DOUBLE * d.samples
     by_channel = 8 * SINGLE * d.channels * d.antennas**2
-    # Smooth gains have coefficients in place of channels, hardly as many.
+    # Smooth gains have coefficients in place of channels, and at most as many.
     by_antenna = 0.0 if settings.gain_delay is None else 6 * SINGLE * d.antennas * d.channels**2
     if not isinstance(settings, ForegroundFit):
         return TENSORFLOW_MEMORY + RETAINED * (data + 20 * SINGLE * d.samples + by_channel + by_antenna)

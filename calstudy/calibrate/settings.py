@@ -253,7 +253,7 @@ Deviation = Annotated[Annotated[float, Field(ge=0)] | Literal["infinite"], Befor
 
 
 class ForegroundPrior(Section):
-    """How far foregrounds may be from what is assumed: a Gaussian prior, flat over the modelled delays."""
+    """Gaussian prior on deviations of the foregrounds from the assumed ones, flat over the modelled delays."""
 
     mean: Literal["none", "sky-model"] = Field("none", description="What is assumed of the foregrounds.")
     deviation: Deviation = Field(
