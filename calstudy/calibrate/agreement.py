@@ -1,6 +1,6 @@
-"""How far gains, foreground models and what they make of the data agree with the truth (paper §Simulation Results).
+"""Compare gains, foreground models and residuals of a fit with the truth (paper §Simulation Results).
 
-Every number has the scatter over the antennas, baselines or integrations that it was measured on.
+Every number has its scatter over the antennas, baselines or integrations on which it was measured.
 """
 
 from __future__ import annotations
@@ -22,19 +22,7 @@ MAIN_LOBE = 4
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number and how much it scatters.
-
-    Attributes
-    ----------
-    value
-        Median, or what the name says.
-    scatter
-        Half the width of the central 68 %.
-    count
-        How many values there are.
-    over
-        What they belong to.
-    """
+    """A median (or the quantity of its name), half the width of the central 68 %, and the number and kind of values."""
 
     value: float
     scatter: float
@@ -50,18 +38,10 @@ class Statistic:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a simulated measurement consists of; visibilities (Ntimes, Nbls, Nfreqs) complex, in Jy.
+    """The parts of a simulated measurement; visibilities are complex, (Ntimes, Nbls, Nfreqs), in Jy.
 
-    What is flagged is zero, here and in `Fit`.
-
-    Attributes
-    ----------
-    gains
-        True gains, (Ntimes, Nants, Nfreqs).
-    foregrounds, noise
-        F and N without gains.
-    data
-        The measurement, gains included.
+    True gains are (Ntimes, Nants, Nfreqs). Foregrounds F and noise N are without gains, data are with them. Flagged
+    samples are zero, here and in `Fit`.
     """
 
     gains: np.ndarray
@@ -72,14 +52,9 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What calibration made of it.
+    """The result of a calibration: gains (Ntimes, Nants, Nfreqs), intrinsic foregrounds and calibrated residual R.
 
-    Attributes
-    ----------
-    gains
-        (Ntimes, Nants, Nfreqs).
-    model, residual
-        Intrinsic foregrounds and calibrated residual R, (Ntimes, Nbls, Nfreqs), in Jy.
+    Model and residual are (Ntimes, Nbls, Nfreqs), in Jy.
     """
 
     gains: np.ndarray
@@ -89,7 +64,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Baselines:
-    """Where and how the baselines measure.
+    """Antennas, lengths and channels of the baselines.
 
     Attributes
     ----------
@@ -100,7 +75,7 @@ class Baselines:
     frequency
         Channel centres, Hz, (Nfreqs,).
     buffer
-        Added to the horizon delay to find what is outside the wedge, s.
+        Delay, s, that is added to the horizon delay; the wedge ends there.
     """
 
     antennas: np.ndarray
@@ -115,12 +90,12 @@ class Baselines:
 
     @property
     def inside(self) -> np.ndarray:
-        """Which delays lie within the horizon, (Nbls, Ndelays)."""
+        """Mask of the delays within the horizon, (Nbls, Ndelays)."""
         return np.abs(self.delay) <= horizon_delay(self.lengths[:, None])
 
     @property
     def outside(self) -> np.ndarray:
-        """Which delays lie beyond horizon and buffer, or the main lobe of the taper if that is wider."""
+        """Mask of the delays beyond horizon and buffer, or beyond the main lobe of the taper if that is wider."""
         lobe = MAIN_LOBE / (channel_width(self.frequency) * self.frequency.size)
         return np.abs(self.delay) > horizon_delay(self.lengths[:, None]) + max(self.buffer, lobe)
 
@@ -138,21 +113,10 @@ class Baselines:
 
 
 def compare_with_truth(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
-    """Compare a fit with the truth.
+    """Compare a fit with the truth, and return statistics by name.
 
-    Parameters
-    ----------
-    truth
-        What the measurement consists of.
-    fit
-        What calibration made of it.
-    baselines
-        Their antennas, lengths and channels.
-
-    Returns
-    -------
-    Statistics by name. Ratios are of rms amplitudes; "aligned" means free of the phases and the scale that no fit can
-    know (`calstudy.calibrate.degeneracy.align`), "raw" as fitted. Names that end in "outside" or "inside" refer to
+    Ratios are of rms amplitudes. "Aligned" quantities are free of the phases and the scale that no fit can determine
+    (`calstudy.calibrate.degeneracy.align`), "raw" ones are as fitted. Names that end in "outside" or "inside" refer to
     delays beyond or within the horizon of each baseline; those that no baseline has are left out.
     """
     found = _gains(truth, fit, baselines) | _models(truth, fit) | _fitted_data(truth, fit, baselines)
@@ -164,17 +128,14 @@ def _rms(values: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
 
 
 def aligned_gains(fitted: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Return fitted gains brought closest to the true ones by what no fit can know, (Ntimes, Nants, Nfreqs)."""
+    """Align fitted with true gains in their degenerate phases and scale, (Ntimes, Nants, Nfreqs)."""
     return np.stack([align(*both)[0] for both in zip(fitted, true, strict=True)])
 
 
 def gain_errors(fitted: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Return the rms over channels of fitted minus true gains, over that of the true ones; where there are any, (N,).
+    """Return the rms over channels of fitted minus true gains relative to the rms of the true ones, (N,).
 
-    Parameters
-    ----------
-    fitted, true
-        Complex, (Ntimes, Nants, Nfreqs); zero where there is no solution.
+    Gains are complex, (Ntimes, Nants, Nfreqs), and zero where there is no solution; those are left out.
     """
     size = _rms(true, axis=2)
     known = size > 0
@@ -255,7 +216,7 @@ def _residuals(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statis
 
 
 def _masked_mean(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Mean over the marked delays of each baseline; zero where none is marked."""
+    """Return the mean over the marked delays of each baseline; zero where none is marked."""
     return np.sum(values, axis=1, where=mask) / np.maximum(mask.sum(axis=1), 1)
 
 
@@ -265,5 +226,5 @@ def as_json(statistics: Mapping[str, Statistic]) -> dict[str, Any]:
 
 
 def from_json(values: Mapping[str, Any]) -> dict[str, Statistic]:
-    """Return what `as_json` was given."""
+    """Return the statistics that `as_json` converted."""
     return {name: Statistic(**value) for name, value in values.items()}

@@ -1,4 +1,4 @@
-"""Amplitudes of antennas before they are calibrated: zeros, which are no data, and what stands out."""
+"""Amplitudes of antennas before calibration: samples that are exactly zero, and outliers."""
 
 from __future__ import annotations
 
@@ -7,22 +7,16 @@ import numpy as np
 from calstudy.base.observation import Observation
 
 FAR = 30.0
-"""Amplitudes of an antenna this many times the median of the antennas, or less than its inverse, are told."""
+"""Amplitudes of an antenna this many times the median of the antennas, or less than its inverse, are reported."""
 FEW = 0.05
-"""With data in a smaller part of the channels a fit of foregrounds and gains says little; told."""
+"""With data in a smaller fraction of the channels, a fit of foregrounds and gains is unreliable; this is reported."""
 
 
 def dead_samples(data: Observation, chosen: np.ndarray) -> np.ndarray:
-    """Return which samples are exact zeros because an antenna was off, bool, (Ntimes, Nchosen, Nfreqs, Npols).
+    """Find samples that are exactly zero because an antenna was off, bool, (Ntimes, Nchosen, Nfreqs, Npols).
 
     An antenna is off in a channel of an integration if all its baselines that are not flagged are exactly zero there.
-
-    Parameters
-    ----------
-    data
-        Visibilities and flags.
-    chosen
-        Which baselines are looked at, bool, (Nbls,).
+    `chosen`, bool, (Nbls,), selects baselines.
     """
     zero = ~data.flags[:, chosen] & (data.visibilities[:, chosen] == 0)
     if not zero.any():
@@ -37,7 +31,7 @@ def dead_samples(data: Observation, chosen: np.ndarray) -> np.ndarray:
 
 
 def conspicuous(data: Observation) -> list[str]:
-    """Return sentences on antennas of zeros alone, or with amplitudes far from others, and on few channels."""
+    """Describe antennas that are zero throughout or have outlying amplitudes, and integrations with few channels."""
     crosses = ~data.autos
     dead, antennas = dead_samples(data, crosses), data.antennas[crosses]
     live = ~data.flags[:, crosses] & ~dead
@@ -66,7 +60,7 @@ def conspicuous(data: Observation) -> list[str]:
 
 
 def _few_channels(live: np.ndarray) -> list[str]:
-    """Return a sentence if solves have data in few channels; `live` is (Ntimes, Nbls, Nfreqs, Npols)."""
+    """Describe solves with data in few channels; `live` is (Ntimes, Nbls, Nfreqs, Npols)."""
     counts = live.any(axis=1).sum(axis=1)
     few = (counts > 0) & (counts < FEW * live.shape[2])
     if not few.any():

@@ -1,4 +1,4 @@
-"""The foreground basis: discrete prolate spheroidal sequences in frequency, shared by baselines of like length.
+"""The foreground basis: discrete prolate spheroidal sequences in frequency, shared by baselines of similar length.
 
 Paper Eq. FGMODEL models each intrinsic visibility as a sum of DPSS (Slepian 1978) whose delays reach the horizon of its
 baseline. Half-widths are rounded up to a step, so that baselines fall into buckets with one basis each and no basis is
@@ -16,7 +16,7 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.calibrate.settings import BasisSettings
 
-# Sequences asked for beyond the Shannon number 2NW; concentrations fall to 1e-14 well within these.
+# Sequences computed beyond the Shannon number 2NW; concentrations fall to 1e-14 well within these.
 EXTRA_SEQUENCES = 40
 # How far channels may be off their grid, in units of its spacing.
 GRID_TOLERANCE = 0.05
@@ -24,7 +24,7 @@ GRID_TOLERANCE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Bucket:
-    """Models that share one basis, or, if it is joint, one set of coefficients.
+    """Models that share one basis or, in a joint bucket, one set of coefficients.
 
     Attributes
     ----------
@@ -33,10 +33,9 @@ class Bucket:
     members
         Indices of the models in this bucket, shape (Nmembers,).
     vectors
-        Orthonormal sequences, shape (Nfreqs, Nvec), float64, for which every member has coefficients of its own, or a
-        root of the covariance of the foregrounds, where they have a prior. In a joint bucket,
-        (Nmembers, Nfreqs, Nvec), orthonormal over all members together, with coefficients that the members have in
-        common.
+        Orthonormal sequences, shape (Nfreqs, Nvec), float64, for which every member has its own coefficients; with a
+        prior, a root of the covariance of the foregrounds. In a joint bucket, (Nmembers, Nfreqs, Nvec), orthonormal
+        over all members together, with coefficients that the members share.
     """
 
     half_width: float | None
@@ -45,12 +44,12 @@ class Bucket:
 
     @property
     def joint(self) -> bool:
-        """Whether the members have their coefficients in common."""
+        """Whether the members share their coefficients."""
         return self.vectors.ndim == 3
 
     @property
     def n_coefficients(self) -> int:
-        """Number of complex coefficients of the members together."""
+        """Number of complex coefficients of all members together."""
         return self.vectors.shape[-1] * (1 if self.joint else self.members.size)
 
 
@@ -58,15 +57,8 @@ class Bucket:
 class ForegroundBasis:
     """The bases of all foreground models (one model per baseline, or one per redundant group).
 
-    A model is one spectrum; models that are tied to each other by common coefficients are the members of a joint
-    bucket.
-
-    Attributes
-    ----------
-    buckets
-        Every model is a member of exactly one bucket.
-    n_models, n_frequencies
-        Number of models and of channels.
+    A model is one spectrum, and belongs to exactly one bucket; models with common coefficients are the members of a
+    joint bucket.
     """
 
     buckets: tuple[Bucket, ...]
@@ -80,7 +72,7 @@ class ForegroundBasis:
 
 
 def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarray:
-    """Return the largest modelled delay of each baseline, shape (Nmodels,), in s, for `lengths` in m.
+    """Compute the largest modelled delay of each baseline, shape (Nmodels,), in s, for `lengths` in m.
 
     It is ``max(horizon * length / c, min_delay) + buffer``, rounded up to a multiple of `delay_step`; autocorrelations
     have length zero.
@@ -91,7 +83,7 @@ def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarra
 
 
 def _most_sequences(n_frequencies: int, half_bandwidth: float) -> int:
-    """Return how many sequences are asked for, of which those below the cutoff are left out."""
+    """Return the number of sequences to compute, before those below the eigenvalue cutoff are left out."""
     return min(n_frequencies, int(2 * half_bandwidth) + EXTRA_SEQUENCES)
 
 
@@ -111,16 +103,9 @@ def _sequences(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: flo
 
 
 def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> np.ndarray:
-    """Return the DPSS concentrated within `half_bandwidth` better than the cutoff, shape (n_frequencies, Nvec).
+    """Compute the DPSS whose concentration is above the cutoff, shape (n_frequencies, Nvec).
 
-    Parameters
-    ----------
-    n_frequencies
-        Length of the sequences.
-    half_bandwidth
-        The product NW of the number of channels, the channel width and the delay half-width.
-    eigenvalue_cutoff
-        Sequences with a smaller spectral concentration are left out.
+    `half_bandwidth` is NW, the product of the number of channels, the channel width and the delay half-width.
     """
     return _sequences(n_frequencies, half_bandwidth, eigenvalue_cutoff)[0]
 
@@ -128,17 +113,9 @@ def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: f
 def flat_wedge_root(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> np.ndarray:
     """Return a root B of the covariance B B^T of a signal, white up to a delay, that has variance one per channel.
 
-    The covariance is sin(2 pi W (i - j)) / (2 pi W (i - j)) with the half-bandwidth N W of N channels; its
-    eigenvectors are the DPSS, its eigenvalues their concentrations over 2 W (Slepian 1978).
-
-    Parameters
-    ----------
-    n_frequencies, half_bandwidth, eigenvalue_cutoff
-        As for `dpss_vectors`.
-
-    Returns
-    -------
-    ndarray, float64, (n_frequencies, Nvec)
+    The covariance is sin(2 pi W (i - j)) / (2 pi W (i - j)) with the half-bandwidth N W of N channels; its eigenvectors
+    are the DPSS, its eigenvalues their concentrations over 2 W (Slepian 1978). The root is float64, (n_frequencies,
+    Nvec); parameters are as for `dpss_vectors`.
     """
     vectors, concentrations = _sequences(n_frequencies, half_bandwidth, eigenvalue_cutoff)
     return vectors * np.sqrt(concentrations * n_frequencies / (2 * half_bandwidth))
@@ -146,17 +123,7 @@ def flat_wedge_root(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff
 
 @dataclass(frozen=True, eq=False)
 class ChannelGrid:
-    """The even grid that channels lie on.
-
-    Attributes
-    ----------
-    width
-        Spacing of the grid in Hz.
-    n_channels
-        Length of the grid, gaps included.
-    positions
-        Where each channel is on it, shape (Nfreqs,).
-    """
+    """The even grid of the channels: spacing in Hz, length with gaps, and position of each channel on it, (Nfreqs,)."""
 
     width: float
     n_channels: int
@@ -166,10 +133,7 @@ class ChannelGrid:
 def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
     """Return the grid of channel centres (Nfreqs,) in Hz, ascending or descending, with or without gaps.
 
-    Raises
-    ------
-    InputError
-        If there are fewer than two channels, or they lie on no even grid.
+    Raises InputError if there are fewer than two channels, or if they do not lie on an even grid.
     """
     spacings = np.abs(np.diff(frequencies))
     refusal = InputError("frequencies: the DPSS foreground basis needs at least two channels on an even grid")
@@ -186,20 +150,10 @@ def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
 
 
 def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -> np.ndarray:
-    """Return an orthonormal basis of the restriction of sequences to the channels that exist.
+    """Return an orthonormal basis of sequences restricted to the channels that exist, float64, (Nfreqs, at most Nvec).
 
-    Parameters
-    ----------
-    vectors
-        Orthonormal sequences on the whole grid, (n_channels, Nvec), float64.
-    grid
-        The grid, and which of its channels exist.
-    eigenvalue_cutoff
-        Combinations of which the existing channels hold less than this fraction of the power are left out.
-
-    Returns
-    -------
-    ndarray, float64, (Nfreqs, at most Nvec)
+    `vectors` are orthonormal on the whole grid, (n_channels, Nvec). Combinations with less than the fraction
+    `eigenvalue_cutoff` of their power in the existing channels are left out.
     """
     if len(grid.positions) == grid.n_channels:
         return vectors
@@ -208,16 +162,10 @@ def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -
 
 
 def gain_vectors(frequencies: np.ndarray, delay: float, eigenvalue_cutoff: float) -> np.ndarray:
-    """Return orthonormal sequences that hold gains with delays up to `delay` s, shape (Nfreqs, Ngain).
+    """Compute orthonormal sequences for gains with delays up to `delay` s, shape (Nfreqs, Ngain).
 
-    Parameters
-    ----------
-    frequencies
-        Channel centres on an even grid, gaps allowed, Hz, shape (Nfreqs,).
-    delay
-        Half-width in s; the basis is all of the channels if they do not resolve it.
-    eigenvalue_cutoff
-        Sequences with a smaller spectral concentration are left out.
+    Channel centres are in Hz on an even grid, gaps allowed. If the channels do not resolve the delay, the basis spans
+    all of them. Sequences with a spectral concentration below the cutoff are left out.
     """
     grid = channel_grid(frequencies)
     if delay * grid.width >= 0.5:
@@ -237,17 +185,15 @@ def make_basis(
         Baseline length of each model in m, shape (Nmodels,); zero for autocorrelations.
     frequencies
         Channel centres in Hz on an even grid, gaps allowed, shape (Nfreqs,).
-    settings
-        Delays that are modelled, and the eigenvalue cutoff.
     prior
-        Whether vectors are a root of the covariance of a flat wedge with variance one per channel (see
-        `flat_wedge_root`), in place of orthonormal ones.
+        Use a root of the covariance of a flat wedge with variance one per channel (see `flat_wedge_root`) in place of
+        orthonormal vectors.
 
     Raises
     ------
     InputError
-        If channels are on no even grid, a half-width is zero, or a basis would leave no channel's worth of freedom
-        to the data.
+        If channels do not lie on an even grid, a half-width is zero, or a basis has as many vectors as there are
+        channels.
     """
     n_frequencies = len(frequencies)
     grid = channel_grid(np.asarray(frequencies, float))
@@ -276,15 +222,7 @@ def make_basis(
 
 
 def require_room(length: float, frequencies: np.ndarray, settings: BasisSettings) -> None:
-    """Raise InputError if a baseline of this length cannot have a foreground basis; see `make_basis`.
-
-    Parameters
-    ----------
-    length
-        m.
-    frequencies, settings
-        As for `make_basis`.
-    """
+    """Raise InputError if a baseline of this length, in m, cannot have a foreground basis; see `make_basis`."""
     grid = channel_grid(np.asarray(frequencies, float))
     product = delay_half_widths(np.array([length]), settings)[0] * grid.width
     # A plan is faster where the sequences, and scipy.signal for them, are not needed to see that there is room.

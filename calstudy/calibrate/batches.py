@@ -1,8 +1,8 @@
-"""Batches of foreground models that are worked on at once, and the products with their bases.
+"""Batches of foreground models that are processed at once, and the products with their bases.
 
-Baselines of like length share a basis (`calstudy.calibrate.basis`), and an array can have as many bases as baselines.
-What is compiled grows with the number of pieces, so that models of different bases are put together into a few batches,
-their coefficients padded with zeros: a vector of zeros has no part in anything.
+Baselines of similar length share a basis (`calstudy.calibrate.basis`), and an array can have as many bases as
+baselines. The size of compiled graphs grows with the number of pieces. Models of different bases are therefore put
+together into a few batches, with coefficients padded with zeros: a vector of zeros contributes nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SPAN_CUTOFF = {tf.float32: 1e-9, tf.float64: 1e-15}
 # Random products of columns from which their span is found, over the number of columns: the rank is 1.1 to 1.4 times
 # that, and about twice in 1,500 channels.
 PRODUCT_SAMPLES = 3
-# One matrix product for each basis is faster than one for each model, if that many have it.
+# One matrix product for each basis is faster than one for each model, if the basis has at least this many models.
 ALIKE = 4
 
 
@@ -42,9 +42,9 @@ class Batch(NamedTuple):
         First one and one past the last, in the solvers' order.
     bases
         The different bases of these models, (Nfreqs, Nvec) each, float64; a single one of (Nmodels, Nfreqs, Nvec) if
-        the models have their coefficients in common.
+        the models share their coefficients.
     basis_index
-        Which of them each model has, (Nmodels,), ascending.
+        Index of the basis of each model, (Nmodels,), ascending.
     """
 
     models: tuple[int, int]
@@ -54,25 +54,16 @@ class Batch(NamedTuple):
 
     @property
     def joint(self) -> bool:
-        """Whether the models have their coefficients in common."""
+        """Whether the models share their coefficients."""
         return self.bases[0].ndim == 3
 
 
 def make_batches(bases: Sequence[np.ndarray], sizes: Sequence[int], edges: np.ndarray, most: int) -> list[Batch]:
-    """Return batches of at most `most` baselines and of models with similar numbers of vectors.
+    """Divide models into batches of at most `most` baselines, with similar numbers of vectors.
 
-    A model with more baselines than that, or models with common coefficients, are a batch all the same.
-
-    Parameters
-    ----------
-    bases
-        Of each bucket, as in `Batch`; their models follow each other.
-    sizes
-        Number of models of each bucket.
-    edges
-        First baseline of each model, and one past the last of all, (Nmodels + 1,).
-    most
-        Baselines.
+    A model with more baselines than that, or models with common coefficients, still form one batch. `bases` and `sizes`
+    (numbers of models) are those of consecutive buckets; `edges` are the first baseline of each model and one past the
+    last, (Nmodels + 1,).
     """
     joint = np.repeat([basis.ndim == 3 for basis in bases], sizes)
     bucket_of = np.repeat(np.arange(len(bases)), sizes)
@@ -106,9 +97,9 @@ class Vectors:
     overlaps
         A^T Q of each, (Nbases, Nvec, rank), with the batch's span Q, in the precision of the inner products.
     widths
-        Vectors that are not padding, (Nbases,).
+        Numbers of vectors that are not padding, (Nbases,).
     index
-        Which of them each row has, (Nrows,), ascending.
+        Index of the basis of each row, (Nrows,), ascending.
     """
 
     def __init__(self, bases: np.ndarray, overlaps: np.ndarray, widths: np.ndarray, index: np.ndarray) -> None:
@@ -131,7 +122,7 @@ class Vectors:
             return tf.matmul(curvature[:, None, :] * self._stack, self._stack, transpose_b=True)
         found = []
         for rows, basis in zip(tf.split(curvature, self._rows_of_basis), self._bases, strict=True):
-            # Of the products of vectors with each other, and of vectors with D, the fewer are made.
+            # Either the products of vectors with each other or those of vectors with D are computed, the fewer ones.
             if rows.shape[0] > self.n_vectors:
                 span = self._product_span if rows.shape[0] >= self.length else None
                 found.append(column_products(rows, basis, basis, span))
@@ -174,18 +165,16 @@ class Vectors:
 
 
 class Piece(NamedTuple):
-    """One batch, and its vectors.
+    """One batch, and the vectors of its models.
 
     Attributes
     ----------
     span
-        Orthonormal basis Q of what the batch's vectors span, (Nfreqs, rank), in the precision of the inner products.
+        Orthonormal basis Q of the span of the batch's vectors, (Nfreqs, rank), in the precision of the inner products.
     owner
         Position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model.
-    vectors
-        Of its models.
     own
-        Of its baselines, if they have coefficients of their own besides the shared ones.
+        Vectors of the baselines, if they have their own coefficients besides the shared ones.
     """
 
     batch: Batch
@@ -201,7 +190,7 @@ class Piece(NamedTuple):
         return tf.stack([tf.math.segment_sum(part, self.owner) for part in tf.unstack(values)])
 
     def to_baselines(self, values: tf.Tensor) -> tf.Tensor:
-        """Give each baseline what its model has, the transpose of `to_models`."""
+        """Copy the values of each model to its baselines, the transpose of `to_models`."""
         return values if self.owner is None else tf.gather(values, self.owner, axis=1)
 
     def absorb(self, values: tf.Tensor, root: tf.Tensor) -> tf.Tensor:
@@ -216,20 +205,10 @@ class Piece(NamedTuple):
 
 
 def make_piece(batch: Batch, span: np.ndarray, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
-    """Return a batch with its vectors.
+    """Build the vectors of a batch; those of its baselines as well, if these have their own coefficients.
 
-    Parameters
-    ----------
-    batch
-        Which.
-    span
-        Orthonormal basis of what its vectors span, (Nfreqs, rank), float64.
-    owner
-        Position in the batch of the model of each baseline, ascending, (Nbls,); None if each baseline is its own model.
-    with_own
-        Whether baselines have coefficients of their own besides the shared ones.
-    dtype
-        Of the span and the overlaps.
+    `span` is as from `span_of`. `owner` is the position in the batch of the model of each baseline, ascending, (Nbls,),
+    or None if each baseline is its own model. `dtype` is that of the span and the overlaps.
     """
     kind = dtype.as_numpy_dtype
     own = batch_vectors(batch, span, owner, kind) if with_own else None
@@ -238,14 +217,9 @@ def make_piece(batch: Batch, span: np.ndarray, owner: np.ndarray | None, with_ow
 
 
 def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
-    """Return an orthonormal basis of what bases span together, (Nfreqs, rank), float64.
+    """Return an orthonormal basis of the joint span of several bases, (Nfreqs, rank), float64.
 
-    Parameters
-    ----------
-    bases
-        (Nfreqs, Nvec), or of the members of a joint batch, (Nmembers, Nfreqs, Nvec).
-    dtype
-        Precision that it is for.
+    Bases are (Nfreqs, Nvec), or (Nmembers, Nfreqs, Nvec) for the members of a joint batch. `dtype` sets the precision.
     """
     vectors = np.concatenate([_side_by_side(basis) for basis in bases], axis=1)
     # R of a QR decomposition has the same left singular vectors; the right ones, of no use, would take most time.
@@ -255,17 +229,12 @@ def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
 
 
 def product_span(pairs: Sequence[tuple[np.ndarray, np.ndarray]], dtype: tf.DType) -> tf.Tensor | None:
-    """Return an orthonormal basis of what the products of columns span, (length, rank); None if it is everything.
+    """Return an orthonormal basis of the span of products of columns, (length, rank); None if it is the whole space.
 
-    Smooth columns, as foreground vectors are, have products that span little more than both together. The span is
-    found from products of random combinations of the columns (Halko, Martinsson & Tropp 2011, SIAM Rev. 53, 217).
-
-    Parameters
-    ----------
-    pairs
-        Each column of the first is multiplied with each of the second, (length, Nleft) and (length, Nright), float64.
-    dtype
-        Of the basis, and the precision that it is for.
+    Smooth columns, such as foreground vectors, have products whose rank is little more than the sum of both ranks. The
+    span is found from products of random combinations of the columns (Halko, Martinsson & Tropp 2011, SIAM Rev. 53,
+    217). Each column of the first of a pair is multiplied with each of the second, (length, Nleft) and (length,
+    Nright), float64. `dtype` is that of the basis and sets the precision.
     """
     rng = np.random.default_rng(1)
     samples = []
@@ -285,13 +254,8 @@ def product_span(pairs: Sequence[tuple[np.ndarray, np.ndarray]], dtype: tf.DType
 def column_products(rows: tf.Tensor, left: tf.Tensor, right: tf.Tensor, span: tf.Tensor | None = None) -> tf.Tensor:
     """Return sum_f y(f) A_i(f) B_j(f), (Nrows, Nleft, Nright), for rows y, (Nrows, length).
 
-    Parameters
-    ----------
-    left, right
-        A and B, (length, Nleft) and (length, Nright).
-    span
-        What the products of their columns span (see `product_span`). If it is given, rows are first multiplied with
-        it, which is less work for many rows.
+    A and B are (length, Nleft) and (length, Nright). With the span of the products of their columns (see
+    `product_span`), rows are first multiplied with it, which is less work for many rows.
     """
     products = tf.reshape(left[:, :, None] * right[:, None, :], [left.shape[0], -1])
     found = rows @ products if span is None else (rows @ span) @ tf.matmul(span, products, transpose_a=True)
@@ -299,21 +263,11 @@ def column_products(rows: tf.Tensor, left: tf.Tensor, right: tf.Tensor, span: tf
 
 
 def batch_vectors(batch: Batch, span: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
-    """Return the vectors of the models of a batch, or of its baselines.
+    """Build the vectors of the models of a batch or, with `owner`, of its baselines.
 
-    Models with common coefficients are one row, whose channels are those of all of them, one after the other.
-
-    Parameters
-    ----------
-    batch
-        Which.
-    span
-        Q, (Nfreqs, rank).
-    owner
-        Position in the batch of the model of each baseline, ascending, for the vectors of the baselines; None for those
-        of the models.
-    dtype
-        Of the overlaps.
+    Models with common coefficients are one row, with the channels of all of them in sequence. `span` is Q, (Nfreqs,
+    rank). `owner` is the position in the batch of the model of each baseline, ascending, (Nbls,). `dtype` is that of
+    the overlaps.
     """
     if batch.joint:
         (basis,) = batch.bases
@@ -336,11 +290,11 @@ def _side_by_side(basis: np.ndarray) -> np.ndarray:
 
 
 def _normalized(columns: np.ndarray) -> np.ndarray:
-    """Return columns of unit norm, and those of zeros as they are."""
+    """Normalize columns; columns of zeros stay as they are."""
     norms = np.linalg.norm(columns, axis=0)
     return columns / np.where(norms > 0, norms, 1)
 
 
 def joined(parts: list[tf.Tensor], axis: int) -> tf.Tensor:
-    """Return tensors one after the other."""
+    """Concatenate tensors, without a copy if there is only one."""
     return parts[0] if len(parts) == 1 else tf.concat(parts, axis)

@@ -1,7 +1,7 @@
-"""What a calibration leaves of the foregrounds, as far as two noise realizations have it in common.
+"""The foreground residual of a calibration that two noise realizations have in common.
 
-The residual of a fit is noise, the signal, and an error e of which the part that both realizations share survives the
-cross power of even and odd: the bias of P^R. In a simulation the noise is known, and e is what is left without it.
+The residual of a fit is noise, the signal, and an error e. The part of e that both realizations share survives the
+cross power of even and odd: it is the bias of P^R. In a simulation the noise is known, and is subtracted to find e.
 """
 
 from __future__ import annotations
@@ -17,16 +17,10 @@ from calstudy.power.delay import delay_transform
 
 @dataclass(frozen=True, eq=False)
 class Realization:
-    """One measurement of one integration whose parts are known; (Nbls, Nfreqs) each, complex, Jy.
+    """One measurement of one integration whose parts are known; complex, (Nbls, Nfreqs) each, in Jy.
 
-    Attributes
-    ----------
-    visibilities
-        As measured, gains included.
-    noise
-        The noise in them, before the gains.
-    gain_products
-        The true g_a g_b*.
+    Visibilities are as measured, gains included; the noise is before the gains, and `gain_products` are the true g_a
+    g_b*.
     """
 
     visibilities: np.ndarray
@@ -34,42 +28,28 @@ class Realization:
     gain_products: np.ndarray
 
     def residual_without_noise(self, fitted_products: np.ndarray, model: np.ndarray) -> np.ndarray:
-        """Return the residual on the scale of the true gains, which no degeneracy of the fit moves, without the noise.
+        """Return the noise-free residual on the scale of the true gains, independent of degeneracies of the fit.
 
-        Parameters
-        ----------
-        fitted_products, model
-            g_a g_b* and F as fitted, (Nbls, Nfreqs).
+        `fitted_products` and `model` are g_a g_b* and F as fitted, (Nbls, Nfreqs).
         """
         return (self.visibilities - fitted_products * model) / self.gain_products - self.noise
 
 
 def cross_power(even: np.ndarray, odd: np.ndarray, baselines: Baselines) -> np.ndarray:
-    """Return Re <even* odd> of each baseline, (Nbls,), added up over its delays outside the wedge, (Jy Hz)^2.
+    """Sum Re <even* odd> of each baseline over its delays outside the wedge, (Nbls,), (Jy Hz)^2.
 
-    Parameters
-    ----------
-    even, odd
-        Visibilities of one integration, (Nbls, Nfreqs), complex, Jy.
-    baselines
-        Their lengths, channels and the buffer of the wedge.
+    Visibilities are of one integration, complex, (Nbls, Nfreqs), in Jy.
     """
     first, second = (delay_transform(values, baselines.frequency, TAPER) for values in (even, odd))
     return np.sum((first.conj() * second).real, axis=1, where=baselines.outside)
 
 
 def ratio_over_antennas(power: np.ndarray, reference: np.ndarray, antennas: np.ndarray) -> tuple[float, float]:
-    """Return sum(power) / sum(reference) over baselines and its standard deviation.
+    """Return sum(power) / sum(reference) over baselines, (Nbls,) each, and its standard deviation.
 
-    What a fit leaves of the foregrounds is mostly due to errors of its gains, which the baselines of an antenna share.
-    The error comes from leaving out one antenna after the other (`calstudy.power.clusters`).
-
-    Parameters
-    ----------
-    power, reference
-        (Nbls,) each.
-    antennas
-        The two antennas of each baseline, (Nbls, 2).
+    The foreground residual of a fit is mostly due to errors of its gains, which the baselines of an antenna share. The
+    standard deviation comes from leaving out one antenna after the other (`calstudy.power.clusters`). `antennas` are
+    the two of each baseline, (Nbls, 2).
     """
     clusters = Clusters.of_baselines(antennas)
     above, below = (clusters.sums(values[:, None], np.repeat(values, 2)[:, None]) for values in (power, reference))

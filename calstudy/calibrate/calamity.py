@@ -1,4 +1,4 @@
-"""CALAMITY (Ewall-Wice et al. 2022) and its relatives: every integration and polarization is a least-squares fit."""
+"""CALAMITY (Ewall-Wice et al. 2022) and its relatives: a least-squares fit of every integration and polarization."""
 
 from __future__ import annotations
 
@@ -42,13 +42,10 @@ def make_solver(settings: GainFit) -> Solver:
 
 
 class Solve(NamedTuple):
-    """One solve: its integrations, its polarization, and how it went.
+    """One solve: its integrations, its polarization, its solution and diagnostics.
 
-    Attributes
-    ----------
-    diagnostics
-        The slope of the calibrated data on the sky model, and the rms of its band shape, if there is one; passes and
-        the last change of the weights, if they come from the gains.
+    With a sky model, the diagnostics are the slope of the calibrated data on it and the rms of the band shape; with
+    weights from the gains, the number of passes and the last change of the weights.
     """
 
     times: slice
@@ -74,11 +71,9 @@ def fit(
     observation
         Visibilities with parallel-hand polarizations only.
     assumed
-        A sky model, whose weighted sum fixes the overall scale, and which is taken for the truth if foregrounds are not
-        fitted; the data themselves if there is none, which makes gains of about unity. Gains to start from come before
-        what `settings.initial_gains` says.
-    settings
-        Foreground basis, weights, solver and prior.
+        A sky model, whose weighted sum fixes the overall scale, and which is the foreground model if foregrounds are
+        not fitted. Without a sky model the data take its place, which makes gains of about unity. Gains to start from
+        override `settings.initial_gains`.
     progress
         Called after each solve with the number done and the total.
 
@@ -104,7 +99,7 @@ def fit(
     return Calibration(
         gains=gains,
         gain_flags=gain_flags,
-        # Solves know nothing of baselines that they have no weight for.
+        # Baselines without weight are not part of the solves.
         model=model if settings.baselines is None else None,
         flags=~used,
         baselines=prepared.fitted,
@@ -141,13 +136,10 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
 def _solve(
     problem: CalibrationProblem, solver: Solver, warm: WarmStart | None, anew: bool
 ) -> tuple[Solution, WarmStart | None, bool]:
-    """Solve from the warm start, and anew from the problem's own gains if that got stuck; the lower loss counts.
+    """Solve from the warm start and, if that got stuck, from the problem's own gains; the lower loss counts.
 
-    Parameters
-    ----------
-    anew
-        Whether it is done again if the first one stalled. It is returned as well: a solve anew that stalled, too, will
-        do so for the next integration.
+    `anew` allows the second solve after a stall. It is returned, false once the second solve has stalled too, because
+    that will happen again for the next integration.
     """
     solution, next_warm = solve_warm(problem, solver, warm)
     stuck = solution.status == "failed" or (solution.status == "stalled" and anew)
@@ -163,19 +155,11 @@ def _solve(
 def _solve_in_passes(
     problem: CalibrationProblem, solver: Solver, warm: WarmStart | None, settings: GainWeights
 ) -> tuple[Solution, WarmStart | None, dict[str, float]]:
-    """Solve with the weights of the gains of the pass before, until they settle; each pass starts from the one before.
+    """Solve with the weights of the gains of the previous pass, until the weights settle.
 
-    Parameters
-    ----------
-    problem
-        With the weights of unity gains.
-    warm
-        Whose gains make the first weights; None for those that the problem starts from.
-
-    Returns
-    -------
-    The last solution, with the times of all passes, what the next solve may start from, and the number of passes and
-    the last relative change of the weights by name.
+    The problem has the weights of unity gains. The first weights are from the gains of the warm start, or of the
+    problem if it is None. Returns the last solution with the times of all passes, the warm start of the next solve, and
+    the number of passes and the last relative change of the weights by name.
     """
     weighted = problem.weighted_by(problem.initial_gains if warm is None else warm.gains)
     solutions: list[Solution] = []
@@ -203,7 +187,7 @@ def _solve_in_passes(
 
 
 def _together(solutions: Sequence[Solution]) -> Solution:
-    """Return the last of consecutive solutions, with the steps and times of all."""
+    """Return the last of consecutive solutions, with the steps and times of all of them."""
     first, *others = [solution.loss_history for solution in solutions]
     return replace(
         solutions[-1],
@@ -221,7 +205,7 @@ def _skipped(structure: FitStructure, message: str) -> Solution:
 
 
 def _diagnostics(solution: Solution, problem: CalibrationProblem) -> dict[str, float]:
-    """Return what a solution tells of the scale and the band shape of g_a g_b*, as far as there is a sky model."""
+    """Return the scale and the rms band shape of g_a g_b* relative to the sky model, if there is one."""
     if problem.sky_model is None or not solution.usable:
         return {}
     slope, shape = sky_model_slope(solution.gains, problem)
@@ -247,7 +231,7 @@ def _outcome(solve: Solve) -> Outcome:
 
 
 def _has_data(structure: FitStructure, used: np.ndarray) -> np.ndarray:
-    """Return which antennas and channels, (Nants, Nfreqs), have any baseline that is used, (Nbls, Nfreqs)."""
+    """Return the antennas and channels, (Nants, Nfreqs), with any baseline in use; `used` is (Nbls, Nfreqs)."""
     found = np.zeros((structure.n_antennas, structure.n_frequencies), bool)
     for column in structure.antennas.T:
         np.logical_or.at(found, column, used)

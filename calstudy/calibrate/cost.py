@@ -1,4 +1,4 @@
-"""What a calibration will need, before it starts, and how to make it fit."""
+"""Estimate memory and time of a calibration before it starts, and reduce the memory of one that does not fit."""
 
 from __future__ import annotations
 
@@ -48,16 +48,10 @@ FIRST_ORDER_STEP = 4e-3
 
 @dataclass(frozen=True)
 class Dimensions:
-    """What the memory of a solve depends on.
+    """Quantities that determine the memory of a solve.
 
-    Attributes
-    ----------
-    antennas, baselines, models, channels
-        Their numbers, of all integrations that are solved together.
-    widest
-        Vectors of the largest foreground basis.
-    coefficients
-        Vectors of all models together.
+    Antennas, baselines, models and channels are counted over all integrations that are solved together; `widest` is the
+    number of vectors of the largest foreground basis, `coefficients` that of all models together.
     """
 
     antennas: int
@@ -69,7 +63,7 @@ class Dimensions:
 
     @classmethod
     def of(cls, structure: FitStructure) -> Dimensions:
-        """Return those of a fit structure."""
+        """Return the dimensions of a fit structure."""
         basis = structure.basis
         widest = max(bucket.vectors.shape[-1] for bucket in basis.buckets)
         return cls(
@@ -88,25 +82,20 @@ class Dimensions:
 
     @property
     def rank(self) -> int:
-        """Vectors of the common basis of all models, at most about."""
+        """Approximate upper limit of the rank of the common basis of all models."""
         return min(self.widest + EXTRA_RANK, self.channels)
 
 
 def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
-    """Return the bytes that one solve needs at its peak, libraries included, within about a factor of 1.5.
+    """Return the peak memory of one solve in bytes, libraries included, within about a factor of 1.5.
 
-    Parameters
-    ----------
-    dimensions
-        Of all integrations that are solved together.
-    settings
-        Whose solver, and how many models at a time, are meant.
+    `dimensions` are those of all integrations that are solved together.
     """
     d = dimensions
     # The problem's complex visibilities and weights, and the solver's pairs of them.
     data = (2 + 1) * 2 * DOUBLE * d.samples
     by_channel = 8 * SINGLE * d.channels * d.antennas**2
-    # Smooth gains have coefficients in place of channels, hardly as many.
+    # Smooth gains have coefficients in place of channels, and at most as many.
     by_antenna = 0.0 if settings.gain_delay is None else 6 * SINGLE * d.antennas * d.channels**2
     if not isinstance(settings, ForegroundFit):
         return TENSORFLOW_MEMORY + RETAINED * (data + 20 * SINGLE * d.samples + by_channel + by_antenna)
@@ -126,7 +115,7 @@ def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
 
 
 def _unknowns(dimensions: Dimensions, settings: GainFit) -> float:
-    """Return the bytes of what a solver keeps of its unknowns and past steps."""
+    """Return the memory of a solver's unknowns and past steps, in bytes."""
     solver = settings.solver
     gains = 2 * dimensions.antennas * dimensions.channels
     if isinstance(solver, GaussNewtonSettings):
@@ -142,23 +131,13 @@ def _unknowns(dimensions: Dimensions, settings: GainFit) -> float:
 
 
 def basis_vectors(length: float, channels: Channels, basis: BasisSettings) -> int:
-    """Return how many foreground vectors a baseline of this length (m) has, about.
-
-    Parameters
-    ----------
-    length
-        Of the baseline, m.
-    channels
-        Number and width of the channels.
-    basis
-        Half-width and buffer of the modelled delays.
-    """
+    """Return the approximate number of foreground vectors of a baseline of this length (m)."""
     delay = max(basis.horizon * length / SPEED_OF_LIGHT, basis.min_delay) + basis.buffer
     return int(min(2 * channels.count * channels.width * delay + EXTRA_VECTORS, channels.count))
 
 
 def dimensions_of(size: Size, settings: GainFit) -> Dimensions:
-    """Return what the memory of one solve depends on, as if no baselines shared a model."""
+    """Return the dimensions of one solve, as if no baselines shared a model."""
     baselines = min(settings.integrations_per_solve, size.times) * size.baselines
     basis = settings.basis if isinstance(settings, ForegroundFit) else BasisSettings()
     coefficients = baselines * basis_vectors(size.mean, size.channels, basis)

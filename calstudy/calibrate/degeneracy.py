@@ -1,12 +1,12 @@
-"""Degeneracies: directions that no residual can see, fixed after the fit, and left out of comparisons with the truth.
+"""Degeneracies: directions that no residual constrains, fixed after the fit and left out of comparisons with the truth.
 
 The likelihood (paper Eq. LOGLIKELIHOOD) does not change under two exact transformations:
 
-- the phase of all gains, channel by channel: it cancels in g_a g_b* and the model does not know of it;
+- the phase of all gains, channel by channel: it cancels in g_a g_b*, and the model does not depend on it;
 - one real scale: gains divided by sqrt(s), model multiplied by s. It is one number, not one per channel, because the
   model is smooth in frequency; a complex multiplier of the model is not among them, because g g* has no overall phase.
 
-Gains times smooth functions against the model are nearly degenerate as well, but only nearly, and are left as fitted.
+Gains multiplied by smooth functions, which the model compensates, are only nearly degenerate. They are left as fitted.
 """
 
 from __future__ import annotations
@@ -19,14 +19,10 @@ from calstudy.calibrate.problem import CalibrationProblem, gain_products
 
 
 def fix_phase(gains: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Turn all gains by one phase per channel so that they come closest to the reference in least squares.
+    """Rotate all gains by one phase per channel, to bring them closest to the reference in least squares.
 
-    With a reference of ones this makes the sum of the gains over antennas real and positive.
-
-    Parameters
-    ----------
-    gains, reference
-        Shape (Nants, Nfreqs), complex. Channels where the two are orthogonal are left as they are.
+    Both are complex, (Nants, Nfreqs); channels where the two are orthogonal stay as they are. With a reference of ones,
+    the sum of the gains over antennas becomes real and positive.
     """
     overlap = np.sum(gains * np.conj(reference), axis=0)
     modulus = np.abs(overlap)
@@ -37,28 +33,17 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
     """Return the real factor by which the model is multiplied, and g_a g_b* divided; one if the model is frozen.
 
     For the ``sum`` prior this is the exact minimum of the prior along the scale, so that the likelihood keeps its own
-    minimum; for ``post-hoc`` the ratio of the moduli of the two sums (paper §Method); for ``gains`` what gives the
-    gains the geometric mean of the initial ones; for ``sky-model`` what makes the calibrated data regress on the sky
-    model with a slope of one; for ``none`` one.
+    minimum. For ``post-hoc`` it is the ratio of the moduli of the two sums (paper §Method). For ``gains`` it gives the
+    gains the geometric mean of the initial ones. For ``sky-model`` it makes the slope of the calibrated data on the sky
+    model one. For ``none`` it is one.
 
     Where a prior on the foregrounds is much wider than the noise, the fit finds g_a g_b* by a regression of the sky
-    model on the data, and not of the data on the sky model, and what the sky model lacks makes it too large, by the
-    square of its relative rms. ``sky-model`` corrects that.
+    model on the data, and not of the data on the sky model. Foregrounds that the sky model lacks then make g_a g_b* too
+    large, by the square of their relative rms. ``sky-model`` corrects that.
 
-    Parameters
-    ----------
-    gains
-        As fitted, (Nants, Nfreqs), complex.
-    model
-        Intrinsic visibilities as fitted, (Nbls, Nfreqs), complex, in the unit of the data.
-    problem
-        What was fitted, and its prior.
-
-    Raises
-    ------
-    ValueError
-        If the summed model vanishes, or opposes the summed sky model, or the data are not correlated with the sky
-        model, so that no positive scale exists.
+    Gains and model are as fitted, complex, (Nants, Nfreqs) and (Nbls, Nfreqs). Raises ValueError if no positive scale
+    exists: the summed model vanishes or opposes the summed sky model, or the data are not correlated with the sky
+    model.
     """
     if problem.prior == "none" or problem.frozen:
         return 1.0
@@ -84,17 +69,10 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
 
 
 def sky_model_slope(gains: np.ndarray, problem: CalibrationProblem) -> tuple[float, np.ndarray]:
-    """Return the slope of the calibrated data on the sky model, and the slopes of single channels over it.
+    """Return the slope of the calibrated data on the sky model, and the slopes of single channels relative to it.
 
-    What they tell of a fit: the scale of g_a g_b*, and its band shape, which all antennas share. A fit of free
-    foregrounds determines the first not at all, and the second only where it is not smooth.
-
-    Parameters
-    ----------
-    gains
-        (Nants, Nfreqs), complex.
-    problem
-        What was fitted, with a sky model.
+    The slope is the scale of g_a g_b*, and the slopes of channels are its band shape, which all antennas share. A fit
+    of free foregrounds does not determine the first, and the second only where it is not smooth.
 
     Returns
     -------
@@ -114,23 +92,10 @@ def sky_model_slope(gains: np.ndarray, problem: CalibrationProblem) -> tuple[flo
 def fix_degeneracies(
     gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains and model with phase and scale fixed; g_a g_b* F is unchanged.
+    """Return gains and model, as new arrays, with phase and scale fixed; g_a g_b* F is unchanged.
 
-    Gains in a smooth basis stay in its span, and have only one phase fixed.
-
-    Parameters
-    ----------
-    gains
-        As fitted, (Nants, Nfreqs), complex. Not mutated.
-    model
-        Intrinsic visibilities as fitted, (Nbls, Nfreqs), complex, in the unit of the data. Not mutated.
-    problem
-        What was fitted: its prior, and the initial gains as the reference of the phase.
-
-    Raises
-    ------
-    ValueError
-        If no positive scale exists (see `model_scale`).
+    The initial gains of the problem are the reference of the phase. Gains in a smooth basis stay in its span, and only
+    one phase of them is fixed. Raises ValueError if no positive scale exists (see `model_scale`).
     """
     scale = model_scale(gains, model, problem)
     if problem.structure.gain_vectors is None:
@@ -141,15 +106,11 @@ def fix_degeneracies(
 
 
 def align(gains: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, float]:
-    """Turn and scale fitted gains to come closest to a reference, in least squares over all antennas and channels.
+    """Rotate and scale fitted gains to bring them closest to a reference, in least squares over antennas and channels.
 
-    A comparison with the truth must not charge a fit with a phase per channel or a real scale, which the likelihood
-    does not determine. All else, near degeneracies between gains and smooth foregrounds included, is left as fitted.
-
-    Parameters
-    ----------
-    gains, reference
-        Complex, (Nants, Nfreqs). Not mutated.
+    The likelihood does not determine a phase per channel and a real scale, so that comparisons with the truth must not
+    count them as errors. Near degeneracies between gains and smooth foregrounds are left as fitted. Both arrays are
+    complex, (Nants, Nfreqs), and not changed.
 
     Returns
     -------
@@ -157,7 +118,7 @@ def align(gains: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, float]:
         The gains, multiplied by one phase per channel and by `scale`, (Nants, Nfreqs).
     scale
         Real and positive. A model fitted with these gains must be divided by its square, so that the product of gains
-        and model, which is what was fitted, stays the same.
+        and model, which is the fitted quantity, stays the same.
     """
     turned = fix_phase(gains, reference)
     scale = float(np.vdot(turned, reference).real / np.vdot(turned, turned).real)

@@ -1,12 +1,11 @@
-"""Where a solve starts on any array: one delay for each antenna, and with a sky model one complex gain.
+"""Starting point of a solve on any array: one delay for each antenna and, with a sky model, one complex gain.
 
 A cable delay tau_a turns the gain of an antenna by exp(2 pi i nu tau_a). In V_ab = g_a g_b* F_ab it shifts the
 foregrounds in delay by tau_a - tau_b. The delays of all antennas follow from the shifts of all baselines.
 
 With a sky model m, V m* has the phase of g_a g_b*, and its delay spectrum is a narrow peak at the shift: the fringe fit
 of interferometry, here with the powers of the baselines of an antenna added up (Schwab & Cotton 1983). One complex gain
-per antenna then follows from least squares over all channels, or, if it is asked for, one in every channel, with m for
-the truth.
+per antenna then follows from least squares over all channels or, on request, one in every channel, with m as the truth.
 
 Without a sky model, foregrounds are known to lie within the horizon delay b/c of a baseline of length b. The power in a
 Gaussian of half this width,
@@ -14,12 +13,13 @@ Gaussian of half this width,
     S_ab(D) = sum_tau |V_ab(tau)|^2 exp(-(tau - D)^2 / 2 sigma_ab^2),    sigma_ab = b / 2c + 1 / 2B,
 
 with the bandwidth B, is greatest where D is the shift plus the mean delay of the foregrounds. The wider the Gaussian,
-the less a baseline says. A gradient of delay over the array cannot be told from a displacement of the sky. It is taken
-for one as far as cables with the scatter that was found would not have it (`_sky_gradient`). Amplitudes and phases of
-antennas cannot be told from those of the foregrounds at all, and are left as they are.
+the weaker the constraint from a baseline. A gradient of delay over the array is degenerate with a displacement of the
+sky. It is attributed to the sky as far as it exceeds the gradient expected of cables with the measured scatter
+(`_sky_gradient`). Amplitudes and phases of antennas cannot be separated from those of the foregrounds, and are left as
+they are.
 
-Either way the delays are those with the greatest sum of S_ab(tau_a - tau_b) over baselines. Noise has a flat S, so that
-an antenna without signal does not change the delays of the others.
+In both cases the delays are those with the greatest sum of S_ab(tau_a - tau_b) over baselines. Noise has a flat S, so
+that an antenna without signal does not change the delays of the others.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ SMALLEST_GAIN = 0.01
 SKY_SCATTER = 0.2
 """How far the mean direction of foregrounds is from the zenith, in direction cosines east and north."""
 ROBUST_ITERATIONS = 10
-"""Rounds of finding the antennas whose delays stand out."""
+"""Iterations to find antennas with outlying delays."""
 SWEEPS = 20
-"""Rounds of moving antennas one by one, at most; two or three are the rule."""
+"""Maximum number of rounds of moving antennas one by one; two or three usually suffice."""
 GAIN_ITERATIONS = 50
 """Rounds of least squares for gains: half a step each, they come to 1e-4 of the gains and less."""
 BLOCK = 1024
@@ -60,28 +60,14 @@ MATRIX_ELEMENTS = 4_000_000
 def delay_start(
     data: Observation, weights: np.ndarray, settings: DelayStart, sky: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
+    """Find gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
 
-    Parameters
-    ----------
-    data
-        The visibilities; autocorrelations are not used.
-    weights
-        (Ntimes, Nbls, Nfreqs, Npols); samples of weight zero have no influence.
-    settings
-        Whether gains are fitted in every channel.
-    sky
-        A sky model like the visibilities, or None.
+    Autocorrelations and samples of weight zero, (Ntimes, Nbls, Nfreqs, Npols), have no influence. Without a sky model
+    the gains have modulus one. They are one for antennas without data, and where there is nothing to fit.
 
-    Returns
-    -------
-    Without a sky model of modulus one; one for antennas that have no data, and where nothing is to be fitted.
-
-    Raises
-    ------
-    InputError
-        If the channels are on no even grid; if the sky model is zero; or if there is none, and gains are asked for in
-        every channel, or channels are too wide for the delays of the foregrounds.
+    Raises InputError if the channels do not lie on an even grid, or if the sky model is zero. Raises it without a sky
+    model as well, if gains in every channel are requested, or if channels are too wide for the delays of the
+    foregrounds.
     """
     if settings.per_channel and sky is None:
         raise InputError(
@@ -106,14 +92,8 @@ def delay_start(
 class _DelayFit:
     """The fit of one integration and polarization.
 
-    Parameters
-    ----------
-    antennas
-        Of each baseline, (Nbls, 2).
-    positions
-        Of the antennas, east, north, up, m, (Nants, 3).
-    frequencies
-        Hz, (Nfreqs,).
+    `antennas` are the two of each baseline, (Nbls, 2); `positions` are east, north, up in m, (Nants, 3); `frequencies`
+    are in Hz, (Nfreqs,).
     """
 
     def __init__(self, antennas: np.ndarray, positions: np.ndarray, frequencies: np.ndarray) -> None:
@@ -127,7 +107,7 @@ class _DelayFit:
         self._turns = 2j * np.pi * (frequencies - frequencies.mean())
 
     def gains(self, visibilities: np.ndarray, weights: np.ndarray, model: np.ndarray | None) -> np.ndarray:
-        """Return gains, (Nants, Nfreqs), from data, weights and sky model, (Nbls, Nfreqs), zero where flagged."""
+        """Compute gains, (Nants, Nfreqs), from data, weights and sky model, (Nbls, Nfreqs), zero where flagged."""
         spectra = weights * visibilities if model is None else weights * visibilities * model.conj()
         scores = self._window_scores(spectra) if model is None else self._fringe_scores(spectra)
         delays, found = _antenna_delays(scores, self.antennas, self.n_antennas)
@@ -143,7 +123,7 @@ class _DelayFit:
         return phasors * _least_squares(correlation, power, self.antennas, start)
 
     def _power(self, spectra: np.ndarray) -> np.ndarray:
-        """Return |sum_nu x exp(-2 pi i nu tau)|^2 of some baselines at all delays, (Nspectra, Ndelays)."""
+        """Compute |sum_nu x exp(-2 pi i nu tau)|^2 of some baselines at all delays, (Nspectra, Ndelays)."""
         padded = np.zeros((len(spectra), self.grid.n_channels), complex)
         padded[:, self.grid.positions] = spectra
         return np.abs(fft(padded, self.n_delays, axis=1)) ** 2
@@ -163,7 +143,7 @@ class _DelayFit:
         return scores
 
     def _window_scores(self, spectra: np.ndarray) -> np.ndarray:
-        """Return the part of the power of v in a Gaussian about each delay, minus its mean, (Nbls, Ndelays), float32.
+        """Return the power fraction of v in a Gaussian about each delay, minus the mean, (Nbls, Ndelays), float32.
 
         The convolution is a product with exp(-(2 pi k dnu sigma)^2 / 2) over the lags k of the autocorrelation in
         frequency.
@@ -189,12 +169,12 @@ class _DelayFit:
         return scores
 
     def _blocks(self, rows: np.ndarray) -> list[np.ndarray]:
-        """Return baselines in pieces that need little memory."""
+        """Divide baselines into blocks of limited memory."""
         return np.array_split(rows, max(len(rows) // BLOCK, 1))
 
 
 def _clipped(visibilities: np.ndarray) -> np.ndarray:
-    """Return visibilities, (Nbls, Nfreqs), with what stands out of its baseline reduced; zeros are no data."""
+    """Limit outlying visibilities of each baseline, (Nbls, Nfreqs); zeros are missing data."""
     modulus = np.abs(visibilities)
     median = np.ma.median(np.ma.masked_equal(modulus, 0), axis=1, keepdims=True).filled(0)
     limit = LARGEST_SAMPLE * median
@@ -209,9 +189,7 @@ class _DelaySearch:
     scores
         Of every baseline at every delay, of mean zero, (Nbls, Ndelays).
     antennas
-        (Nbls, 2).
-    n_antennas
-        Their number.
+        The two of each baseline, (Nbls, 2).
 
     Attributes
     ----------
@@ -231,9 +209,9 @@ class _DelaySearch:
         self._others = [antennas[rows].sum(axis=1) - antenna for antenna, rows in enumerate(self._rows)]
 
     def _shifted(self, antenna: int, at: np.ndarray, forward: bool) -> np.ndarray:
-        """Return the scores of the baselines of an antenna, (Nrows, Ndelays), by the delay of one of its two ends.
+        """Return the scores of the baselines of an antenna, (Nrows, Ndelays), by the delay of one of the two antennas.
 
-        Forward: by its own delay, with the others at `at`; else by the delay of the others, with its own at `at`.
+        Forward: by its own delay, with the others at `at`; otherwise by the delay of the others, with its own at `at`.
         """
         rows = self._rows[antenna]
         signs = np.where((self.antennas[rows, 0] == antenna) == forward, 1, -1)
@@ -242,7 +220,7 @@ class _DelaySearch:
         )
 
     def place(self) -> None:
-        """Give every antenna a delay, first those of which the ones before say most."""
+        """Give every antenna a delay, in order of the scores with antennas that have one already."""
         known = np.zeros((len(self.delays), len(self._steps)), self.scores.dtype)
         placed = np.zeros(len(self.delays), bool)
         while not placed.all():
@@ -255,7 +233,7 @@ class _DelaySearch:
             np.add.at(known, self._others[chosen], self._shifted(chosen, here, forward=False))
 
     def improve(self) -> bool:
-        """Move every antenna to its best delay where the others are; return whether any has moved."""
+        """Move every antenna to its best delay, given those of the others; return whether any has moved."""
         before = self.delays.copy()
         for antenna in np.flatnonzero(self.evidence > 0).tolist():
             there = self.delays[self._others[antenna]]
@@ -264,18 +242,10 @@ class _DelaySearch:
 
 
 def _antenna_delays(scores: np.ndarray, antennas: np.ndarray, n_antennas: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the delays with the greatest sum of scores at tau_a - tau_b, and which antennas have any, (Nants,).
+    """Return the delays with the greatest sum of scores at tau_a - tau_b, and which antennas have data, (Nants,).
 
-    Delays are in steps of the grid, with median zero.
-
-    Parameters
-    ----------
-    scores
-        Of every baseline at every delay, periodic, of mean zero, (Nbls, Ndelays).
-    antennas
-        (Nbls, 2).
-    n_antennas
-        Their number; those without data stay at zero.
+    Delays are in steps of the grid, with median zero; those of antennas without data are zero. Scores are periodic in
+    delay, of mean zero, (Nbls, Ndelays).
     """
     search, n_delays = _DelaySearch(scores, antennas, n_antennas), scores.shape[1]
     search.place()
@@ -291,22 +261,17 @@ def _antenna_delays(scores: np.ndarray, antennas: np.ndarray, n_antennas: int) -
 
 
 def _sky_gradient(delays: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Return the part of the delays, s, (Nants,), that is the displacement of the foregrounds from the zenith.
+    """Return the part of the delays, s, (Nants,), that is due to the displacement of the foregrounds from the zenith.
 
-    Delays are tau_a + k . x_a / c with the mean direction k of the foregrounds. With cable delays tau that scatter by s
-    and |k| by `SKY_SCATTER` in each direction, the mean of k is that of ridge regression,
+    Delays are tau_a + k . x_a / c with the mean direction k of the foregrounds, and positions x, east, north, up, m,
+    (Nants, 3). With cable delays tau that scatter by s and |k| by `SKY_SCATTER` in each direction, the mean of k is
+    that of ridge regression,
 
         k = (X^T W X / s^2 + 1 / SKY_SCATTER^2)^-1 X^T W delays / s^2,
 
-    with X = x / c about the mean, and weights W against outliers (Cauchy's, of scale 3 s). Arrays that are small for
-    their cables keep their gradient; on arrays that are large it is the sky's.
-
-    Parameters
-    ----------
-    delays
-        s, (Nants,).
-    positions
-        East, north, up, m, (Nants, 3).
+    with X = x / c about the mean, and weights W against outliers (Cauchy's, of scale 3 s). In arrays that are small
+    relative to the scatter of their cables, the gradient stays in the delays; in large arrays it is attributed to the
+    sky.
     """
     if len(delays) <= 3:
         return np.zeros(len(delays))
@@ -327,7 +292,7 @@ def _sky_gradient(delays: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def _offsets(scores: np.ndarray, antennas: np.ndarray, delays: np.ndarray) -> np.ndarray:
-    """Return by how much less than a step each delay is off, (Nants,): the maximum of the parabolas of all scores."""
+    """Return the offset of each delay from its step, (Nants,): the maximum of the sum of parabolas through scores."""
     n_delays, n_antennas = scores.shape[1], delays.size
     at = (delays[antennas[:, 0]] - delays[antennas[:, 1]])[:, None] + np.array([-1, 0, 1])
     below, middle, above = np.take_along_axis(scores, at % n_delays, axis=1).T.astype(float)
@@ -344,7 +309,7 @@ def _phases(correlation: np.ndarray, antennas: np.ndarray, n_antennas: int) -> n
     """Return phasors of the antennas, (Nants,), from correlations of baselines with the sky model, (Nbls,).
 
     They are those of the leading eigenvector of the Hermitian matrix of the correlations, in every part of the array
-    that baselines connect.
+    that is connected by baselines.
     """
     first, second = antennas.T
     matrix = np.zeros((n_antennas, n_antennas), complex)
@@ -361,18 +326,8 @@ def _phases(correlation: np.ndarray, antennas: np.ndarray, n_antennas: int) -> n
 def _least_squares(correlation: np.ndarray, power: np.ndarray, antennas: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return the gains u, (Nants, Nchannels), that minimize the sum of w |v - u_a u_b* m|^2 in each channel.
 
-    By u_a = sum_b C_ab u_b / sum_b M_ab |u_b|^2, going half the way each time (Salvini & Wijnholds 2014).
-
-    Parameters
-    ----------
-    correlation
-        w v m*, C, (Nbls, Nchannels).
-    power
-        w |m|^2, M, (Nbls, Nchannels).
-    antennas
-        (Nbls, 2).
-    start
-        Gains to start from, and to keep where there are no data, (Nants, Nchannels).
+    By u_a = sum_b C_ab u_b / sum_b M_ab |u_b|^2, with half a step each time (Salvini & Wijnholds 2014). C is w v m*,
+    and M is w |m|^2, (Nbls, Nchannels). `start` is kept where there are no data, (Nants, Nchannels).
     """
     gains, (first, second) = start.copy(), antennas.T
     n_antennas, n_channels = start.shape

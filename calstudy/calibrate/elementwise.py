@@ -14,15 +14,7 @@ LEAST_FUSED = 1_000_000
 class BaselineProducts:
     """The products of the elimination and of its Gauss-Newton matrix on some baselines.
 
-    Parameters
-    ----------
-    tensors
-        Of the fit.
-
-    Attributes
-    ----------
-    fused
-        Whether the products are compiled. Batches with equal numbers of baselines share one compilation.
+    They are compiled if `fused`; batches with equal numbers of baselines share one compilation.
     """
 
     def __init__(self, tensors: FitTensors) -> None:
@@ -70,6 +62,9 @@ class BaselineProducts:
     def _pull(
         self, change: tf.Tensor, answer: tf.Tensor | None, ends: Ends, curvature: tf.Tensor, model: tf.Tensor
     ) -> tf.Tensor:
-        """Return F* (y - D x) of a weighted change y that foregrounds answer by x, by antenna; (2, Nants, Nfreqs)."""
+        """Return F* (y - D x) summed by antenna, (2, Nants, Nfreqs).
+
+        y is a weighted change, and x the response of the foregrounds.
+        """
         left = change if answer is None else change - curvature * answer
         return ends.sum_over_antenna(pairs.conjugate_multiply(model, left), self._n_antennas)

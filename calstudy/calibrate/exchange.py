@@ -1,8 +1,9 @@
-"""Folders in which data go to a calibration by another program, and its gains come back: what is in them.
+"""Folders that exchange data and gains with another calibration program.
 
 A folder of one experiment has `MANIFEST`, data sets ``data-1``, ``data-2``, ... and, once they are calibrated, a file
-of gains for each, and perhaps a model. Data sets are told by the digest that the manifest has of each: their names and
-order say nothing. Worlds that differ in what is assumed alone have the same data; they are told by the sky model.
+of gains for each, and optionally a model. Data sets are identified by their digests in the manifest; their names and
+order have no meaning. Worlds that differ only in their assumptions have the same data, and are identified by the sky
+model.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ MODEL_SUFFIXES = (".model.uvh5", ".model.uvfits", ".model.ms")
 
 
 class DataSet(Section):
-    """One set of data, and by what it is told."""
+    """One data set, its file and the digest that identifies it."""
 
     name: FileName
     file: FileName
@@ -32,20 +33,18 @@ class DataSet(Section):
 
 
 class Manifest(Section):
-    """What a folder of exported data says of itself: nothing of the experiment.
+    """The content of a folder of exported data, without any information on the experiment.
 
     Attributes
     ----------
     calstudy
-        Version that wrote it.
+        Version of calstudy that wrote it.
     digest
-        Of all data sets and the sky model: ties the folder to the experiment.
-    data
-        The data sets.
+        Digest of all data sets and the sky model; it links the folder to the experiment.
     sky_model
         File of the assumed visibilities of the foregrounds; None if nothing is assumed.
     sky_model_digest
-        Of all that they were made from.
+        Digest of all inputs of the sky model.
     noise
         Standard deviation of the complex noise of a sample, Jy; None if the data have none.
     """
@@ -59,13 +58,13 @@ class Manifest(Section):
 
 
 def salted(digest: str, salt: str) -> str:
-    """Return a digest as a manifest has it: of a blind challenge, one from which nobody finds what was digested."""
+    """Return a digest as written in a manifest; with the salt of a blind challenge its input cannot be guessed."""
     return hmac.new(salt.encode(), digest.encode(), "sha256").hexdigest()[:32] if salt else digest
 
 
 @dataclass(frozen=True)
 class Returned:
-    """What came back for one data set: the file of its gains, and that of a model, or None."""
+    """The files of the gains and, if there is one, of the model that were returned for one data set."""
 
     gains: Path
     model: Path | None
@@ -86,20 +85,13 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def find_returned(folder: Path, digest: str, sky_model: str | None) -> Returned:
-    """Return what came back for the data set with a digest, of the world with a sky model.
+    """Find the gains and model that were returned for a data set, in the world with a sky model.
 
-    Parameters
-    ----------
-    folder
-        Of one experiment; or of several such folders, one for each world of a comparison.
-    digest, sky_model
-        Digests of the data and of the sky model, as in the manifest.
+    The folder is that of one experiment, or has several such folders, one for each world of a comparison. Digests are
+    those of the manifest.
 
-    Raises
-    ------
-    InputError
-        If there is no manifest, none that has these data and this sky model, no gains for them, or several files; or if
-        one of them is a link that leads out of the folder.
+    Raises InputError if no manifest has these data and this sky model, if there are no gains for them or several files,
+    or if a file is a link that leads out of the folder.
     """
     manifests = [folder / MANIFEST] if (folder / MANIFEST).exists() else sorted(folder.glob(f"*/{MANIFEST}"))
     if not manifests:

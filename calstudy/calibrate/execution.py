@@ -1,6 +1,6 @@
-"""Call a calibrator, check what it returns, and make the calibrated residual R = V / (g_a g_b*) - F.
+"""Call a calibrator, check what it returns, and compute the calibrated residual R = V / (g_a g_b*) - F.
 
-What a user's own calibrator does wrong becomes a sentence that names it; what a built-in one does wrong is a bug.
+Mistakes of a user's own calibrator are reported as InputError with its name; those of a built-in one are bugs.
 """
 
 from __future__ import annotations
@@ -32,17 +32,7 @@ if TYPE_CHECKING:
 
 
 def require_calibratable(calibrator: Calibrator, frame: Frame, has_sky_model: bool) -> None:
-    """Raise InputError, with the calibrator's own sentence, if it refuses data of these baselines and channels.
-
-    Parameters
-    ----------
-    calibrator
-        Asked for its refusal.
-    frame
-        Antennas, baselines and channels of the data.
-    has_sky_model
-        Whether there is one.
-    """
+    """Raise InputError, with the calibrator's own sentence, if it refuses data of these baselines and channels."""
     with guarded(calibrator):
         reason = calibrator.refusal(frame, has_sky_model)
     if reason is not None:
@@ -52,7 +42,7 @@ def require_calibratable(calibrator: Calibrator, frame: Frame, has_sky_model: bo
 
 
 def cost_of(calibrator: Calibrator, size: Size) -> Cost:
-    """Return what a calibrator says that data of a size cost it; raises InputError if a user's says something else."""
+    """Return a calibrator's estimate of its cost for data of a size; raises InputError if that is not a Cost."""
     with guarded(calibrator):
         cost = calibrator.cost(size)
     if not isinstance(cost, Cost):
@@ -68,18 +58,18 @@ def run_calibrator(
     progress: Progress | None = None,
     noise: float | None = None,
 ) -> CalibrationResult:
-    """Calibrate visibilities, and put what comes back into standard objects.
+    """Calibrate visibilities, and return gains, model and residual as standard objects.
 
     Parameters
     ----------
     calibrator
-        Any, built in or a user's.
+        Any calibrator, built in or a user's.
     data
         Visibilities, rectangular and time-major; not changed.
     sky_model
-        Visibilities of the sky as far as it is known, with the samples of `data`, or None; not changed.
+        Visibilities of the known part of the sky, with the samples of `data`, or None; not changed.
     gains
-        Where to start, for a calibrator that starts somewhere; None for what it does by itself.
+        Gains to start from, for an iterative calibrator; None for the calibrator's own start.
     progress
         Called after each solve with the number done and the total.
     noise
@@ -89,7 +79,7 @@ def run_calibrator(
     ------
     InputError
         If the data or the sky model cannot be used, the calibrator refuses them, or a user's calibrator fails or
-        returns what does not fit.
+        returns an invalid calibration.
     """
     observation = Observation(data)
     assumed = Assumed(None if sky_model is None else Observation(sky_model), gains, noise)
@@ -102,7 +92,7 @@ def run_calibrator(
 
 
 def _require_usable(sky_model: Observation, data: Observation) -> None:
-    """Raise InputError unless a sky model has the samples of the data, and finite values where they are not flagged."""
+    """Raise InputError unless a sky model has the samples of the data, and is finite where they are not flagged."""
     if (
         sky_model.shape != data.shape
         or not np.array_equal(sky_model.pairs, data.pairs)
@@ -127,7 +117,7 @@ def _where(calibrator: Calibrator) -> str:
 
 
 class _Returned:
-    """What a calibrator returned, checked: faults of a user's are sentences, those of a built-in one are our bugs."""
+    """A checked calibration; mistakes of a user's calibrator raise InputError, those of a built-in one ValueError."""
 
     def __init__(
         self, calibrator: Calibrator, returned: Calibration, observation: Observation, assumed: Assumed
@@ -237,7 +227,7 @@ class _Returned:
         return outcomes
 
     def result(self, usage: Usage) -> CalibrationResult:
-        """Return gains, model and residual in standard objects, and the records of all solves."""
+        """Return gains, model and residual as standard objects, with the records of all solves."""
         # pyuvdata takes long to import, and plans need other parts of this module.
         from calstudy.calibrate.standard_formats import make_gains, make_visibilities
 
@@ -268,7 +258,7 @@ class _Returned:
         )
 
     def _residual(self, gains: np.ndarray, flags: np.ndarray) -> np.ndarray:
-        """Return V / (g_a g_b*) - F, zero where flagged; adds to the flags those of the gains."""
+        """Compute V / (g_a g_b*) - F, zero where flagged, and add the flags of the gains to `flags`."""
         residual = np.zeros(self.fitted.shape, complex)
         first, second = np.searchsorted(self.numbers, self.fitted.pairs).T
         for t in range(self.fitted.n_times):

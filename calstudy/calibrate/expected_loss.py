@@ -1,4 +1,4 @@
-"""How much of a small signal a calibration is expected to leave, from the fit alone.
+"""Predict the fraction of a small signal that a calibration preserves, from the fit alone.
 
 At the minimum of the likelihood sum w |V - g_a g_b* F|^2, let J be the Jacobian of the model g_a g_b* F in all
 unknowns, gains and coefficients of the foregrounds, times sqrt(w) and free of the phases of g_a g_b*. A small signal s
@@ -16,13 +16,14 @@ of its power on baseline p at delay tau, where f is the tapered delay mode. All 
 with their conjugates: data and unknowns count as twice as many real numbers, and <f|P|f> is the mean over the two
 phases of the mode.
 
-P is the sum of two projectors: P_F on the foreground sequences, weighted by sqrt(D), which is known in closed form for
-each baseline or group; and that on what gains can do and foregrounds cannot, the span of Z = (1 - P_F) J_g with the
-Jacobian J_g of the gains. What gains of per-channel freedom absorb far from the modelled delays is their share of the
-degrees of freedom, (2 N - 1) / (N (N - 1)) for N antennas.
+P is the sum of two projectors. P_F projects on the foreground sequences, weighted by sqrt(D), and is known in closed
+form for each baseline or group. The other projects on changes of the gains that foregrounds cannot follow, the span of
+Z = (1 - P_F) J_g with the Jacobian J_g of the gains. Far from the modelled delays, gains that are free in every channel
+absorb their share of the degrees of freedom, (2 N - 1) / (N (N - 1)) for N antennas.
 
-With a finite prior, the foregrounds answer y with the smoother B (1 + B^T B)^-1 B^T = 1 - W, where B = sqrt(D) A are
-their sequences for coefficients of unit variance. W takes the place of 1 - P_F, but is no projector. The residual is
+With a finite prior, the foregrounds respond to y with the smoother B (1 + B^T B)^-1 B^T = 1 - W, where B = sqrt(D) A
+are their sequences for coefficients of unit variance. W takes the place of 1 - P_F, but is no projector. The residual
+is
 
     M y,   M = W - W J_g (J_g^T W J_g)^-1 J_g^T W,   T = <f|M^2|f> / <f|f>.
 
@@ -30,8 +31,8 @@ Gains absorb <f|W^2 - M^2|f>. For an infinite prior this is <f|P|f> of their pro
 
 The second part is exact from a dense decomposition for small arrays. For others it is a stochastic diagonal (Hutchinson
 1990, Commun. Stat. Simul. Comput. 19, 433; Bekas, Kokiopoulou & Saad 2007, Appl. Numer. Math. 57, 1214), here in the
-basis of the delay modes: for white noise x with <x x*> = 1, the mean of |f* P x|^2 is <f|P P|f> = <f|P|f>, that of
-|f* W x|^2 - |f* M x|^2 is <f|W^2 - M^2|f>, and P x or M x cost one solve of the normal equations of the reduced problem
+basis of the delay modes: for white noise x with <x x*> = 1, the mean of |f* P x|^2 is <f|P P|f> = <f|P|f>, that of |f*
+W x|^2 - |f* M x|^2 is <f|W^2 - M^2|f>, and P x or M x cost one solve of the normal equations of the reduced problem
 (`calstudy.calibrate.solvers.reduced`).
 """
 
@@ -51,7 +52,7 @@ from calstudy.calibrate.tangent_space import TangentSpace
 from calstudy.power.delay import make_taper
 
 TAPER = "blackman-harris"
-# Elements of the dense Jacobian up to which the exact diagonal is offered.
+# Largest number of elements of the dense Jacobian for the exact diagonal.
 DENSE = 3e7
 CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
 
@@ -59,12 +60,7 @@ CG_TOLERANCE, CG_ITERATIONS = 1e-5, 500
 class DelayModes:
     """Tapered delay modes of a band, with or without gaps.
 
-    Parameters
-    ----------
-    frequency
-        Channel centres on an even grid, Hz, (Nfreqs,).
-    taper
-        See `calstudy.power.delay.TAPERS`.
+    Channel centres are on an even grid, Hz, (Nfreqs,); tapers are those of `calstudy.power.delay.TAPERS`.
     """
 
     def __init__(self, frequency: np.ndarray, taper: str = TAPER) -> None:
@@ -74,7 +70,7 @@ class DelayModes:
         self.weights = make_taper(taper, grid.n_channels)[grid.positions]
 
     def amplitudes(self, values: np.ndarray) -> np.ndarray:
-        """Return f* values for every delay: frequency is the last axis, (..., Nfreqs) to (..., Ndelays)."""
+        """Compute f* values for every delay: frequency is the last axis, (..., Nfreqs) to (..., Ndelays)."""
         padded = np.zeros((*values.shape[:-1], self._grid.n_channels), complex)
         padded[..., self._grid.positions] = values * self.weights
         transformed = np.fft.ifft(padded, axis=-1, norm="forward")
@@ -83,7 +79,7 @@ class DelayModes:
 
 @dataclass(frozen=True)
 class ExpectedTransfer:
-    """The fraction of a white signal's power that a fit leaves.
+    """The fraction of a white signal's power that a fit preserves.
 
     Attributes
     ----------
@@ -94,7 +90,7 @@ class ExpectedTransfer:
     error
         Standard deviation of the stochastic estimate, of the same shape; zero if it is exact.
     foregrounds, gains
-        What each of them absorbs, of the same shape; the three add up to one.
+        Fractions that foregrounds and gains absorb, of the same shape; the three fractions add up to one.
     """
 
     delay: np.ndarray = field(metadata={"unit": "s"})
@@ -112,12 +108,12 @@ def expected_transfer(
     probes: int | None = None,
     seed: int = 0,
 ) -> ExpectedTransfer:
-    """Return what a fit is expected to leave of a white signal, for every baseline and delay.
+    """Predict the fraction of a white signal that a fit preserves, for every baseline and delay.
 
     Parameters
     ----------
     problem
-        What was fitted.
+        The fitted problem.
     gains, model
         The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
     modes
@@ -125,12 +121,12 @@ def expected_transfer(
     probes
         Number of random vectors; None for the exact diagonal.
     seed
-        Of the random vectors.
+        Seed of the random vectors.
 
     Raises
     ------
     ValueError
-        If the exact diagonal of a large problem is asked for, or fewer than two probes.
+        If the exact diagonal of a large problem is requested, or fewer than two probes.
     """
     tangent = TangentSpace.at(problem, gains, model)
     used = tangent.roots > 0
@@ -171,7 +167,7 @@ def jacobian_size(problem: CalibrationProblem) -> int:
 def _exact_diagonal(
     problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace, modes: DelayModes
 ) -> np.ndarray:
-    """Return <f|P|f> of the gains, (Nbls, Ndelays), from dense matrices."""
+    """Compute <f|P|f> of the gains, (Nbls, Ndelays), from dense matrices."""
     if jacobian_size(problem) > DENSE:
         raise ValueError(
             f"the exact transfer of {problem.structure.n_antennas} antennas and {problem.structure.n_frequencies} "
@@ -229,15 +225,7 @@ def _jacobian(problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSp
 
 
 class GainResponse:
-    """The linear response of the gains to a change of the data, at a solution.
-
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    gains
-        The solution, (Nants, Nfreqs), complex.
-    """
+    """The linear response of the gains to a change of the data, at a solution, (Nants, Nfreqs), complex."""
 
     def __init__(self, problem: CalibrationProblem, gains: np.ndarray) -> None:
         self._kernels = kernels = compiled(problem.structure, problem.frozen)
@@ -257,10 +245,7 @@ class GainResponse:
     def solve(self, change: np.ndarray) -> np.ndarray:
         """Return the relative change eta of the gains, complex, (Nants, Nfreqs), for a change y of the whitened data.
 
-        Parameters
-        ----------
-        change
-            J_g* y, in the unit of the square root of the loss, complex, (Nants, Nfreqs).
+        `change` is J_g* y, in the unit of the square root of the loss, complex, (Nants, Nfreqs).
         """
         # Inside the kernels the loss has the weighted square of the data for a unit.
         return pairs.to_complex(self._compiled(pairs.to_pair(change / self._unit, tf.float32)))
@@ -270,7 +255,7 @@ class GainResponse:
         return eta
 
     def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
-        """Return what gains absorb of whitened changes W y, without what foregrounds absorb of that, (Nbls, Nfreqs)."""
+        """Return the part of W y that gains absorb, less the foregrounds' response to it, (Nbls, Nfreqs)."""
         first, second = self._antennas
         gradient = tangent.slope.conj() * left
         descent = np.zeros(self._shape, complex)
@@ -283,7 +268,7 @@ class GainResponse:
 def linear_response(
     problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signal: np.ndarray
 ) -> np.ndarray:
-    """Return what a fit leaves of a small signal in the calibrated data, to first order.
+    """Compute the residual of a small signal after calibration, to first order.
 
     It is the difference of the residuals of two fits, of data with the signal and without, if both are at the minimum;
     it does not depend on where these start and stop.
@@ -291,11 +276,11 @@ def linear_response(
     Parameters
     ----------
     problem
-        What was fitted.
+        The fitted problem.
     gains, model
         The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
     signal
-        Likewise, (Nbls, Nfreqs), in the unit of the model.
+        Calibrated visibilities of the signal, (Nbls, Nfreqs), in the unit of the model.
 
     Returns
     -------
@@ -310,7 +295,7 @@ def linear_response(
 def _stochastic_diagonal(
     problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace, modes: DelayModes, probes: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return <f|P|f> of the gains and its standard deviation, (Nbls, Ndelays) each; parameters as `expected_transfer`.
+    """Estimate <f|P|f> of the gains and its standard deviation, (Nbls, Ndelays) each.
 
     Raises ValueError for fewer than two probes, which give no error.
     """

@@ -1,4 +1,4 @@
-"""A sky-based fit, whose foregrounds are known: there is nothing to eliminate."""
+"""Projection of a sky-based fit, whose foregrounds are known, so that none are eliminated."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from calstudy.calibrate.tensors import FitTensors
 
 
 class FrozenForegrounds:
-    """Takes the place of `calstudy.calibrate.projection.Projector`.
+    """Replacement of `calstudy.calibrate.projection.Projector` for known foregrounds.
 
-    Without foregrounds to respond, the Gauss-Newton matrix does not couple channels.
+    Because foregrounds do not respond, the Gauss-Newton matrix does not couple channels.
     """
 
     def __init__(self, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
@@ -32,7 +32,7 @@ class FrozenForegrounds:
         return self._products.pull(change, None, ends, part.curvature, part.model)
 
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
-        """Return what `Projector.curvature_descent` does; foregrounds do not follow."""
+        """Return the same as `Projector.curvature_descent`, with fixed foregrounds."""
         (part,), ends = projection.parts, self.tensors.ends
         second = pairs.multiply(part.model, ends.relative_change(eta))
         change = self._products.change(eta, ends, part.curvature, second)

@@ -1,4 +1,4 @@
-"""Two sets of gains compared, free of what no calibration of the data can know."""
+"""Compare two sets of gains, free of the degeneracies of calibration."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from calstudy.power.delay import channel_width, delay_transform, delays
 
 GRADIENT_STEPS, GRADIENT_TOLERANCE = 50, 1e-12
 REDUNDANT = 1.0
-"""m. Baselines that differ by less count as the same."""
+"""m. Baselines that differ by less are redundant."""
 NOT_PARALLEL = 0.3
-"""The sine of the angle between two baselines that span a plane is larger."""
+"""Minimum sine of the angle between two baselines that span the plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,14 @@ class GainPair:
 
 @dataclass(frozen=True, eq=False)
 class GainDifference:
-    """How far two sets of gains differ: rms of the difference over the rms of the second.
+    """The difference of two sets of gains: rms of the difference over the rms of the second.
 
     Attributes
     ----------
     pair
-        What was compared, the first gains brought closest to the second.
+        The gains, the first aligned with the second.
     as_given
-        Before that, of all antennas together.
+        Difference before the alignment, of all antennas together.
     of_antenna, of_channel
         (Nants,) and (Nfreqs,); NaN where there are no gains.
     delay, of_delay
@@ -72,19 +72,11 @@ class GainDifference:
 
 
 def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
-    """Return the gains that two files have in common.
+    """Select the gains that two files have in common.
 
-    Parameters
-    ----------
-    first, second
-        Of either convention. An integration of the first is compared with the closest of the second.
-    polarization
-        Place among the feeds that both have.
-
-    Raises
-    ------
-    InputError
-        If they hold delays, or have no antennas, no feed, or not the same channels in common.
+    Gains may be of either convention. An integration of the first is compared with the closest of the second.
+    `polarization` is the index among the feeds that both have. Raises InputError if a file holds delays, or if the two
+    have no antennas, no such feed, or not the same channels in common.
     """
     for name, cal in (("first", first), ("second", second)):
         if cal.cal_type != "gain":
@@ -116,7 +108,7 @@ def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
 
 
 def _gains(cal: UVCal, numbers: np.ndarray, feed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains and where there are any, (Ntimes, Nants, Nfreqs), channels ascending."""
+    """Return gains and the mask of valid ones, (Ntimes, Nants, Nfreqs), channels ascending."""
     rows = [int(np.flatnonzero(cal.ant_array == number)[0]) for number in numbers]
     column = int(np.flatnonzero(cal.jones_array == feed)[0])
     order = np.argsort(np.ravel(cal.freq_array))
@@ -129,19 +121,9 @@ def _gains(cal: UVCal, numbers: np.ndarray, feed: int) -> tuple[np.ndarray, np.n
 def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
     """Compare two sets of gains, free of one phase per channel and one real scale for each integration.
 
-    Parameters
-    ----------
-    pair
-        What is compared. Not mutated.
-    redundant
-        Whether one amplitude and one phase gradient across the array in every channel are left out as well, which the
-        redundancy of an array does not determine. On a lattice a gradient may be of any number of turns per baseline,
-        elsewhere it must be less than half a turn per baseline.
-
-    Raises
-    ------
-    InputError
-        If the two have no gains in common.
+    With `redundant`, one amplitude and one phase gradient across the array in every channel are removed as well, which
+    the redundancy of an array does not determine. On a lattice a gradient may be of any number of turns per baseline,
+    elsewhere it must be less than half a turn per baseline. Raises InputError if the two have no gains in common.
     """
     if not pair.first.any():
         raise InputError("all gains that the two files have in common are flagged in either")
@@ -174,11 +156,11 @@ def _relative(difference: np.ndarray, gains: np.ndarray, axes: tuple[int, ...]) 
 
 
 def _without_turns(pair: GainPair) -> GainPair:
-    """Take the phase gradient between two sets of gains out of the first, however many turns it is across the array.
+    """Remove the phase gradient between two sets of gains from the first, for any number of turns across the array.
 
-    Gains g_a' = g_a exp(i q x_a) have the products of antennas of one redundant group all turned by q d: the mean of
-    those products gives q d for the shortest group, and for the shortest that is not parallel to it. On a lattice these
-    are its steps, and whole turns per step make no difference. Elsewhere q must be less than half a turn per baseline.
+    Gains g_a' = g_a exp(i q x_a) turn the products of antennas of one redundant group all by q d: the mean of those
+    products gives q d for the shortest group, and for the shortest that is not parallel to it. On a lattice these are
+    its steps, and whole turns per step make no difference. Elsewhere q must be less than half a turn per baseline.
     """
     first, second = np.triu_indices(len(pair.antennas), 1)
     if not first.size:
@@ -200,7 +182,7 @@ def _without_turns(pair: GainPair) -> GainPair:
 
 
 def _spanning(vectors: list[np.ndarray]) -> list[int]:
-    """Return the places of the shortest vector, and of the shortest that is not parallel to it if there is one."""
+    """Return the indices of the shortest vector, and of the shortest that is not parallel to it if there is one."""
     order = np.argsort([np.linalg.norm(vector) for vector in vectors])
     shortest = vectors[order[0]] / np.linalg.norm(vectors[order[0]])
     for place in order[1:]:
@@ -211,7 +193,7 @@ def _spanning(vectors: list[np.ndarray]) -> list[int]:
 
 
 def _without_gradients(first: np.ndarray, second: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Return the first gains (Nants, Nfreqs) with amplitude and phase gradient of each channel as the second's."""
+    """Match amplitude and phase gradient of each channel of the first gains, (Nants, Nfreqs), to the second."""
     design = np.column_stack([positions - positions.mean(axis=0), np.ones(len(positions))])
     turned = fix_phase(first, second)
     for _ in range(GRADIENT_STEPS):

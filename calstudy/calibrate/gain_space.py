@@ -1,7 +1,7 @@
-"""The space in which gains are sought: any gain in any channel, or combinations of smooth functions of frequency.
+"""The space of the gains: any gain in any channel, or combinations of smooth functions of frequency.
 
-Solvers that iterate on relative changes eta of the gains, g (1 + eta), see a smooth basis B through the change of
-coordinates eta = (c B^T) / g.
+Solvers iterate on relative changes eta of the gains, g (1 + eta). A smooth basis B is a change of coordinates, eta = (c
+B^T) / g.
 """
 
 from __future__ import annotations
@@ -15,25 +15,21 @@ from calstudy.calibrate import pairs
 class GainSpace:
     """Coordinates of the gains: pairs (2, Nants, Nfreqs) themselves, or coefficients (2, Nants, Ngain) of a basis.
 
-    Parameters
-    ----------
-    vectors
-        Orthonormal, (Nfreqs, Ngain), as from `calstudy.calibrate.basis.gain_vectors`, or None for no restriction.
-    dtype
-        Of all tensors that pass through.
+    The basis is orthonormal, (Nfreqs, Ngain), as from `calstudy.calibrate.basis.gain_vectors`, or None for no
+    restriction. `dtype` is that of all tensors.
     """
 
     def __init__(self, vectors: np.ndarray | None, dtype: tf.DType) -> None:
         self.vectors = None if vectors is None else tf.constant(vectors, dtype)
 
     def expand(self, coordinates: tf.Tensor) -> tf.Tensor:
-        """Return what has these coordinates, (2, Nants, Nfreqs)."""
+        """Return the gains with these coordinates, (2, Nants, Nfreqs)."""
         if self.vectors is None:
             return coordinates
         return tf.einsum("pac,fc->paf", coordinates, self.vectors)
 
     def reduce(self, values: tf.Tensor) -> tf.Tensor:
-        """Return the coordinates of the closest gains, in least squares; the transpose of `expand`."""
+        """Return the coordinates of the closest gains in least squares; the transpose of `expand`."""
         return values if self.vectors is None else tf.einsum("paf,fc->pac", values, self.vectors)
 
     def expand_relative(self, coordinates: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:

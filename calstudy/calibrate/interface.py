@@ -1,6 +1,6 @@
-"""What a calibrator is: settings, what it refuses, what it costs, and how visibilities become gains.
+"""Interface of calibrators: settings, refusals, cost, and the calibration of visibilities.
 
-Built-in calibrators are the modules of `calstudy.calibrate.calibrators`. One's own is a subclass of `Calibrator` in a
+Built-in calibrators are the modules of `calstudy.calibrate.calibrators`. Your own is a subclass of `Calibrator` in a
 file or an installed package (docs/extending.md). `calstudy.calibrate.execution` calls either.
 """
 
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
 
 Status = Literal["converged", "max-steps", "stalled", "failed", "skipped", "by-file"]
 USABLE: tuple[Status, ...] = ("converged", "max-steps", "stalled", "by-file")
-"""Statuses of solves that gave gains; what others cover is flagged."""
+"""Statuses of solves that gave gains; samples of other solves are flagged."""
 SETTLED: tuple[Status, ...] = ("converged", "by-file")
-"""Statuses that nobody needs to be warned of."""
+"""Statuses that need no warning."""
 Progress = Callable[[int, int], None]
 """Called after each solve with the number done and the total."""
 
 
 @dataclass(frozen=True, eq=False)
 class Assumed:
-    """What a calibrator takes for granted.
+    """Information that a calibrator takes as given.
 
     Attributes
     ----------
     sky_model
-        Visibilities of the sky as far as it is known, with the baselines, times, channels and polarizations of the
-        data, in the same order; None if there are none.
+        Visibilities of the known part of the sky, with the baselines, times, channels and polarizations of the data,
+        in the same order; None if there are none.
     gains
-        Gains to start from, None for unity. A calibrator that does not iterate may leave them alone.
+        Gains to start from, None for unity. A calibrator that does not iterate may ignore them.
     noise
         Standard deviation of the complex noise of a sample that was measured once (nsamples of one), in the unit of
-        the data; None if it is not known. Asked for by `Calibrator.needs_noise`.
+        the data; None if it is not known. Requested by `Calibrator.needs_noise`.
     """
 
     sky_model: Observation | None = None
@@ -61,19 +61,19 @@ class Outcome:
     Attributes
     ----------
     status
-        ``converged``; ``max-steps`` or ``stalled`` for gains that are usable but not those that were sought;
-        ``failed`` for none; ``skipped`` if there were no data to fit; ``by-file`` for gains of another program, of
-        which nothing else is known.
+        ``converged``; ``max-steps`` or ``stalled`` for gains that are usable but short of the minimum; ``failed`` for
+        none; ``skipped`` if there were no data to fit; ``by-file`` for gains of another program, of which nothing else
+        is known.
     message
         One sentence on why it stopped.
     steps
         Steps taken; None if the calibrator does not iterate.
     loss_history
-        What was minimized, before the first step and after each.
+        The minimized quantity, before the first step and after each.
     seconds
         Wall time; None for an equal share of the whole.
     cpu_seconds
-        Processor time, of programs that the calibrator starts as well; None for an equal share of the whole.
+        Processor time, also of programs that the calibrator starts; None for an equal share of the whole.
     newton_decrement, decrement_rms
         As in `calstudy.calibrate.solution.Solution`; NaN if unknown.
     peak_memory
@@ -96,7 +96,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration:
-    """What a calibrator returns.
+    """The result of a calibrator.
 
     Attributes
     ----------
@@ -109,13 +109,13 @@ class Calibration:
         How the solves ended: one for each polarization and each group of integrations, polarization by polarization,
         each in the order of time; or a single one for all of them.
     gain_flags
-        Which gains are not to be used, bool, like `gains`; None for none, or for those of the UVCal.
+        Mask of gains that must not be used, bool, like `gains`; None for none, or for those of the UVCal.
     model
         The foregrounds F, (Ntimes, Nbls, Nfreqs, Npols), in the unit of the data; None for the sky model.
     flags
         Samples that are excluded besides the flagged ones, like `model`; None for none.
     baselines
-        Which baselines were calibrated, bool, (Nbls,); None for all. Model and flags cover only these.
+        Mask of the calibrated baselines, bool, (Nbls,); None for all. Model and flags cover only these.
     """
 
     gains: np.ndarray | UVCal
@@ -128,16 +128,16 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Outline:
-    """What is known of a calibration before it starts.
+    """Properties of a calibration that are known before it starts.
 
     Attributes
     ----------
     cost
-        Of all its solves.
+        Cost of all its solves.
     details
-        What is worth reporting besides the dimensions of the data, such as "640 foreground coefficients each".
+        Details worth reporting besides the dimensions of the data, such as "640 foreground coefficients each".
     notes
-        Sentences on what will not work well.
+        Sentences on settings that will not work well.
     """
 
     cost: Cost
@@ -146,7 +146,7 @@ class Outline:
 
 
 class Smoothing(Section):
-    """What all ways to smooth gains have in common."""
+    """Settings that all ways to smooth gains have in common."""
 
     reference_antenna: int | None = Field(
         None,
@@ -212,7 +212,7 @@ class SmoothCal(Smoothing):
 
     @property
     def over_time(self) -> bool:
-        """Always."""
+        """Always true."""
         return True
 
 
@@ -222,7 +222,7 @@ SmoothGains = Annotated[
 
 
 class Calibrator(Plugin):
-    """A way to find gains. Fields of a subclass are its settings; `calibrate` is what it does."""
+    """A way to find gains. Fields of a subclass are its settings; `calibrate` finds the gains."""
 
     registry: ClassVar[Registry[Calibrator]] = Registry(
         "calibrator",
@@ -255,22 +255,22 @@ class Calibrator(Plugin):
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return in one sentence why data cannot be calibrated, or None if they can.
 
-        Asked by plans, before there are data, and again before data are calibrated. A sentence about a setting starts
-        with its path and a colon, such as ``basis.buffer: must be ...``.
+        Plans call this before there are data, and it is called again before data are calibrated. A sentence about a
+        setting starts with its path and a colon, such as ``basis.buffer: must be ...``.
 
         Parameters
         ----------
         frame
             Antennas, baselines and channels of the data.
         has_sky_model
-            Whether `Assumed.sky_model` will be there.
+            Whether `Assumed.sky_model` will be given.
         """
         del frame, has_sky_model
         return None
 
     @property
     def needs_noise(self) -> bool:
-        """Whether `Assumed.noise` changes anything."""
+        """Whether the calibrator uses `Assumed.noise`."""
         return False
 
     @property
@@ -279,11 +279,11 @@ class Calibrator(Plugin):
         return False
 
     def cost(self, size: Size) -> Cost:
-        """Return what calibrating data of this size takes; by default little beyond the data themselves."""
+        """Return the cost of calibrating data of this size; by default little beyond the data themselves."""
         return Cost(5.0 + 1e-6 * size.samples, LIBRARIES_MEMORY + 6 * COMPLEX128 * size.samples)
 
     def outline(self, frame: Frame) -> Outline:
-        """Return what is known of a calibration of data with these baselines; by default the cost of their size."""
+        """Return the properties of a calibration of data with these baselines; by default the cost of their size."""
         return Outline(self.cost(Size.of_frame(frame)))
 
     def leaner(self) -> Self | None:
@@ -299,22 +299,22 @@ class Calibrator(Plugin):
         observation
             The data; arrays are read-only.
         assumed
-            What may be taken for granted.
+            Information that may be taken as given.
         progress
-            To be called after each solve with the number done and the total; None for no progress reports.
+            Call this after each solve with the number done and the total; None for no progress reports.
         """
 
     def for_data(self, digest: str, sky_model: str | None = None) -> Self:
-        """Return the calibrator of one data set of a run; the same for all, unless files say what to do with each.
+        """Return the calibrator of one data set of a run; by default the same for all data sets.
 
-        Asked by plans. May raise InputError.
+        Plans call this. A calibrator that reads files for each data set overrides it, and may raise InputError.
 
         Parameters
         ----------
         digest
-            Of all that the data set is made from.
+            Digest of all inputs of the data set.
         sky_model
-            Of all that the sky model is made from; None if there is none.
+            Digest of all inputs of the sky model; None if there is none.
         """
         del digest, sky_model
         return self

@@ -32,9 +32,9 @@ class JointGroup:
         the conjugate.
     vectors
         Vectors of each baseline over all channels of the data in their order, shape (Nmembers, Nfreqs, Nvec), real.
-        They need be neither orthogonal nor normalized: only what they span over all baselines together matters.
+        They need be neither orthogonal nor normalized: only their span over all baselines together matters.
     name
-        For messages.
+        Name in messages.
 
     Raises
     ------
@@ -82,16 +82,13 @@ class PlacedGroup(NamedTuple):
 def read_joint_groups(path: Path) -> tuple[JointGroup, ...]:
     """Read groups from an .npz file of arrays ``antennas_NAME`` and ``vectors_NAME``, a pair for every group.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, holds other arrays or half a pair, or a group is refused.
+    Raises InputError if the file cannot be read, holds other arrays or half a pair, or a group is invalid.
     """
     try:
-        # Opened here, for what is no archive is left open there.
+        # Opened here, because np.load leaves a file open that is not an archive.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    # What is no archive at all is taken for a pickle, or, as a single array, has no names.
+    # np.load takes a file that is not an archive for a pickle; a single array has no names.
     except (OSError, EOFError, ValueError, BadZipFile, AttributeError, TypeError) as error:
         raise InputError(f"{FIELD}.path: {path} cannot be read as an .npz file of plain arrays ({error})") from None
     groups = []
@@ -109,22 +106,10 @@ def read_joint_groups(path: Path) -> tuple[JointGroup, ...]:
 
 
 def place_groups(groups: Sequence[JointGroup], antennas: np.ndarray, n_frequencies: int) -> list[PlacedGroup]:
-    """Find the baselines of groups in the data, and make their vectors orthonormal.
+    """Find the baselines of groups in the data, and orthonormalize their vectors.
 
-    Parameters
-    ----------
-    groups
-        Any number.
-    antennas
-        Antenna numbers of the data's baselines, (Nbls, 2).
-    n_frequencies
-        Channels of the data.
-
-    Raises
-    ------
-    InputError
-        If a group has another number of channels, a baseline that the data do not have or that was there before, or as
-        many independent vectors as samples.
+    `antennas` are the antenna numbers of the data's baselines, (Nbls, 2). Raises InputError if a group has another
+    number of channels, a baseline that the data lack or that occurs twice, or as many independent vectors as samples.
     """
     rows = {(int(a), int(b)): index for index, (a, b) in enumerate(antennas)}
     seen: set[int] = set()
@@ -164,7 +149,7 @@ def other_baselines(placed: Sequence[PlacedGroup], n_baselines: int) -> np.ndarr
 
 
 def orthonormal(vectors: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis over all baselines together of what vectors (Nmembers, Nfreqs, Nvec) span."""
+    """Return an orthonormal basis, over all baselines together, of the span of vectors (Nmembers, Nfreqs, Nvec)."""
     stacked = vectors.reshape(-1, vectors.shape[2])
     norms = np.linalg.norm(stacked, axis=0)
     left, singular, _ = np.linalg.svd(stacked[:, norms > 0] / norms[norms > 0], full_matrices=False)

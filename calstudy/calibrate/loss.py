@@ -1,4 +1,4 @@
-"""The loss of gains and foreground coefficients together, and its gradient.
+"""The joint loss of gains and foreground coefficients, and its gradient.
 
 It is the likelihood of paper Eq. LOGLIKELIHOOD and LOGLIKELIHOODREDUNDANT, and the prior on the summed model.
 """
@@ -17,7 +17,7 @@ from calstudy.calibrate.tensors import Ends, FitTensors
 
 # Real and imaginary parts stay apart here: stacking them would cost the compiled step a copy each time.
 RealImaginary = tuple[tf.Tensor, tf.Tensor]
-# Into at most this many parts the baselines are divided, so that what a part needs for a while stays in the processor's
+# Baselines are divided into at most this many parts, so that the temporary arrays of a part stay in the processor's
 # cache. More of them take longer to compile.
 PARTS = 8
 
@@ -35,8 +35,7 @@ class Parameters(NamedTuple):
 class FitData(NamedTuple):
     """Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) and the prior's target (2,), in units of the rms.
 
-    The model (2, Nbls, Nfreqs) is there only if it is frozen; `summed`, see `sum_prior`, only if
-    it is not.
+    The model (2, Nbls, Nfreqs) is given only if it is frozen, `summed` (see `sum_prior`) only if it is not.
     """
 
     visibilities: tf.Tensor
@@ -49,10 +48,7 @@ class FitData(NamedTuple):
 class Part(NamedTuple):
     """Some baselines of the loss, which is a sum over them.
 
-    Attributes
-    ----------
-    buckets, models, baselines
-        First one and one past the last, in the solvers' order.
+    Ranges are the first one and one past the last, in the solvers' order.
     """
 
     buckets: tuple[int, int]
@@ -61,18 +57,10 @@ class Part(NamedTuple):
 
 
 def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tensor]) -> RealImaginary:
-    """Return sum_i u_i A_i of all models, one matrix product per bucket (paper Eq. FGMODEL).
+    """Return sum_i u_i A_i of all models, real and imaginary part, each (Nmodels, Nfreqs) (paper Eq. FGMODEL).
 
-    Parameters
-    ----------
-    coefficients
-        For each bucket, u of shape (2, Nmembers, Nvec); (2, 1, Nvec) for a joint bucket.
-    bases
-        For each bucket, the basis A of shape (Nvec, Nfreqs); (Nvec, Nmembers, Nfreqs) for a joint bucket.
-
-    Returns
-    -------
-    Real and imaginary part, each of shape (Nmodels, Nfreqs).
+    There is one matrix product per bucket, of u, (2, Nmembers, Nvec), and the basis A, (Nvec, Nfreqs); of (2, 1, Nvec)
+    and (Nvec, Nmembers, Nfreqs) for a joint bucket.
     """
     real, imaginary = [], []
     for u, basis in zip(coefficients, bases, strict=True):
@@ -94,16 +82,8 @@ def likelihood(
 ) -> tf.Tensor:
     """Return sum w |v - g_a g_b* F|^2 over baselines and channels.
 
-    Parameters
-    ----------
-    ends
-        Of the baselines.
-    gains
-        Shape (2, Nants, Nfreqs).
-    model
-        F on the baselines, real and imaginary part, each (Nbls, Nfreqs).
-    visibilities, weights
-        Shapes (2, Nbls, Nfreqs) and (Nbls, Nfreqs).
+    Gains are (2, Nants, Nfreqs); F is given on the baselines, real and imaginary part, each (Nbls, Nfreqs).
+    Visibilities are (2, Nbls, Nfreqs), weights (Nbls, Nfreqs).
     """
     first, second = ends
     real, imaginary = tf.unstack(gains)
@@ -119,14 +99,8 @@ def likelihood(
 def sum_prior(coefficients: Sequence[tf.Tensor], summed: Sequence[tf.Tensor], target: tf.Tensor) -> tf.Tensor:
     """Return |sum w' (F - m)|^2 with w' = w, on the model itself and not on gains times model (paper §Method).
 
-    Parameters
-    ----------
-    coefficients
-        u of each bucket, see `foreground_model`.
-    summed
-        What sum w F has of each of them, for its real part and its imaginary part, of the same shapes.
-    target
-        The weighted sum of the sky model, shape (2,).
+    `coefficients` are u of each bucket, see `foreground_model`; `summed` are their weights in the real and the
+    imaginary part of sum w F, of the same shapes. The target is the weighted sum of the sky model, (2,).
     """
     # One sum of all is compiled faster than one for each bucket.
     products = [tf.reshape(u * weight, [2, -1]) for u, weight in zip(coefficients, summed, strict=True)]
@@ -134,7 +108,7 @@ def sum_prior(coefficients: Sequence[tf.Tensor], summed: Sequence[tf.Tensor], ta
 
 
 def _make_parts(tensors: FitTensors) -> list[Part]:
-    """Return all baselines in at most `PARTS` parts, of whole buckets."""
+    """Divide all baselines into at most `PARTS` parts, of whole buckets."""
     parts: list[Part] = []
     start = 0
     for bucket, (_, model) in enumerate(tensors.slices):
@@ -156,16 +130,8 @@ def _coefficients(model: tf.Tensor, basis: np.ndarray) -> tf.Tensor:
 class JointLoss:
     """The loss of one fit structure, in parts.
 
-    Parameters
-    ----------
-    tensors
-        Index tensors of the structure.
-    space
-        In which gains are fitted.
-    prior
-        Of the overall scale; only ``sum`` is part of the loss.
-    dtype
-        Of the loss, its parameters, and `space`.
+    Gains are fitted in `space`. Of the priors of the overall scale, only ``sum`` is part of the loss. `dtype` is that
+    of the loss, its parameters, and `space`.
     """
 
     def __init__(self, tensors: FitTensors, space: GainSpace, prior: Prior, dtype: tf.DType) -> None:
@@ -174,12 +140,9 @@ class JointLoss:
         self._parts = _make_parts(tensors)
 
     def summed(self, weights: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """Return what the sum of w F over baselines and channels has of each coefficient; see `sum_prior`.
+        """Return the weight of each coefficient in the sum of w F over baselines and channels; see `sum_prior`.
 
-        Parameters
-        ----------
-        weights
-            (Nbls, Nfreqs), float64.
+        Weights are (Nbls, Nfreqs), float64.
         """
         # The sum runs over visibilities as they were measured, also where the solver turned a baseline around.
         orientation = self._tensors.orientation
@@ -187,13 +150,7 @@ class JointLoss:
         return self.coefficients(self._tensors.sum_pairs_over_group(of_parts))
 
     def coefficients(self, models: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """Return A^T F of each bucket, the transpose of `foreground_model`.
-
-        Parameters
-        ----------
-        models
-            (2, Nmodels, Nfreqs), float64.
-        """
+        """Return A^T F of each bucket for models (2, Nmodels, Nfreqs), float64; the transpose of `foreground_model`."""
         parts = zip(self._tensors.slices, self._tensors.bases, strict=True)
         return tuple(
             tf.cast(_coefficients(models[:, first:last], basis), self._dtype) for (first, last), basis in parts

@@ -1,4 +1,4 @@
-"""From an observation and the settings of a fit to the problems that solvers take."""
+"""Prepare the calibration problems of an observation for the settings of a fit."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ class PreparedFit:
     Attributes
     ----------
     data
-        The visibilities that are calibrated: without the autocorrelations, unless they are fitted. Indices of the
-        structure stand for `data.numbers`.
+        The calibrated visibilities: without the autocorrelations, unless they are fitted. Indices of antennas in the
+        structure are those of `data.numbers`.
     fitted
-        Which baselines of the observation these are, bool, (Nbls,).
+        Mask of these baselines in the observation, bool, (Nbls,).
     structure
-        Of the fit of one integration.
+        Structure of the fit of one integration.
     weights
-        Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior. Those of unity
-        gains, if they come from the gains.
+        Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior. Weights that
+        come from the gains are those of unity gains.
     used
-        Which samples are calibrated, bool, likewise: all that have weight, on whatever baseline.
+        Mask of the calibrated samples, bool, of the same shape: all unflagged samples with weight, also on baselines
+        outside the range to which gains are fitted.
     start
         Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
     sky
@@ -56,20 +57,10 @@ class PreparedFit:
 
 
 def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTHING) -> PreparedFit:
-    """Return what is fitted, after checking it.
+    """Check data and settings, and compute the arrays of a fit.
 
-    Parameters
-    ----------
-    observation, assumed
-        As for `calstudy.calibrate.interface.Calibrator.calibrate`.
-    settings
-        Of the fit.
-
-    Raises
-    ------
-    InputError
-        If there are polarizations that are not of feeds, or unflagged data that are not finite, or weights, gains or
-        joint groups do not fit the data.
+    Raises InputError if there are polarizations that are not parallel hands, or unflagged data that are not finite, or
+    if weights, gains or joint groups do not fit the data.
     """
     require_parallel_hands(observation.uvd)
     fitted = fitted_baselines(observation, settings.autos)
@@ -97,15 +88,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
 def problem_at(
     prepared: PreparedFit, settings: GainFit, times: slice, polarization: int, gains: np.ndarray
 ) -> CalibrationProblem | str:
-    """Return the problem whose solution are some gains, with the weights that they make; or why there is none.
-
-    Parameters
-    ----------
-    prepared, settings, times, polarization
-        As for `make_problem`.
-    gains
-        The solution, complex, (Nants, Nfreqs).
-    """
+    """Return the problem whose solution are gains (Nants, Nfreqs), with the weights from them, or why there is none."""
     problem = make_problem(prepared, settings, times, polarization)
     if isinstance(problem, str) or not isinstance(settings.weights, GainWeights):
         return problem
@@ -116,17 +99,6 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
     """Return the problem of some consecutive integrations together, or the reason why there is none.
 
     Weights that come from the gains are those of unity gains.
-
-    Parameters
-    ----------
-    prepared
-        All integrations.
-    settings
-        Of the fit.
-    times
-        The integrations.
-    polarization
-        Index of the polarization.
     """
     structure = repeat_structure(prepared.structure, times.stop - times.start)
 
@@ -158,9 +130,9 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
 
 
 def _deviations(sky: np.ndarray | None, weights: np.ndarray, settings: GainFit) -> tuple[float, float]:
-    """Return the deviations of the foregrounds' prior in the unit of the data, of each baseline's own and shared.
+    """Return the own and shared deviations of the foregrounds' prior, in the unit of the data.
 
-    They are those of the integrations that are solved together: results must not depend on how runs are cut in pieces.
+    They are those of the integrations that are solved together: results must not depend on the chunks of a run.
     """
     if not isinstance(settings, ForegroundFit) or not settings.foreground_prior.finite or sky is None:
         return math.inf, math.inf

@@ -23,31 +23,28 @@ Prior = Literal["sum", "post-hoc", "gains", "sky-model", "none"]
 
 @dataclass(frozen=True, eq=False)
 class FitStructure:
-    """Which antennas make which baseline, and which baselines share a foreground model.
+    """The antennas of each baseline, and the baselines of each foreground model.
 
-    Solvers compile once per structure: instances with the same content are equal, and hash alike.
+    Solvers compile once per structure: instances with the same content are equal, and have the same hash.
 
     Attributes
     ----------
     antennas
         Antenna indices (a, b) of each baseline, shape (Nbls, 2), each in 0 ... n_antennas - 1.
-    n_antennas
-        Number of antennas.
-    basis
-        The bases of the foreground models.
     groups
         Index of each baseline's foreground model, shape (Nbls,): ``arange(Nbls)`` for per-baseline modelling
         (paper Eq. LOGLIKELIHOOD), the redundant group otherwise (Eq. LOGLIKELIHOODREDUNDANT).
     conjugated
-        True where a baseline sees the conjugate of its model because it points the other way, shape (Nbls,).
+        True where a baseline has the conjugate of its model because of its opposite direction, shape (Nbls,).
     gain_vectors
-        Orthonormal real functions of frequency whose span holds the gains, shape (Nfreqs, Ngain), float64; None for
+        Orthonormal real functions of frequency whose span contains the gains, shape (Nfreqs, Ngain), float64; None for
         gains without restriction.
     models_at_once
-        Foreground models that are worked on at a time; fewer need less memory, and change results by rounding only.
+        Number of foreground models that are processed at a time; fewer need less memory, and change results by
+        rounding only.
     prior
-        Which coefficients have a finite prior: ``own``, ``shared`` (those of a model that baselines have in common), or
-        ``both``, where every baseline has coefficients of its own besides the shared ones; ``none`` if they are free.
+        Coefficients with a finite prior: ``own``, ``shared`` (those of a model that baselines have in common), or
+        ``both``, where every baseline has its own coefficients besides the shared ones; ``none`` if they are free.
         With a prior, the vectors of the basis are a root of the prior's covariance for a variance of one per channel.
     """
 
@@ -91,16 +88,9 @@ class FitStructure:
 
     @classmethod
     def per_baseline(cls, antennas: np.ndarray, n_antennas: int, basis: ForegroundBasis) -> FitStructure:
-        """Return the structure in which every baseline has a foreground model of its own (paper Eq. LOGLIKELIHOOD).
+        """Return the structure with one foreground model for every baseline (paper Eq. LOGLIKELIHOOD).
 
-        Parameters
-        ----------
-        antennas
-            Antenna indices (a, b) of each baseline, (Nbls, 2).
-        n_antennas
-            Number of antennas.
-        basis
-            The bases of Nbls models.
+        `antennas` are the antenna indices (a, b) of each baseline, (Nbls, 2); the basis has Nbls models.
         """
         n_baselines = len(antennas)
         return cls(antennas, n_antennas, basis, np.arange(n_baselines), np.zeros(n_baselines, bool))
@@ -122,16 +112,14 @@ class CalibrationProblem:
 
     Attributes
     ----------
-    structure
-        Antennas, baselines and foreground models.
     visibilities
-        Measured visibilities, shape (Nbls, Nfreqs), complex128, in the unit of the data (Jy). Values with zero weight
-        are set to zero, whatever they were, NaN included.
+        Measured visibilities, shape (Nbls, Nfreqs), complex128, in the unit of the data (Jy). Values with zero weight,
+        NaN included, are set to zero.
     weights
         Weights w of the likelihood, shape (Nbls, Nfreqs), float64, none negative; zero where flagged. The paper's are
         ``1 / (Nbls * Nfreqs)`` (see `flag_weights`).
     initial_gains
-        Where the solver starts, and the reference for the phase of the solution, shape (Nants, Nfreqs), complex128.
+        Start of the solver, and reference for the phase of the solution, shape (Nants, Nfreqs), complex128.
     sky_model
         Visibilities m whose weighted sum fixes the overall scale, shape (Nbls, Nfreqs); None for the measured
         visibilities divided by the initial gains.
@@ -143,9 +131,9 @@ class CalibrationProblem:
         Whether the foregrounds are the sky model, so that only gains are fitted. The scale is then known, and `prior`
         not used.
     deviations
-        Standard deviation per channel, in the unit of the data, of what the foregrounds' prior allows beside the sky
-        model: on each baseline by itself, and in common to those that share a model. Both count only where the
-        structure says so. The weights must be inverse variances then.
+        Standard deviation per channel of the foregrounds about the sky model, in the unit of the data: of each baseline
+        by itself, and common to those that share a model. The structure's prior selects which apply. The weights must
+        then be inverse variances.
     scale_weights
         Weights of the sums that fix the overall scale, like `weights`; None for those. They do not follow the gains.
 
@@ -199,7 +187,7 @@ class CalibrationProblem:
                 raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {wanted}")
 
     def _blank(self, name: str) -> None:
-        """Set a cube to zero where its weight is, complex128; what remains must be finite."""
+        """Set a cube to zero where its weight is zero, as complex128, and require finite values elsewhere."""
         values = np.where(self.weights > 0, getattr(self, name), 0).astype(np.complex128)
         if not np.isfinite(values).all():
             raise ValueError(f"{name}: not finite where the weight is not zero; flag those samples")
@@ -216,13 +204,7 @@ class CalibrationProblem:
         return None if self.structure.prior == "none" else self.sky_model
 
     def weighted_by(self, gains: np.ndarray) -> CalibrationProblem:
-        """Return the problem with its weights over |g_a g_b|^2, and the same sum of weights.
-
-        Parameters
-        ----------
-        gains
-            Complex, (Nants, Nfreqs).
-        """
+        """Divide the weights by |g_a g_b|^2 of gains (Nants, Nfreqs), and keep their sum."""
         weights = gain_weights(self.weights, gain_products(gains, self.structure.antennas))
         return replace(self, weights=weights, scale_weights=self.summing)
 
@@ -249,12 +231,9 @@ class CalibrationProblem:
 
 
 def fitted_baselines(frame: Frame, autos: bool) -> np.ndarray:
-    """Return which baselines are calibrated, bool, shape (Nbls,): all, or all but the autocorrelations.
+    """Return the mask of calibrated baselines, bool, shape (Nbls,): all, or all but the autocorrelations.
 
-    Raises
-    ------
-    InputError
-        If there are none; the message starts with the path of a setting where it is about one.
+    Raises InputError if there are none; a message about a setting starts with its path.
     """
     if autos and not frame.autos.any():
         raise InputError("autos: is true, but the data hold no autocorrelations")
@@ -264,22 +243,16 @@ def fitted_baselines(frame: Frame, autos: bool) -> np.ndarray:
 
 
 def flag_weights(flags: np.ndarray) -> np.ndarray:
-    """Return the paper's weights 1 / (Nbls Nfreqs), zero where flagged; shape of `flags`, (Nbls, Nfreqs), float64."""
+    """Return the paper's weights 1 / (Nbls Nfreqs), zero where flagged; flags are (Nbls, Nfreqs)."""
     return np.where(flags, 0.0, 1.0 / flags.size)
 
 
 def gain_weights(weights: np.ndarray, products: np.ndarray) -> np.ndarray:
     """Return weights over |g_a g_b|^2, with the same mean over baselines and channels.
 
-    |g_a g_b|^2 counts as at least a hundredth of its median: a sample whose gains a fit brings down to zero would have
-    all the weight, and keep them there.
-
-    Parameters
-    ----------
-    weights
-        As of unity gains, (..., Nbls, Nfreqs).
-    products
-        g_a g_b*, of the same shape; not zero where the weight is not.
+    |g_a g_b|^2 has a floor at a hundredth of its median: otherwise a sample whose gains a fit brings close to zero
+    would have all the weight, and keep them there. The weights of unity gains are (..., Nbls, Nfreqs); products g_a
+    g_b* have the same shape, and are not zero where the weight is not.
     """
     used = weights > 0
     power = np.where(used, np.abs(products) ** 2, np.nan)
@@ -293,15 +266,11 @@ def gain_weights(weights: np.ndarray, products: np.ndarray) -> np.ndarray:
 
 
 def weight_change(weights: np.ndarray, before: np.ndarray) -> float:
-    """Return how much weights changed in neighbouring channels against each other, relative, rms.
+    """Return the relative rms change of weights in neighbouring channels against each other.
 
-    Changes that are smooth in frequency carry no error of the foregrounds to other delays, and go on for as long as a
-    fit moves along gains that foregrounds can nearly follow.
-
-    Parameters
-    ----------
-    weights, before
-        (..., Nfreqs); samples without weight do not count.
+    Smooth changes in frequency are ignored: they carry no error of the foregrounds to other delays, and persist while a
+    fit moves along gains that foregrounds can nearly follow. Weights are (..., Nfreqs); samples of zero weight are left
+    out.
     """
     used = (before > 0) & (weights > 0)
     ratio = np.divide(weights, before, out=np.ones_like(weights), where=used)

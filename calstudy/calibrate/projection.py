@@ -1,22 +1,22 @@
-"""Elimination of the foregrounds: the best ones for given gains in closed form, and what is left for the gains.
+"""Elimination of the foregrounds: the best ones for given gains in closed form, and the reduced problem for the gains.
 
 For gains g and a baseline p = (a, b) write G_p = g_a g_b* and D_p = w_p |G_p|^2. With a Gaussian prior of mean m and
 covariance C on the foregrounds F, the fit minimizes
 
     sum w |V - G F|^2 + (F - m)^H C^-1 (F - m).
 
-C is known by its root: F_p = m_p + A_R (s z_R + t d_p) with vectors A_R of the model R of the baseline, coefficients
+C is given by its root: F_p = m_p + A_R (s z_R + t d_p) with vectors A_R of the model R of the baseline, coefficients
 z_R that the baselines of R share, and coefficients d_p of its own, all of unit variance, and deviations s and t. An
-infinite deviation is no prior at all: the foregrounds are A z, m does not matter, and A may be orthonormal (CALAMITY).
+infinite deviation is no prior at all: the foregrounds are A z, m has no effect, and A may be orthonormal (CALAMITY).
 
 The fit is linear least squares in z and d (variable projection, Golub & Pereyra 1973). With N_p = A^T D_p A, the own
-coefficients have the normal matrix t^2 N_p + 1. Putting their solution back leaves P_p = D_p - t^2 D_p A (t^2 N_p +
-1)^-1 A^T D_p in place of D_p for the shared ones, whose normal matrix is s^2 sum_p A^T P_p A + 1, and what is left for
-the gains is K in place of P, made in the same way. The gradient and the Gauss-Newton matrix for a relative change eta
-of the gains, g (1 + eta), are those of a fit with fixed foregrounds, but for K in place of D in the matrix.
+coefficients have the normal matrix t^2 N_p + 1. Inserting their solution replaces D_p by P_p = D_p - t^2 D_p A (t^2 N_p
++ 1)^-1 A^T D_p for the shared ones, whose normal matrix is s^2 sum_p A^T P_p A + 1. Inserting their solution in the
+same way replaces P by K for the gains. The gradient and the Gauss-Newton matrix for a relative change eta of the gains,
+g (1 + eta), are those of a fit with fixed foregrounds, with K in place of D in the matrix.
 
-Models m that have their coefficients in common count as one, whose channels are those of all of them, one after the
-other: N = sum_m A_m^T D_m A_m.
+Models m with common coefficients are treated as one, whose channels are those of all of them in sequence: N = sum_m
+A_m^T D_m A_m.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ FINITE_KERNEL_RIDGE = {tf.float32: 1e-6, tf.float64: 1e-12}
 
 
 class Roots(NamedTuple):
-    """How foregrounds answer a weighted change y of the visibilities: ``Q S^T S Q^T y``, with the span Q of a batch.
+    """Roots S of the foregrounds' response ``Q S^T S Q^T y`` to a weighted change y, with the span Q of a batch.
 
     Attributes
     ----------
     first
-        S of the models of a batch, or of its baselines if they have coefficients of their own besides the shared ones,
+        S of the models of a batch, or of its baselines if they have their own coefficients besides the shared ones,
         (N, Nvec, rank). Of a joint batch that of all members together, (1, Nvec, Nmembers * rank).
     shared
         S of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise.
@@ -61,16 +61,9 @@ class Roots(NamedTuple):
 
 
 class Linearization(NamedTuple):
-    """What the Gauss-Newton matrix has of some consecutive baselines, in the precision of the inner products.
+    """The contribution of consecutive baselines to the Gauss-Newton matrix, in the precision of the inner products.
 
-    Attributes
-    ----------
-    curvature
-        D, (Nbls, Nfreqs).
-    model
-        F, (2, Nbls, Nfreqs).
-    roots
-        Of each of their batches.
+    `curvature` is D, (Nbls, Nfreqs), `model` is F, (2, Nbls, Nfreqs), and `roots` are those of each batch.
     """
 
     curvature: tf.Tensor
@@ -86,11 +79,11 @@ class Projection(NamedTuple):
     loss
         sum w |V - G F|^2 at the best foregrounds, plus the squares of coefficients that have a prior; scalar, float64.
     model
-        F on the baselines, float64, of one stretch of them after the other, each (2, Nbls, Nfreqs).
+        F on the baselines of consecutive stretches, each (2, Nbls, Nfreqs), float64.
     descent
         Minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64.
     parts
-        Of the stretches.
+        Linearizations of the stretches.
     """
 
     loss: tf.Tensor
@@ -104,16 +97,9 @@ class Projection(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Consecutive batches whose baselines have their elementwise products made at once.
+    """Consecutive batches whose elementwise products on baselines are computed at once.
 
-    Attributes
-    ----------
-    baselines
-        First and one past the last, in the solvers' order.
-    ends
-        Their antennas.
-    pieces
-        The batches.
+    `baselines` are the first one and one past the last, in the solvers' order.
     """
 
     baselines: tuple[int, int]
@@ -130,23 +116,19 @@ class Projector:
 
     Parameters
     ----------
-    structure
-        Of the fit.
-    tensors
-        Its index tensors.
     dtype
-        Of the inner products of the iteration, for which float32 is enough but close to a minimum far below the data.
-        The loss, its gradient and N are always evaluated in float64: in float32 the scale of the gains drifts unseen.
+        Precision of the inner products of the iteration. float32 is enough, except close to a minimum far below the
+        data. The loss, its gradient and N are always evaluated in float64: in float32 the scale of the gains drifts.
     twice
-        Whether foregrounds answer once more to what is left of the residual, or of a change. Its rounding has a part
-        that they absorb, and gains that they can follow have derivatives below it. Without effect if the prior is
-        finite: they would answer to what is left as well, and such derivatives are larger.
+        Project the foregrounds out of the residual, or of a change, a second time. Its rounding has a part that they
+        absorb, and gains that they can follow have derivatives below it. Without effect if the prior is finite:
+        foregrounds would respond to the remaining residual as well, and such derivatives are larger.
 
     Attributes
     ----------
     stretches
-        The batches with their vectors. Of large fits each is worked on by itself, so that what it needs for a while
-        stays in the cache; others have their elementwise products made for all baselines at once, in fewer operations.
+        The batches with their vectors. In large fits each is processed by itself, so that its temporary arrays stay in
+        the cache; in others the elementwise products are computed for all baselines at once, in fewer operations.
     common
         Orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`.
     """
@@ -174,7 +156,7 @@ class Projector:
 
     @cached_property
     def _product_spans(self) -> list[tf.Tensor | None]:
-        """What the products of the span of each batch with the common basis span; None for batches of few baselines."""
+        """Spans of the products of each batch's span with the common basis; None for batches of few baselines."""
         found = []
         with tf.init_scope():
             for batch, span in zip(self.tensors.batches, self._spans, strict=True):
@@ -183,9 +165,9 @@ class Projector:
         return found
 
     def of_pieces(self, projection: Projection) -> Iterator[tuple[Piece, tf.Tensor | None, Linearization]]:
-        """Yield each batch, what the products of its span with the common basis span, and its part of a projection.
+        """Yield each batch, the span of the products of its span with the common basis, and its part of a projection.
 
-        The part has the roots of this batch alone.
+        The part has only the roots of this batch.
         """
         spans = iter(self._product_spans)
         for stretch, part in zip(self.stretches, projection.parts, strict=True):
@@ -195,14 +177,8 @@ class Projector:
     def _factor(self, normal: tf.Tensor, filled: np.ndarray) -> tuple[tf.Tensor, tf.Tensor]:
         """Return the Cholesky factors of N, and a root R of the kernel, N^-1 ~ R^T R; all (N, Nvec, Nvec).
 
-        With the ridge e and M = N + e, the kernel is M^-1 (1 + e M^-1). With a finite prior, N has its 1 already.
-
-        Parameters
-        ----------
-        normal
-            N, (N, Nvec, Nvec).
-        filled
-            See `calstudy.calibrate.batches.Vectors`.
+        With the ridge e and M = N + e, the kernel is M^-1 (1 + e M^-1). With a finite prior, N includes its 1 already.
+        For `filled` see `calstudy.calibrate.batches.Vectors`.
         """
         # Only diagonals change: whole matrices of ridges would go through the memory several times.
         diagonal = tf.linalg.diag_part(normal)
@@ -226,22 +202,16 @@ class Projector:
         mean: tf.Tensor | None = None,
         deviations: tf.Tensor | None = None,
     ) -> Projection:
-        """Return the projection at gains (2, Nants, Nfreqs).
+        """Project at gains (2, Nants, Nfreqs).
 
-        Parameters
-        ----------
-        visibilities, weights
-            (2, Nbls, Nfreqs) and (Nbls, Nfreqs).
-        mean
-            m, like the visibilities, if the prior is finite.
-        deviations
-            t of the baselines' own coefficients and s of the shared ones, (2,), if the prior is finite.
+        Visibilities are (2, Nbls, Nfreqs), weights (Nbls, Nfreqs). With a finite prior, `mean` is m, like the
+        visibilities, and `deviations` are t of the baselines' own coefficients and s of the shared ones, (2,).
         """
         found: list[Projection] = []
         for stretch in self.stretches:
             start, end = stretch.baselines
             data = visibilities[:, start:end], weights[start:end], None if mean is None else mean[:, start:end]
-            # Without this, all stretches would be worked on at once, and their temporaries add up.
+            # Without this, all stretches would be processed at once, and their temporaries add up.
             before = [tensor for tensor in tf.nest.flatten(found[-1:]) if tensor is not None]
             with tf.control_dependencies(before):
                 part = self._project_stretch(stretch, gains, data, deviations)
@@ -261,7 +231,7 @@ class Projector:
         data: tuple[tf.Tensor, tf.Tensor, tf.Tensor | None],
         deviations: tf.Tensor | None,
     ) -> Projection:
-        """Return what a stretch has of the projection, for its visibilities, weights and mean."""
+        """Return the part of a stretch in the projection, from its visibilities, weights and mean."""
         eliminate = self._eliminate_both if self._two_levels else self._eliminate_one
         visibilities, weights, mean = data
         curvature, matched = self._products.match(gains, stretch.ends, visibilities, weights, mean)
@@ -286,14 +256,9 @@ class Projector:
     def _eliminate_one(
         self, piece: Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
     ) -> tuple[tf.Tensor, tf.Tensor, Roots]:
-        """Return F - m on the baselines, the prior's share of the loss, and the roots, where a model has one kind.
+        """Eliminate one kind of coefficients; return F - m on the baselines, the prior's part of the loss, and roots.
 
-        Parameters
-        ----------
-        curvature, matched
-            D and G* w V - D m of its baselines.
-        deviations
-            See `_project`.
+        `curvature` and `matched` are D and G* w V - D m of the baselines of the batch; for `deviations` see `_project`.
         """
         owner, vectors = piece.owner, piece.vectors
         if owner is not None:
@@ -318,7 +283,7 @@ class Projector:
     def _eliminate_both(
         self, piece: Piece, curvature: tf.Tensor, matched: tf.Tensor, deviations: tf.Tensor | None
     ) -> tuple[tf.Tensor, tf.Tensor, Roots]:
-        """Return what `_eliminate_one` does, where baselines have coefficients of their own besides the shared ones."""
+        """Do the same as `_eliminate_one` for baselines with their own coefficients besides the shared ones."""
         vectors: Any = piece.own
         owner, (own, shared) = piece.owner, tf.unstack(deviations)
         normal, projected = vectors.normal(curvature), vectors.reduce(matched)
@@ -340,9 +305,9 @@ class Projector:
         return vectors.expand(mine + own * d), penalty, roots
 
     def _answer(self, stretch: Stretch, change: tf.Tensor, part: Linearization) -> tf.Tensor:
-        """Return how the foregrounds of a stretch answer a weighted change y of its visibilities, (2, Nbls, Nfreqs).
+        """Return the foregrounds' response of a stretch to a weighted change y of its visibilities, (2, Nbls, Nfreqs).
 
-        The product S^T S itself would not do in float32: where flags leave a foreground nearly undetermined it is
+        The product S^T S itself would not suffice in float32: where flags leave a foreground nearly undetermined it is
         large, and its rounding would be large for the others.
         """
         answers = []
@@ -370,12 +335,15 @@ class Projector:
         return self._over_stretches(self._hessian_part, eta, projection)
 
     def _hessian_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
-        """Return what a stretch has of `hessian_product`."""
+        """Return the part of a stretch in `hessian_product`."""
         change = self._products.change(eta, stretch.ends, part.curvature, part.model)
         return self._pulled(change, stretch, part)
 
     def _pulled(self, change: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
-        """Return F* (y - D x) of a weighted change y that foregrounds answer by x, by antenna, (2, Nants, Nfreqs)."""
+        """Return F* (y - D x) summed by antenna, (2, Nants, Nfreqs).
+
+        y is a weighted change, and x the response of the foregrounds.
+        """
         answer = self._answer(stretch, change, part)
         if self._twice:
             change -= part.curvature * answer
@@ -391,7 +359,7 @@ class Projector:
         return -self._over_stretches(self._second_derivative_part, eta, projection)
 
     def _second_derivative_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
-        """Return what a stretch has of minus `curvature_descent`."""
+        """Return the part of a stretch in minus `curvature_descent`."""
         ends, curvature, model = stretch.ends, part.curvature, part.model
         first = self._products.change(eta, ends, curvature, model)
         second = pairs.multiply(model, ends.relative_change(eta)) - 2 * self._answer(stretch, first, part)
@@ -403,7 +371,7 @@ class Projector:
         eta: tf.Tensor,
         projection: Projection,
     ) -> tf.Tensor:
-        """Return the sum over the stretches, which are worked on one after the other."""
+        """Sum a function over the stretches, one after the other."""
         sums: list[tf.Tensor] = []
         for stretch, part in zip(self.stretches, projection.parts, strict=True):
             with tf.control_dependencies(sums[-1:]):

@@ -1,4 +1,4 @@
-"""What a calibration gives back: gains, model and residual in standard formats, and how every solve went."""
+"""Results of a calibration: gains, model and residual in standard formats, and a record of every solve."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SolveRecord:
-    """How one solve went; fields without a word here as in `calstudy.calibrate.solution.Solution`.
+    """The record of one solve; other fields are as in `calstudy.calibrate.solution.Solution`.
 
     Attributes
     ----------
     integration
         Index of the first integration.
     n_integrations
-        How many consecutive ones were solved together.
+        Number of consecutive integrations that were solved together.
     time
         Julian date of the first.
     polarization
@@ -54,7 +54,7 @@ class SolveRecord:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Return everything but the full loss history, as plain JSON types."""
+        """Return all fields but the full loss history, as plain JSON types."""
         losses = self.loss_history
         return {
             "integration": self.integration,
@@ -80,13 +80,13 @@ class SolveRecord:
 
 
 def _number(value: float) -> float | None:
-    """Return a float that JSON can hold, None for what it cannot."""
+    """Return a float for JSON, None if it is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """What `calstudy.calibrate.execution.run_calibrator` returns.
+    """The result of `calstudy.calibrate.execution.run_calibrator`.
 
     Attributes
     ----------

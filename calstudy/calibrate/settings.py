@@ -134,12 +134,12 @@ class GainWeights(Section):
     )
 
     def unsettled(self, change: float) -> bool:
-        """Whether weights that changed by so much in the last pass are not those of the result."""
+        """Whether weights with this change in the last pass have not converged."""
         return self.passes > 1 and change > UNSETTLED * self.tolerance
 
 
 def unsettled_message(change: float, passes: int) -> str:
-    """Return what is said of a fit whose weights from its gains have not converged."""
+    """Return the message for a fit whose weights from its gains have not converged."""
     sentence = f"weights from the gains still changed by {change:.1e} in pass {passes}"
     return f"{sentence}, so that the first pass is the result" if change > RUNAWAY else sentence
 
@@ -192,7 +192,7 @@ class BaselineRange(Section):
         return self
 
     def factors(self, lengths: np.ndarray) -> np.ndarray:
-        """Return what the weights of baselines of some lengths, m, are multiplied by."""
+        """Return the factors on the weights of baselines of some lengths, m."""
         chosen = (lengths >= self.shortest) & (lengths <= (math.inf if self.longest is None else self.longest))
         taper = 1.0 if self.taper is None else np.exp(-((lengths / self.taper) ** 2) / 2)
         return chosen * taper
@@ -241,7 +241,7 @@ class JointBasisSettings(Section):
 
 
 def _deviation(value: Any) -> Any:
-    """Refuse what is no deviation in one sentence, where a union of types would have one for each."""
+    """Refuse an invalid deviation in one sentence, where a union of types would have one for each."""
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
         return float(value)
     if value != "infinite":
@@ -253,7 +253,7 @@ Deviation = Annotated[Annotated[float, Field(ge=0)] | Literal["infinite"], Befor
 
 
 class ForegroundPrior(Section):
-    """How far foregrounds may be from what is assumed: a Gaussian prior, flat over the modelled delays."""
+    """Gaussian prior on deviations of the foregrounds from the assumed ones, flat over the modelled delays."""
 
     mean: Literal["none", "sky-model"] = Field("none", description="What is assumed of the foregrounds.")
     deviation: Deviation = Field(
@@ -295,7 +295,7 @@ class ForegroundPrior(Section):
 
 
 class WeightedFit(Calibrator):
-    """What all calibrators have in common that fit gains to weighted visibilities."""
+    """Settings that all calibrators have in common that fit gains to weighted visibilities."""
 
     weights: Weights = GainWeights()
     baselines: BaselineRange | None = Field(
@@ -308,12 +308,9 @@ class WeightedFit(Calibrator):
         return self.weights.kind == "autos"
 
     def fitted(self, frame: Frame) -> Frame:
-        """Return the baselines of a frame that gains are fitted to.
+        """Select the baselines of a frame to which gains are fitted.
 
-        Raises
-        ------
-        InputError
-            If there are none; the message starts with the path of the setting.
+        Raises InputError if there are none; the message starts with the path of the setting.
         """
         if self.baselines is None:
             return frame
@@ -353,7 +350,7 @@ class GainFit(WeightedFit):
     @model_validator(mode="before")
     @classmethod
     def _complete_solver(cls, data: Any) -> Any:
-        """Fill in the fields of `solver` that are not given."""
+        """Fill in missing fields of `solver`."""
         given = data.get("solver") if isinstance(data, dict) else None
         preset = cls.model_fields["solver"].default
         if given == preset.name:
@@ -396,7 +393,7 @@ class ForegroundFit(GainFit):
     @model_validator(mode="before")
     @classmethod
     def _complete_prior(cls, data: Any) -> Any:
-        """Fill in the fields of `foreground_prior` that are not given."""
+        """Fill in missing fields of `foreground_prior`."""
         given = data.get("foreground_prior") if isinstance(data, dict) else None
         if not isinstance(given, dict):
             return data
@@ -416,7 +413,7 @@ class ForegroundFit(GainFit):
 
     @property
     def frozen(self) -> bool:
-        """Whether the prior leaves nothing but the sky model."""
+        """Whether the foregrounds are the sky model, because all deviations of the prior are zero."""
         return self.foreground_prior.deviation == 0 and self.foreground_prior.shared_deviation == 0
 
     @property

@@ -1,4 +1,4 @@
-"""Visibilities of the sky as far as it is known, from a file: brought to the samples and the order of the data."""
+"""Read visibilities of the known part of the sky from a file, and match them to samples and order of the data."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 def read_sky_model(path: Path, template: UVData) -> UVData:
-    """Return the visibilities of a file at the samples of an observation.
+    """Read visibilities, in Jy, at the samples of an observation.
 
     Parameters
     ----------
     path
-        A file in any format of visibilities that pyuvdata reads, in Jy. Antennas are told by their numbers;
-        their positions do not have to be those of the template.
+        A file in any format of visibilities that pyuvdata reads, in Jy. Antennas are matched by number; their positions
+        may differ from those of the template.
     template
         Metadata of the observation: rectangular, time-major, a drift scan.
 
@@ -62,31 +62,12 @@ def read_sky_model(path: Path, template: UVData) -> UVData:
 
 
 def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UVData, list[str]]:
-    """Return a prepared sky model and prepared data with the same baselines, and what was changed in words.
+    """Match a prepared sky model and prepared data in their baselines, and describe each change in one sentence.
 
     Cross-correlations that the sky model lacks are left out of the data. Autocorrelations that it lacks stay, with a
-    sky model of zero, unless they are to be fitted: weights may need them.
-
-    Parameters
-    ----------
-    sky, data
-        From `calstudy.measured.reading.prepare`; not changed.
-    autos
-        Whether autocorrelations are to be fitted.
-
-    Returns
-    -------
-    sky
-        With the samples of the data, in their order.
-    data
-        Perhaps without some baselines.
-    notes
-        One sentence for each thing that was left out.
-
-    Raises
-    ------
-    InputError
-        If no cross-correlation is in both, or as `match_sky_model`.
+    sky model of zero, unless they are fitted (`autos`): weights may need them. The inputs are from
+    `calstudy.measured.reading.prepare`, and not changed; the returned sky model has the samples of the returned data,
+    in their order. Raises InputError if no cross-correlation is in both, or as `match_sky_model`.
     """
     known = {frozenset(pair) for pair in zip(sky.ant_1_array.tolist(), sky.ant_2_array.tolist(), strict=True)}
     pairs = list(zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True))
@@ -111,12 +92,9 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
 
 
 def match_sky_model(sky: UVData, data: UVData) -> UVData:
-    """Return the part of a prepared sky model that belongs to prepared data, in their order.
+    """Select the samples of prepared data from a prepared sky model, in their order.
 
-    Raises
-    ------
-    InputError
-        If baselines, integrations, channels or polarizations of the data are missing from the sky model.
+    Raises InputError if baselines, integrations, channels or polarizations of the data are missing from the sky model.
     """
     sky = sky.copy()
     wanted = set(np.unique(data.baseline_array).tolist())

@@ -1,4 +1,4 @@
-"""Smooth gains in frequency and in time, after they were fitted in every channel and integration."""
+"""Smooth gains in frequency and time, after they were fitted in every channel and integration."""
 
 from __future__ import annotations
 
@@ -21,26 +21,11 @@ SECONDS_PER_DAY = 86400.0
 def smooth(
     gains: np.ndarray, flags: np.ndarray, data: Observation, numbers: np.ndarray, settings: Smoothing
 ) -> np.ndarray:
-    """Return smooth gains; flagged ones have no influence and are left alone.
+    """Smooth gains, (Nants, Nfreqs, Ntimes, Npols); flagged ones have no influence and stay as they are.
 
-    Parameters
-    ----------
-    gains
-        Complex, (Nants, Nfreqs, Ntimes, Npols).
-    flags
-        bool, likewise.
-    data
-        Whose channels and integrations these are.
-    numbers
-        Of the antennas, (Nants,).
-    settings
-        How they are smoothed.
-
-    Raises
-    ------
-    InputError
-        If the reference antenna has no gains, channels or integrations are not even where they must be, or there are
-        too few integrations.
+    Channels and integrations are those of `data`; `numbers` are those of the antennas, (Nants,). Raises InputError if
+    the reference antenna has no gains, if channels or integrations are not even where they must be, or if there are too
+    few integrations.
     """
     values = np.where(flags, 0, gains)
     if settings.reference_antenna is not None:
@@ -87,7 +72,7 @@ def _polynomials(x: np.ndarray, degree: int | None) -> np.ndarray | None:
 
 
 def _sequences(x: np.ndarray, scale: float | None, noun: str) -> np.ndarray | None:
-    """Return sequences whose Fourier transform is concentrated within 1 / scale; None if that is all of them."""
+    """Return sequences whose Fourier transform is concentrated within 1 / scale; None if they span everything."""
     if scale is None or x.size < 2:
         return None
     try:
@@ -103,16 +88,10 @@ def _sequences(x: np.ndarray, scale: float | None, noun: str) -> np.ndarray | No
 def fit(
     values: np.ndarray, used: np.ndarray, in_frequency: np.ndarray | None, in_time: np.ndarray | None
 ) -> np.ndarray:
-    """Return the least-squares fit of products of functions of frequency and of time to what is used.
+    """Fit products of functions of frequency and of time to the used values in least squares.
 
-    Parameters
-    ----------
-    values
-        Complex, (Nfreqs, Ntimes).
-    used
-        bool, likewise.
-    in_frequency, in_time
-        Orthonormal columns, (Nfreqs, Nf) and (Ntimes, Nt). None: each channel, or integration, is fitted by itself.
+    `values` are complex, (Nfreqs, Ntimes), and `used` is bool, of the same shape. Functions are orthonormal columns,
+    (Nfreqs, Nf) and (Ntimes, Nt); with None, each channel or integration is fitted by itself.
     """
     if in_frequency is None and in_time is None:
         return values
@@ -128,10 +107,10 @@ def fit(
 
 
 def _weighted(values: np.ndarray, used: np.ndarray, functions: np.ndarray) -> np.ndarray:
-    """Return the fit of functions (N, Nfunctions) to those values (N,) that are used."""
+    """Fit functions (N, Nfunctions) to the used values (N,)."""
     if not used.any():
         return values
-    # Of functions that the used samples cannot tell apart, the shortest combination is taken.
+    # Functions that are degenerate on the used samples get the combination of minimum norm.
     normal = functions[used].T @ functions[used]
     return functions @ (
         np.linalg.pinv(normal, rcond=EIGENVALUE_CUTOFF, hermitian=True) @ (functions[used].T @ values[used])
@@ -139,7 +118,7 @@ def _weighted(values: np.ndarray, used: np.ndarray, functions: np.ndarray) -> np
 
 
 def _smooth_cal(gains: np.ndarray, flags: np.ndarray, data: Observation, settings: SmoothCal) -> np.ndarray:
-    """Return gains (Ntimes, Nfreqs) as hera_cal smooths them."""
+    """Smooth gains (Ntimes, Nfreqs) as hera_cal does."""
     from hera_cal.smooth_cal import time_freq_2D_filter
 
     with warnings.catch_warnings(), np.errstate(all="ignore"):

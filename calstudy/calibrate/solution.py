@@ -1,4 +1,4 @@
-"""What a solve gives back."""
+"""The solution of one solve."""
 
 from __future__ import annotations
 
@@ -27,21 +27,19 @@ class Solution:
         none; ``skipped`` if there were no data to fit.
     message
         One sentence on why it stopped.
-    n_steps
-        Steps taken.
     seconds
         Wall time.
     cpu_seconds
-        Processor time of this process over the same time, all threads together; on a GPU likewise that of the process.
+        Processor time of this process over the same time, all threads together, also for solves on a GPU.
     newton_decrement
-        Relative Newton decrement, which says how far from the minimum the iteration stopped: the decrease of the loss
-        that one more Gauss-Newton step is predicted to bring, d^T H^-1 d with the descent direction d and the
-        Gauss-Newton matrix H (lambda^2 / 2 of Boyd & Vandenberghe 2004, section 9.5), over the loss. NaN if there is no
-        estimate. To first order the residual still holds this fraction of its own power because the iteration stopped,
-        orthogonal to the residual at the minimum.
+        Relative Newton decrement, a measure of the distance from the minimum: the decrease of the loss that one more
+        Gauss-Newton step is predicted to bring, d^T H^-1 d with the descent direction d and the Gauss-Newton matrix H
+        (lambda^2 / 2 of Boyd & Vandenberghe 2004, section 9.5), over the loss. NaN if there is no estimate. To first
+        order, this fraction of the power of the residual is due to the early end of the iteration, and orthogonal to
+        the residual at the minimum.
     decrement_rms
         Root mean square of that part of the calibrated residual R, in the unit of the data; NaN likewise. Two solves
-        that stop alike have it in common, and their cross power rises by up to its square.
+        that stop at the same point have it in common, and their cross power rises by up to its square.
     """
 
     gains: np.ndarray
@@ -57,5 +55,5 @@ class Solution:
 
     @property
     def usable(self) -> bool:
-        """Whether gains and model are an estimate at all."""
+        """Whether gains and model are a usable estimate."""
         return self.status in USABLE

@@ -1,4 +1,4 @@
-"""Gains, models and residuals in standard formats: UVCal and UVData."""
+"""Convert gains, models and residuals to standard formats: UVCal and UVData."""
 
 from __future__ import annotations
 
@@ -24,14 +24,7 @@ def require_parallel_hands(data: UVData) -> None:
 def make_gains(data: UVData, numbers: np.ndarray, gains: np.ndarray, flags: np.ndarray) -> UVCal:
     """Return gains as a UVCal object for the whole telescope; antennas without data are flagged, with unit gains.
 
-    Parameters
-    ----------
-    data
-        The visibilities that the gains belong to.
-    numbers
-        Antenna number of each row of the gains, shape (Nants,).
-    gains, flags
-        Shape (Nants, Nfreqs, Ntimes, Npols), dimensionless complex and bool.
+    `numbers` are the antenna numbers of the rows, (Nants,). Gains and flags are (Nants, Nfreqs, Ntimes, Npols).
     """
     known = data.telescope.antenna_numbers
     rows = {int(number): row for row, number in enumerate(known)}
@@ -43,17 +36,7 @@ def make_gains(data: UVData, numbers: np.ndarray, gains: np.ndarray, flags: np.n
 
 
 def make_visibilities(data: UVData, cube: np.ndarray, flags: np.ndarray) -> UVData:
-    """Return a copy of `data` that holds other visibilities and flags.
-
-    Parameters
-    ----------
-    data
-        Gives everything else.
-    cube
-        Visibilities in its unit, (Ntimes, Nbls, Nfreqs, Npols), complex.
-    flags
-        Of the same shape, bool.
-    """
+    """Return a copy of `data` with other visibilities and flags, (Ntimes, Nbls, Nfreqs, Npols)."""
     result = from_cube(data, cube)
     result.flag_array = flags.reshape(result.data_array.shape)
     return result

@@ -1,9 +1,9 @@
-"""Where a solve starts: unity, gains from a file, or redundant calibration by hera_cal's firstcal and logcal.
+"""Starting points of a solve: unity, gains from a file, or redundant calibration by hera_cal's firstcal and logcal.
 
-Redundant baselines see the same sky, so that the ratios of their visibilities are ratios of gains (Liu et al. 2010). A
-delay and a phase for each antenna (firstcal) brings phases within reach of the logarithm, in which the equations are
-linear (logcal). What redundancy cannot know, amplitude, phase and phase gradients of the whole array, is set to unity,
-or left as firstcal has it.
+Redundant baselines measure the same sky, so that the ratios of their visibilities are ratios of gains (Liu et al.
+2010). A delay and a phase for each antenna (firstcal) bring phases within reach of the logarithm, in which the
+equations are linear (logcal). Redundancy does not determine amplitude, phase and phase gradients of the whole array.
+These are set to unity, or stay as firstcal has them.
 """
 
 from __future__ import annotations
@@ -24,20 +24,10 @@ POL = "nn"
 
 
 def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
-    """Return the gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
+    """Return the gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols); unity if `gains` is None.
 
-    Parameters
-    ----------
-    data
-        The visibilities.
-    gains
-        Unity if None. Of several integrations the closest in time is taken; flagged, zero and infinite gains count as
-        unity.
-
-    Raises
-    ------
-    InputError
-        If an antenna, channel or polarization of the data has no gain, or the gains are delays.
+    Of several integrations the closest in time is used; flagged, zero and infinite gains are replaced by unity. Raises
+    InputError if an antenna, channel or polarization of the data has no gain, or if the gains are delays.
     """
     if gains is None:
         return np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
@@ -51,27 +41,11 @@ def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
 
 
 def redundant_start(data: Observation, weights: np.ndarray, settings: RedundantStart, tolerance: float) -> np.ndarray:
-    """Return gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
+    """Solve redundant baselines for gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
 
-    Parameters
-    ----------
-    data
-        The visibilities; autocorrelations are not used.
-    weights
-        (Ntimes, Nbls, Nfreqs, Npols); samples of weight zero have no influence.
-    settings
-        Whether delays are fitted first.
-    tolerance
-        Baselines that differ by less than this, in m, are redundant.
-
-    Returns
-    -------
-    Unity for antennas that are in no redundant baseline, and where the solution is not finite.
-
-    Raises
-    ------
-    InputError
-        If no two baselines are redundant.
+    Autocorrelations and samples of weight zero, (Ntimes, Nbls, Nfreqs, Npols), have no influence. Baselines that differ
+    by less than `tolerance`, in m, are redundant. Gains are unity for antennas without redundant baselines, and where
+    the solution is not finite. Raises InputError if no two baselines are redundant.
     """
     pairs, cube = data.pairs, data.visibilities
     groups = redundant_groups(data.vectors, tolerance)
@@ -89,7 +63,7 @@ def redundant_start(data: Observation, weights: np.ndarray, settings: RedundantS
     gains = np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
     for p in range(data.n_polarizations):
         used = {keys[row]: weights[:, row, :, p] for row in keys}
-        # The logarithm must see no zeros, even where they do not count.
+        # The logarithm must not be taken of zeros, even where the weight is zero.
         visibilities = {
             keys[row]: np.where(used[keys[row]] > 0, np.conj(cube[:, row, :, p]) if back else cube[:, row, :, p], 1)
             for row, back in turned.items()
@@ -108,14 +82,14 @@ def _solve(
     frequency: np.ndarray,
     delays: bool,
 ) -> dict[int, np.ndarray]:
-    """Return the gains (Ntimes, Nfreqs) of every antenna that is in a redundant baseline."""
+    """Solve for the gains (Ntimes, Nfreqs) of every antenna with redundant baselines."""
     from hera_cal.datacontainer import DataContainer
     from hera_cal.redcal import RedundantCalibrator
 
     calibrator = RedundantCalibrator(reds)
     data = DataContainer(visibilities)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # Channels without data make singular equations; what comes of them is replaced by unity.
+        # Channels without data make singular equations; their gains are replaced by unity.
         warnings.simplefilter("ignore")
         first = calibrator.firstcal(data, frequency)[1].gains if delays else {}
         # Degeneracies are fixed where phases are small: elsewhere they may jump by a lattice's worth between channels.

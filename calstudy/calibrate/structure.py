@@ -1,4 +1,4 @@
-"""From visibilities and settings to the structure of a fit."""
+"""Build the structure of a fit from baselines and settings."""
 
 from __future__ import annotations
 
@@ -19,17 +19,8 @@ def make_structure(frame: Frame, settings: GainFit) -> FitStructure:
     """Return the structure of the fit of one integration; its antennas are those of the frame.
 
     A redundant group is modelled with the basis of its longest baseline; baselines of a joint group belong to no other.
-
-    Parameters
-    ----------
-    frame, settings
-        Baselines that are fitted, and how.
-
-    Raises
-    ------
-    InputError
-        If the basis does not fit into the channels (see `calstudy.calibrate.basis.make_basis`), or joint groups cannot
-        be read or do not fit the data (see `calstudy.calibrate.joint.place_groups`).
+    Raises InputError if the basis does not fit into the channels (see `calstudy.calibrate.basis.make_basis`), or if
+    joint groups cannot be read or do not fit the data (see `calstudy.calibrate.joint.place_groups`).
     """
     if isinstance(settings, ForegroundFit) and not settings.frozen:
         structure = _foregrounds(frame, settings)
@@ -76,7 +67,7 @@ def _modelled(frame: Frame, chosen: np.ndarray, settings: ForegroundFit) -> FitS
 def _with_joint(
     frame: Frame, rest: FitStructure | None, others: np.ndarray, placed: Sequence[PlacedGroup]
 ) -> FitStructure:
-    """Return the structure of joint groups, and of the other baselines as they are in `rest`, None without any."""
+    """Add joint groups to the structure of the other baselines, `rest`, which is None if there are none."""
     groups, conjugated = np.empty(frame.n_baselines, int), np.zeros(frame.n_baselines, bool)
     buckets: list[Bucket] = []
     n_models = 0
@@ -93,13 +84,13 @@ def _with_joint(
 
 
 def _no_basis(n_models: int, n_frequencies: int) -> ForegroundBasis:
-    """Return a basis for frozen foregrounds, which have no coefficients to fit: a constant, never used."""
+    """Return a placeholder basis, a constant, for frozen foregrounds, which have no coefficients to fit."""
     constant = np.full((n_frequencies, 1), n_frequencies**-0.5)
     return ForegroundBasis((Bucket(0.0, np.arange(n_models), constant),), n_models, n_frequencies)
 
 
 def repeat_structure(structure: FitStructure, count: int) -> FitStructure:
-    """Return the structure of `count` integrations that share their gains, and each have foregrounds of their own.
+    """Return the structure of `count` integrations that share their gains, and have their own foregrounds each.
 
     Baselines and models of the first integration come first, then those of the second, and so on.
     """

@@ -1,4 +1,4 @@
-"""Synthetic integrations of the paper's problem, made in seconds: point sources, random gains, thermal noise."""
+"""Small synthetic integrations of the paper's problem: point sources, random gains, thermal noise."""
 
 from __future__ import annotations
 
@@ -17,12 +17,10 @@ SOURCES = 150
 
 @dataclass(frozen=True)
 class Case:
-    """How large a problem is.
+    """Size and noise of a synthetic problem.
 
     Attributes
     ----------
-    antennas, channels
-        Their numbers.
     extent
         Diameter of a random array, m.
     first, band
@@ -53,21 +51,8 @@ class Case:
 class Simulation:
     """Array, sky and gains of a case.
 
-    Parameters
-    ----------
-    case
-        What is simulated.
-    positions
-        East, north, up of the antennas in m, (Nants, 3); by default at random within `case.extent`.
-
-    Attributes
-    ----------
-    positions
-        East, north, up in m, (Nants, 3).
-    antennas
-        Baselines as pairs of antenna indices, (Nbls, 2).
-    gains
-        True gains, constant in time, (Nants, Nfreqs).
+    Positions are east, north, up of the antennas in m, (Nants, 3), by default at random within `case.extent`. Baselines
+    are pairs of antenna indices, (Nbls, 2); true gains are constant in time, (Nants, Nfreqs).
     """
 
     def __init__(self, case: Case, positions: np.ndarray | None = None) -> None:
@@ -87,7 +72,7 @@ class Simulation:
         return FitStructure.per_baseline(self.antennas, self.case.antennas, found)
 
     def foregrounds(self, integration: int) -> np.ndarray:
-        """Return the foregrounds F of one integration under the drifting sky, (Nbls, Nfreqs), complex."""
+        """Simulate the foregrounds F of one integration under the drifting sky, (Nbls, Nfreqs), complex."""
         angle = SIDEREAL_RATE * self.case.integration * integration
         east = self._east + angle * np.sqrt(np.maximum(1 - self._east**2 - self._north**2, 0))
         up = np.sqrt(np.maximum(1 - east**2 - self._north**2, 0))
@@ -103,7 +88,7 @@ class Simulation:
         return result
 
     def problem(self, integration: int, structure: FitStructure, realization: int = 0) -> CalibrationProblem:
-        """Return the problem of one integration with one realization of the noise, from unity gains.
+        """Return the problem of one integration with one realization of the noise, starting from unity gains.
 
         The EoR is white in frequency, independent by baseline, and the same in all integrations.
         """
@@ -120,7 +105,7 @@ class Simulation:
 
 
 def _disc(case: Case, rng: np.random.Generator) -> np.ndarray:
-    """Return antennas at random in a flat disc, (Nants, 3), m."""
+    """Draw antennas in a flat disc, (Nants, 3), m."""
     radius = case.extent / 2 * np.sqrt(rng.uniform(0, 1, case.antennas))
     angle = rng.uniform(0, 2 * np.pi, case.antennas)
     # The longest baseline is between two antennas at the rim.
@@ -133,6 +118,6 @@ def _complex_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndar
 
 
 def _sky(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return direction cosines and flux densities of sources that do not set."""
+    """Draw direction cosines and flux densities of sources that do not set."""
     radius, angle = 0.98 * np.sqrt(rng.uniform(0, 1, SOURCES)), rng.uniform(0, 2 * np.pi, SOURCES)
     return radius * np.cos(angle), radius * np.sin(angle), rng.pareto(1.5, SOURCES) + 1

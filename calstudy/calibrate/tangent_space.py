@@ -1,4 +1,4 @@
-"""The tangent space of a fit at its solution: what gains and foregrounds can do to a small change of the data."""
+"""The tangent space of a fit at its solution: the response of gains and foregrounds to a small change of the data."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
 
-# Singular values of weighted sequences below this, relative to the largest, belong to what flags left undetermined; the
+# Singular values of weighted sequences below this, relative to the largest, are those that flags left undetermined; the
 # solvers' ridge on their squares is the square of it.
 SPAN_CUTOFF = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What the foregrounds of some baselines absorb of a whitened change y: own own^T y + common common^T y.
+    """The part of a whitened change y that foregrounds of some baselines absorb: own own^T y + common common^T y.
 
     Attributes
     ----------
     members
-        The baselines.
+        Indices of the baselines.
     common
         Sequences on all of them together, (Nmembers, Nfreqs, Nvec), real; orthonormal unless there is a finite prior.
     own
@@ -33,11 +33,11 @@ class Response:
 
     @property
     def sequences(self) -> np.ndarray:
-        """Those of each baseline by itself and the common ones, (Nmembers, Nfreqs, Nall)."""
+        """Sequences of each baseline by itself, then the common ones, (Nmembers, Nfreqs, Nall)."""
         return self.common if self.own is None else np.concatenate([self.own, self.common], axis=2)
 
     def absorb(self, rows: np.ndarray) -> np.ndarray:
-        """Return what is absorbed of changes of the members, (Nmembers, Nfreqs, ...)."""
+        """Return the absorbed part of changes of the members, (Nmembers, Nfreqs, ...)."""
         flat = rows.reshape(*rows.shape[:2], -1)
         found = self.common @ np.einsum("pfv,pfc->vc", self.common, flat, optimize=True)
         if self.own is not None:
@@ -54,11 +54,11 @@ class TangentSpace:
     roots
         Square root of D, (Nbls, Nfreqs).
     slope
-        sqrt(D) F: what a relative change of a gain does to the baseline, (Nbls, Nfreqs), complex.
+        sqrt(D) F, the derivative of a baseline in a relative change of a gain, (Nbls, Nfreqs), complex.
     conjugated
-        Baselines that see the conjugate of their model, (Nbls,) bool.
+        Baselines that have the conjugate of their model, (Nbls,) bool.
     responses
-        Of the foregrounds: one for each model, or joint bucket of models.
+        Responses of the foregrounds, one for each model or joint bucket of models.
     finite
         Whether the foregrounds have a finite prior.
     """
@@ -71,15 +71,7 @@ class TangentSpace:
 
     @classmethod
     def at(cls, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) -> TangentSpace:
-        """Return the tangent space at a solution.
-
-        Parameters
-        ----------
-        problem
-            What was fitted.
-        gains, model
-            The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-        """
+        """Return the tangent space at a solution, gains (Nants, Nfreqs) and model (Nbls, Nfreqs)."""
         structure = problem.structure
         curvature = problem.weights * np.abs(gain_products(gains, structure.antennas)) ** 2
         roots = np.sqrt(curvature)
@@ -108,14 +100,8 @@ class TangentSpace:
 def _response(problem: CalibrationProblem, members: np.ndarray, roots: np.ndarray, vectors: np.ndarray) -> Response:
     """Return the response of one foreground model, with the sequences (Nfreqs, Nvec), on its baselines.
 
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    members, roots
-        The baselines, and square root of D on them, (Nmembers, Nfreqs).
-    vectors
-        For coefficients of unit variance, in units of the prior's deviation, if it is finite.
+    `roots` is the square root of D on the members, (Nmembers, Nfreqs). With a finite prior, the vectors are for
+    coefficients of unit variance, in units of the prior's deviation.
     """
     prior, (own, shared) = problem.structure.prior, problem.deviations
     if prior == "none":

@@ -1,8 +1,8 @@
-"""From the structure of a fit to TensorFlow: index tensors, and the moves between antennas, baselines and models.
+"""Index tensors of the structure of a fit, and sums and copies between antennas, baselines and models.
 
 Inside the solvers, baselines are sorted by foreground model and models by bucket, so that each bucket is a slice. A
-baseline that sees the conjugate of its model is turned around: its antennas swap and its visibility is conjugated, and
-nothing after that needs to know.
+baseline that has the conjugate of its model is reversed: its antennas are swapped and its visibility is conjugated.
+Later operations do not depend on the orientation.
 """
 
 from __future__ import annotations
@@ -22,14 +22,8 @@ from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 class SortedData(NamedTuple):
     """The data of one problem, in the solvers' order and orientation.
 
-    Attributes
-    ----------
-    visibilities
-        Shape (2, Nbls, Nfreqs), divided by `scale`.
-    weights
-        Shape (Nbls, Nfreqs), as in the problem.
-    scale
-        Weighted rms of the problem's visibilities, in their unit.
+    Visibilities, (2, Nbls, Nfreqs), are divided by their weighted rms, `scale`; weights, (Nbls, Nfreqs), are as in the
+    problem.
     """
 
     visibilities: tf.Tensor
@@ -44,7 +38,7 @@ class Ends(NamedTuple):
     second: tf.Tensor
 
     def slice(self, start: int, end: int) -> Ends:
-        """Return those of a range of baselines."""
+        """Return the antennas of a range of baselines."""
         return Ends(self.first[start:end], self.second[start:end])
 
     def gain_products(self, gains: tf.Tensor) -> tf.Tensor:
@@ -77,8 +71,6 @@ class FitTensors:
 
     Attributes
     ----------
-    ends
-        Antennas of each baseline.
     shared
         Whether any baselines share a model.
     model_index
@@ -90,10 +82,10 @@ class FitTensors:
     bases
         Basis of each bucket, shape (Nfreqs, Nvec), or (Nmodels, Nfreqs, Nvec) if it is joint, float64 arrays.
     batches
-        The models in pieces that are worked on one after the other: what a piece needs for a while bounds the memory,
-        and what has to be compiled grows with their number.
+        Batches of models that are processed one after the other: the temporary arrays of one batch bound the memory,
+        and the size of compiled graphs grows with the number of batches.
     orientation
-        1, or -1 for baselines that were turned around, shape (Nbls, 1); None if there are none.
+        1, or -1 for reversed baselines, shape (Nbls, 1); None if there are none.
     """
 
     def __init__(self, structure: FitStructure) -> None:
@@ -137,14 +129,7 @@ class FitTensors:
     def load_model(self, model: np.ndarray, scale: float, dtype: tf.DType) -> tf.Tensor:
         """Return a model as a tensor in the solvers' order and orientation, (2, Nbls, Nfreqs); the inverse of `unload`.
 
-        Parameters
-        ----------
-        model
-            On the problem's baselines, (Nbls, Nfreqs), complex, in the unit of the data.
-        scale
-            What it is divided by, in that unit.
-        dtype
-            Of the tensor.
+        The model, (Nbls, Nfreqs), and `scale`, by which it is divided, are in the unit of the data.
         """
         values = model[self._order] / scale
         return pairs.to_pair(np.where(self._conjugated[:, None], values.conj(), values), dtype)
@@ -152,7 +137,7 @@ class FitTensors:
     def unload(self, model: Sequence[tf.Tensor], scale: float) -> np.ndarray:
         """Return a model in the problem's order and orientation, (Nbls, Nfreqs), times `scale`.
 
-        It is given in parts that follow each other, each (2, N, Nfreqs).
+        The parts of the model follow each other, and are (2, N, Nfreqs) each.
         """
         sorted_model = scale * np.concatenate([pairs.to_complex(part) for part in model])
         result = np.empty_like(sorted_model)
@@ -169,11 +154,11 @@ class FitTensors:
         return int(self._baseline_edges[model]), int(self._baseline_edges[model + 1])
 
     def of_models(self, values: tf.Tensor) -> tf.Tensor:
-        """Return what the first baseline of each model has: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
+        """Select the first baseline of each model: (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs)."""
         return values if self.model_index is None else tf.gather(values, self._baseline_edges[:-1], axis=1)
 
     def to_baselines(self, model: tf.Tensor) -> tf.Tensor:
-        """Give each baseline its model: (2, Nmodels, Nfreqs) to (2, Nbls, Nfreqs)."""
+        """Copy each model to its baselines: (2, Nmodels, Nfreqs) to (2, Nbls, Nfreqs)."""
         return model if self.model_index is None else tf.gather(model, self.model_index, axis=1)
 
     def sum_over_group(self, values: tf.Tensor) -> tf.Tensor:
@@ -181,7 +166,7 @@ class FitTensors:
         return values if self.model_index is None else tf.math.segment_sum(values, self.model_index)
 
     def sum_pairs_over_group(self, values: tf.Tensor) -> tf.Tensor:
-        """`sum_over_group` for (2, Nbls, Nfreqs)."""
+        """Apply `sum_over_group` to values of shape (2, Nbls, Nfreqs)."""
         if self.model_index is None:
             return values
         return tf.stack([self.sum_over_group(part) for part in tf.unstack(values)])

@@ -14,16 +14,9 @@ from calstudy.calibrate.solvers.reduced import newton_decrement_at
 
 
 class Checkpoint(NamedTuple):
-    """An estimate on the way.
+    """An intermediate estimate: gains (Nants, Nfreqs) and model (Nbls, Nfreqs), complex128, with degeneracies fixed.
 
-    Attributes
-    ----------
-    n_steps
-        Steps taken.
-    gains, model
-        Shapes (Nants, Nfreqs) and (Nbls, Nfreqs), complex128, degeneracies fixed.
-    newton_decrement, decrement_rms
-        How far from the minimum, as in `calstudy.calibrate.solution.Solution`.
+    The decrements are as in `calstudy.calibrate.solution.Solution`.
     """
 
     n_steps: int
@@ -34,22 +27,11 @@ class Checkpoint(NamedTuple):
 
 
 def trace(problem: CalibrationProblem, solver: Solver, steps: Sequence[int]) -> list[Checkpoint]:
-    """Run a solver to its end, and return its estimates after given numbers of steps, and at the end.
+    """Run a solver from the problem's initial gains, and return its estimates after given numbers of steps.
 
-    Parameters
-    ----------
-    problem
-        What is fitted, from its initial gains.
-    solver
-        Any solver. One that takes several steps at once gives its estimate when it has taken as many or more;
-        `Checkpoint.n_steps` says how many.
-    steps
-        Numbers of steps.
-
-    Raises
-    ------
-    ValueError
-        If an estimate has no positive scale (see `calstudy.calibrate.degeneracy.model_scale`).
+    The last estimate is that at the end of the solve. A solver that takes several steps at once gives its estimate
+    after as many steps or more; `Checkpoint.n_steps` is their number. Raises ValueError if an estimate has no positive
+    scale (see `calstudy.calibrate.degeneracy.model_scale`).
     """
     state = solver.init(problem)
     due = sorted(set(steps))

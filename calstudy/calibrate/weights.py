@@ -1,9 +1,9 @@
 """Weights of the likelihood: inverse variances from gains or autocorrelations, sample counts, flags, or a file.
 
 Noise that is received with the sky is multiplied by the gains as the sky is, so that the variance of a visibility is
-proportional to |g_a g_b|^2. With weights that do not follow it, errors of the foregrounds that are smooth in frequency
-become errors of the gains that have the structure of |g_a g_b|^2 in frequency: with gains that are white in frequency
-they are white, and at all delays.
+proportional to |g_a g_b|^2. With other weights, errors of the foregrounds that are smooth in frequency become errors of
+the gains with the spectral structure of |g_a g_b|^2: with gains that are white in frequency they are white, and at all
+delays.
 """
 
 from __future__ import annotations
@@ -27,25 +27,11 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     """Return the weight of every sample, zero where flagged or where an antenna was off (`dead_samples`).
 
     In each integration and polarization their mean over unflagged samples is that of the paper, 1 / (Nbls Nfreqs).
+    Weights from gains are those of unity gains; the solves change them. They are float64, (Ntimes, Nfitted, Nfreqs,
+    Npols), for the baselines of the mask `fitted`, (Nbls,); the data include autocorrelations where weights need them.
 
-    Parameters
-    ----------
-    data
-        Visibilities, autocorrelations included where they are needed.
-    fitted
-        Which baselines are calibrated, bool, shape (Nbls,).
-    settings
-        Where weights come from. Those from gains are those of unity gains; the solves change them.
-
-    Returns
-    -------
-    ndarray, float64, (Ntimes, Nfitted, Nfreqs, Npols)
-
-    Raises
-    ------
-    InputError
-        If sample counts are negative or not finite, autocorrelations are asked for and missing, or a file does not fit
-        the data or holds weights that are complex, negative or not finite.
+    Raises InputError if sample counts are negative or not finite, if autocorrelations are needed and missing, or if a
+    file does not fit the data or has weights that are complex, negative or not finite.
     """
     used = ~data.flags[:, fitted] & ~dead_samples(data, fitted)
     if settings.kind == "nsamples":
@@ -70,26 +56,14 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
 def inverse_variances(
     data: Observation, fitted: np.ndarray, weights: np.ndarray, settings: ForegroundFit, noise: float | None
 ) -> np.ndarray:
-    """Return the weights times a factor for each integration and polarization that makes them 1 / sigma^2 in the mean.
+    """Scale weights in each integration and polarization so that their mean is that of 1 / sigma^2.
 
-    Samples of zero weight do not count.
+    Samples of zero weight do not count. Weights are as from `make_weights`, (Ntimes, Nfitted, Nfreqs, Npols). sigma is
+    `settings.foreground_prior.noise`, or else `noise` (see `calstudy.calibrate.interface.Assumed`). Without either,
+    weights from autocorrelations use the radiometer equation, sigma^2 = V_aa V_bb / (channel width x integration time x
+    nsamples).
 
-    Parameters
-    ----------
-    data, fitted
-        As for `make_weights`.
-    weights
-        What that returns, (Ntimes, Nfitted, Nfreqs, Npols).
-    settings
-        Whose `foreground_prior.noise` comes first.
-    noise
-        What is known of it otherwise (see `calstudy.calibrate.interface.Assumed`); None: the radiometer equation,
-        sigma^2 = V_aa V_bb / (channel width x integration time x nsamples), for weights from autocorrelations.
-
-    Raises
-    ------
-    InputError
-        If nothing says what the noise is, or it is zero.
+    Raises InputError if the noise is unknown or zero.
     """
     used = weights > 0
     sigma = settings.foreground_prior.noise or noise

@@ -1,4 +1,4 @@
-"""What the calibrator takes for granted: the sky and the instrument of an experiment, with some fields changed."""
+"""The assumptions of the calibrator: the sky and the instrument of an experiment, with some fields changed."""
 
 from __future__ import annotations
 
@@ -23,23 +23,20 @@ OF_THE_DATA = ("channels", "times", "polarizations")
 
 
 class AssumedWorld(Section):
-    """The sky and the instrument as the calibrator takes them to be."""
+    """The sky and the instrument that the calibrator assumes."""
 
     sky: SkySettings
     instrument: InstrumentSettings
 
 
 def assumed_changes(assumed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what `calibration.assumed` says as one dotted path for each value.
+    """Return the changes of `calibration.assumed` as one dotted path for each value.
 
-    A block without `kind` stands for its fields, so that ``sky: {foregrounds: {count: 3}}`` is
+    A block without `kind` is split into its fields, so that ``sky: {foregrounds: {count: 3}}`` is
     ``sky.foregrounds.count: 3``; a block with a `kind` is a value, and so is an empty one.
 
-    Raises
-    ------
-    ExperimentError
-        With one sentence per fault: a path that is not of the sky or the instrument, or is given twice, or a file of
-        visibilities besides other changes.
+    Raises ExperimentError, with one sentence per fault, for a path that is not of the sky or the instrument or is given
+    twice, and for a file of visibilities besides other changes.
     """
     found: dict[str, Any] = {}
     faults = []
@@ -75,20 +72,11 @@ def _flat(block: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]
 def assumed_world(experiment: Experiment, folder: Path | None = None) -> AssumedWorld:
     """Return the sky and the instrument from which the sky model of the calibrator is simulated.
 
-    The instrument is the nominal one, with changes: what `instrument.as_built` says is known to nobody.
+    The instrument is the nominal one, with changes: no calibrator knows `instrument.as_built`. A file of visibilities
+    in `calibration.assumed` changes neither. Relative paths of plug-ins start at `folder`.
 
-    Parameters
-    ----------
-    experiment
-        Its sky and instrument are the truth; a file of visibilities in `calibration.assumed` changes neither.
-    folder
-        Where relative paths of plug-ins start.
-
-    Raises
-    ------
-    ExperimentError
-        With one sentence per fault: see `assumed_changes`, fields that do not exist or hold what is not allowed, and
-        channels, times or polarizations that are not those of the data.
+    Raises ExperimentError, with one sentence per fault: see `assumed_changes`; fields that do not exist or have invalid
+    values; and channels, times or polarizations that are not those of the data.
     """
     changes = {path: value for path, value in assumed_changes(experiment.calibration.assumed).items() if "." in path}
     if not changes:

@@ -1,4 +1,4 @@
-"""Read experiment files: scales and overrides, validation, and the files that they name."""
+"""Read experiment files: scales and overrides, validation, and input files."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from calstudy.instrument.size import antenna_count
 from calstudy.sky.settings import SkySettings
 
 TAGS = {"solver": "name", "calibration": CALIBRATORS.tag}
-"""What a bare string stands for, where a block may be written as one; elsewhere its `kind`."""
+"""Field that a bare string sets, where a block may be written as a string; elsewhere its `kind`."""
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """Split ``path=value`` as given to --set; the value is read as YAML."""
+    """Split ``path=value`` of the option --set; the value is read as YAML."""
     path, equals, value = text.partition("=")
     if not equals or not path.strip():
         raise InputError(f"--set {text}: write a dotted path and a value, such as --set instrument.times.count=8")
@@ -37,19 +37,10 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
-    """Return a copy of `data` with the field at the dotted path set to `value`.
+    """Return a copy of `data`, the content of an experiment file, with the field at the dotted path set to `value`.
 
-    Items of a list are counted from 0: ``corruption.effects.0.sigma``. A list that the data do not have starts as the
+    Items of a list are counted from 0: ``corruption.effects.0.sigma``. A list that is missing in the data starts as the
     default of an experiment. Keys of the data may themselves be dotted paths, as those of ``calibration.assumed`` are.
-
-    Parameters
-    ----------
-    data
-        Content of an experiment file; not changed.
-    path
-        Names of nested fields and places in lists, joined by dots.
-    value
-        Any JSON-able value.
     """
     result = deepcopy(dict(data))
     block: dict | list = result
@@ -74,7 +65,7 @@ def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
 
 
 def _split(block: dict | list, steps: list[str]) -> tuple[str, list[str]]:
-    """Split the steps of a path after the first; or, where a block has a dotted key of several steps, after them."""
+    """Split a path after its first step, or, where a block has a dotted key of several steps, after these."""
     if isinstance(block, dict):
         for count in range(len(steps), 1, -1):
             if ".".join(steps[:count]) in block:
@@ -83,7 +74,7 @@ def _split(block: dict | list, steps: list[str]) -> tuple[str, list[str]]:
 
 
 def _key(block: dict | list, step: str, path: str) -> Any:
-    """Return the key of a block, or the place in a list, that a step of a dotted path means."""
+    """Return the key of a block, or the index in a list, for a step of a dotted path."""
     if isinstance(block, dict):
         return step
     if not step.isdigit() or int(step) >= len(block):
@@ -133,7 +124,7 @@ def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
 
 
 def _require_scales(data: Mapping[str, Any], base: Path) -> None:
-    """Raise ExperimentError if a scale that the file defines, asked for or not, sets what cannot be set."""
+    """Raise ExperimentError if any scale of the file, selected or not, has invalid overrides."""
     scales = data.get("scales")
     if not isinstance(scales, dict):
         return
@@ -141,7 +132,7 @@ def _require_scales(data: Mapping[str, Any], base: Path) -> None:
     try:
         Experiment.model_validate(data, context={"folder": base})
     except ValidationError:
-        return  # The faults of the file itself are told first.
+        return  # The faults of the file itself are reported first.
     for name in [name for name, changes in scales.items() if isinstance(changes, dict)]:
         try:
             changed = apply_scale(data, name)
@@ -155,7 +146,7 @@ def _require_scales(data: Mapping[str, Any], base: Path) -> None:
 
 
 def input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, BaseModel, str]]:
-    """Yield (dotted path, block, field) of every input file that the experiment names."""
+    """Yield (dotted path, block, field) of every input file of the experiment."""
     for field in type(section).model_fields:
         value, path = getattr(section, field), f"{prefix}{field}"
         if isinstance(value, BaseModel) and field != "outputs":
@@ -169,9 +160,9 @@ def input_files(section: BaseModel, prefix: str = "") -> Iterator[tuple[str, Bas
 
 
 def expand_user(path: Path, field: str) -> Path:
-    """Replace a leading ~ by the home folder; raises InputError, naming the field, if there is no such user.
+    """Replace a leading ~ by the home folder.
 
-    Or if no file can have this name.
+    Raises InputError, with the field, if there is no such user, or if no file can have this name.
     """
     if "\0" in str(path):
         raise InputError(f"{field} = {str(path)!r}: no file can have this name")
@@ -182,7 +173,7 @@ def expand_user(path: Path, field: str) -> Path:
 
 
 def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> Experiment:
-    """Make the paths of input files absolute, relative ones from `base`, and check that they can be read."""
+    """Make the paths of input files absolute, relative to `base`, and check that the files can be read."""
     resolved = _absolute(data, experiment, experiment.sky, base)
     resolved_experiment = Experiment.model_validate(resolved, context={"folder": base})
     _require_function(resolved_experiment.sky)
@@ -196,20 +187,10 @@ def _resolve_files(data: dict[str, Any], experiment: Experiment, base: Path) -> 
 def _absolute(
     data: dict[str, Any], section: BaseModel, sky: SkySettings, base: Path, prefix: str = ""
 ) -> dict[str, Any]:
-    """Return data with absolute paths of input files; raises ExperimentError if one is not there.
+    """Return plain values with absolute paths of input files; raises ExperimentError if one is missing.
 
-    Parameters
-    ----------
-    data
-        Plain values.
-    section
-        The same, validated.
-    sky
-        The sky that belongs to it.
-    base
-        Where relative paths start.
-    prefix
-        Path of the section in the experiment file, with a dot at the end, or empty.
+    `section` are the same values, validated, and `sky` is the sky that belongs to them. Relative paths start at `base`.
+    `prefix` is the path of the section in the experiment file, with a dot at the end, or empty.
     """
     faults, resolved = [], data
     if sky.foregrounds.kind == "gleam" and sky.foregrounds.path is None:
@@ -235,7 +216,7 @@ def _absolute(
 
 
 def _missing(field: str, given: Any, file: Path, folder: bool = False) -> list[str]:
-    """Return a sentence if a file, or a folder, that a field names is not there or cannot be looked at."""
+    """Return a sentence if a file, or a folder, of a field is missing or cannot be accessed."""
     try:
         found = file.is_dir() if folder else file.is_file()
     except OSError as error:
@@ -255,7 +236,7 @@ def _require_function(sky: SkySettings, prefix: str = "") -> None:
 def _require_known_antennas(
     instrument: InstrumentSettings, named: Mapping[str, Sequence[int]], prefix: str = ""
 ) -> None:
-    """Raise ExperimentError if `named`, or a set of antennas with another beam, names one that is not there."""
+    """Raise ExperimentError if `named`, or a set of antennas with another beam, has an antenna that does not exist."""
     count = antenna_count(instrument.layout)
     groups = {
         f"{prefix}instrument.antenna_beams.{name}.antennas": group.antennas
@@ -280,7 +261,7 @@ def _require_known_antennas(
 
 
 def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
-    """Check what the calibrator assumes, and make the paths of input files in it absolute."""
+    """Check the assumptions of the calibrator, and make the paths of input files in them absolute."""
     changes = assumed_changes(experiment.calibration.assumed)
     if not changes:
         return experiment
@@ -304,17 +285,8 @@ def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
 def validate(data: Mapping[str, Any], base: Path) -> Experiment:
     """Validate the content of an experiment file.
 
-    Parameters
-    ----------
-    data
-        Plain dictionaries, lists, strings and numbers.
-    base
-        Folder from which relative paths of input files are taken.
-
-    Raises
-    ------
-    ExperimentError
-        With one sentence per fault: the field's dotted path, the value, what is allowed.
+    Relative paths of input files start at the folder `base`. Raises ExperimentError with one sentence per fault: the
+    field's dotted path, the value, and the allowed values.
     """
     plain = dict(data)
     try:
@@ -341,7 +313,7 @@ def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) ->
     InputError
         If the file cannot be read or an override cannot be applied.
     ExperimentError
-        If fields are unknown, missing, or hold values that are not allowed.
+        If fields are unknown or missing, or have invalid values.
     """
     path = Path(path)
     content = read_mapping(path)
@@ -355,5 +327,5 @@ def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) ->
 
 
 def dump(experiment: Experiment) -> str:
-    """Return the resolved experiment as YAML that `load` reads back to the same experiment."""
+    """Return the resolved experiment as YAML; `load` reads it back to the same experiment."""
     return yaml.safe_dump(experiment.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)

@@ -1,4 +1,4 @@
-"""Turn pydantic's errors into sentences that name the field's dotted path, the value, and what is allowed."""
+"""Convert pydantic's errors to sentences with the field's dotted path, the value, and the allowed values."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ BOUNDS = {
     "less_than": ("less than", "lt"),
     "less_than_equal": ("at most", "le"),
 }
-"""Words of a bound, and where its value is."""
+"""Words of a bound, and the key of its value."""
 PREFIXED = ("Hz", "s", "m")
 PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "u", 1e-9: "n"}
 
 
 def _members(annotation: Any) -> list[Any]:
-    """Unpack Annotated and unions into the plain types they allow."""
+    """Unpack Annotated and unions into the plain types that they allow."""
     if get_origin(annotation) is Annotated:
         return _members(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
@@ -47,7 +47,7 @@ def _members(annotation: Any) -> list[Any]:
 
 
 def _items(annotation: Any) -> list[Any]:
-    """Return what the items of a block or a list may be, or nothing for anything else."""
+    """Return the types of the items of a block or a list, or nothing for any other type."""
     position = {dict: 1, tuple: 0}.get(get_origin(annotation))
     return [] if position is None else _members(get_args(annotation)[position])
 
@@ -61,7 +61,7 @@ def _tags(model: type[BaseModel]) -> list[str]:
 
 
 def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
-    """Follow a pydantic location; return the dotted path as written in the file, and the block that holds its end.
+    """Follow a pydantic location; return the dotted path as written in the file, and the block of its last step.
 
     Pydantic puts the tag of a chosen block into the location, where the file has no key for it.
     """
@@ -85,7 +85,7 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
 
 
 def _written(data: Any, path: str) -> str:
-    """Return how the value at the dotted path reads in the file."""
+    """Return the value at the dotted path as the file has it."""
     for step in path.split("."):
         if isinstance(data, dict) and step in data:
             data = data[step]
@@ -99,7 +99,7 @@ def _written(data: Any, path: str) -> str:
 
 
 def _unit(holder: type[BaseModel] | None, field: int | str) -> str:
-    """Return the unit in which a field's bounds are, or an empty string."""
+    """Return the unit of a field's bounds, or an empty string."""
     info = holder.model_fields.get(str(field)) if holder else None
     extra = info.json_schema_extra if info else None
     return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
@@ -141,7 +141,7 @@ def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:
 
 
 def _wanted(error: Any, holder: type[BaseModel] | None) -> str:
-    """Return what a value should have been."""
+    """Return the requirement that a value does not meet."""
     kind, context = error["type"], error.get("ctx", {})
     if kind == "literal_error":
         allowed = [word.strip(" '") for word in context["expected"].replace(" or ", ", ").split(",")]
@@ -177,15 +177,9 @@ def _all(error: ValidationError, root: type[BaseModel], data: Any, prefix: str) 
 
 
 def sentences(error: ValidationError, root: type[BaseModel], data: Any) -> list[str]:
-    """Return one sentence per fault that pydantic found in `data`, in the file's own terms.
+    """Return one sentence per fault that pydantic found in `data`, in terms of the file.
 
-    Parameters
-    ----------
-    error
-        What validating `data` against `root` raised.
-    root
-        The model of the whole file.
-    data
-        The file's content as plain dictionaries and lists.
+    `error` is from validating `data`, the file's content as plain dictionaries and lists, with `root`, the model of the
+    whole file.
     """
     return list(dict.fromkeys(_all(error, root, data, "")))

@@ -1,4 +1,4 @@
-"""What one experiment file says."""
+"""The content of an experiment file."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 class Refusing(Protocol):
-    """What an experiment asks of its figures, which are `calstudy.figures.StudyFigure`."""
+    """The interface of an experiment to its figures, which are `calstudy.figures.StudyFigure`."""
 
     def refusal(self, experiment: Experiment) -> str | None:
-        """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
+        """Return why the figure cannot be drawn for an experiment, to follow its name, or None."""
 
 
 class Variant(Section):
@@ -79,7 +79,7 @@ Pair = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 
 class Inspection(Section):
-    """What the figures of single gains and baselines show; antennas are counted from 0 in the order of the layout."""
+    """Content of the figures of single gains and baselines; antennas are counted from 0 in the order of the layout."""
 
     antennas: Pair = Field((0, 1), description="Two antennas; the model and data figures show their baseline.")
     integration: int = Field(0, ge=0, description="Counted from 0.")
@@ -90,7 +90,7 @@ class Inspection(Section):
 
     @property
     def pairs(self) -> tuple[tuple[int, int], ...]:
-        """All pairs of antennas that are named."""
+        """All named pairs of antennas."""
         return (self.antennas, *(self.baselines or ()))
 
     @model_validator(mode="after")
@@ -108,7 +108,7 @@ def _followed_solvers() -> dict[str, Solver]:
 
 
 class Convergence(Section):
-    """What the figure `convergence` follows: how much of the foregrounds solvers leave after so many steps."""
+    """Settings of the figure `convergence`: the foregrounds that solvers leave after given numbers of steps."""
 
     integrations: int = Field(3, ge=1, description="How many, spread over the run; each is solved from the start.")
     solvers: Annotated[dict[str, Solver], Field(min_length=1, max_length=5)] = Field(
@@ -121,7 +121,7 @@ class Convergence(Section):
 
 
 class Outputs(Section):
-    """What is drawn, and where products and run folders go."""
+    """Figures, and the folders of products and runs."""
 
     figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] = Field(
         default_factory=lambda: tuple(FIGURES.make(name) for name in DEFAULT_FIGURES),
@@ -142,7 +142,7 @@ def _as_list(blocks: Any) -> Any:
 
 
 class RealizationBlock(Section):
-    """Realizations of an experiment, which differ in the seeds of what is drawn; the first is the experiment itself."""
+    """Realizations of an experiment, which differ in the seeds of random parts; the first is the experiment itself."""
 
     draw: Annotated[tuple[Literal["eor", "gains", "noise"], ...], Field(strict=False)] = Field(
         ("eor", "gains", "noise"), description="What is drawn again in every realization; the rest is common to all."
@@ -168,7 +168,7 @@ StudyName = Annotated[str, AfterValidator(_usable_name), Field(description="Name
 
 
 class Experiment(Section):
-    """One study: an instrument, a sky, what corrupts the data, the calibration under test, and what is measured."""
+    """One study: instrument, sky, corruption of the data, calibration under test, and measured quantities."""
 
     name: StudyName
     description: str = ""
@@ -253,7 +253,7 @@ class Experiment(Section):
 
     @property
     def measures_signal_loss(self) -> bool:
-        """Whether data are calibrated with the EoR and without, all else equal, so that its loss can be measured."""
+        """Whether data are calibrated with and without the EoR, all else equal, so that its loss can be measured."""
         residual, without, eor = (self.variants.get(name) for name in SIGNAL_LOSS_VARIANTS)
         if residual is None or without is None or eor is None:
             return False

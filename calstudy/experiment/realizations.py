@@ -12,21 +12,16 @@ from calstudy.corrupt.settings import NoNoise
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
 
 PARTS = ("eor", "gains", "noise")
-"""What can be drawn again."""
+"""Parts that can be drawn again."""
 SEED_STEP = 10
-"""Draw number n, counted from 0, of a part has n times this added to its seeds in the experiment."""
+"""Draw number n of a part, counted from 0, adds n times this to its seeds in the experiment."""
 
 
 @dataclass(frozen=True)
 class Realization:
-    """One realization.
+    """One realization: an experiment with the seeds of its draws and without `realizations`.
 
-    Attributes
-    ----------
-    draws
-        Number of the draw of each of `PARTS`, counted from 0; 0 has the seeds of the experiment.
-    experiment
-        With the seeds of these draws and without `realizations`.
+    `draws` are the numbers of the draws of each of `PARTS`, counted from 0; 0 has the seeds of the experiment.
     """
 
     draws: Mapping[str, int]
@@ -34,20 +29,16 @@ class Realization:
 
     @property
     def label(self) -> str:
-        """What is drawn anew, such as ``gains 3, noise 3``, counted from 1; ``base`` for the experiment itself."""
+        """Parts that are drawn again, such as ``gains 3, noise 3``, counted from 1; ``base`` for the experiment."""
         return ", ".join(f"{part} {number + 1}" for part, number in self.draws.items() if number) or "base"
 
 
 def expand_realizations(experiment: Experiment) -> list[Realization]:
     """Return the realizations of all blocks, each once: first the experiment itself, then those of block after block.
 
-    Raises
-    ------
-    InputError
-        If the experiment has no realizations.
-    ExperimentError
-        With one sentence per fault: a sweep besides, variants without signal loss, parts that cannot be drawn, are
-        drawn in two blocks, or whose seeds would coincide.
+    Raises InputError if the experiment has no realizations, and ExperimentError, with one sentence per fault, for a
+    sweep besides, variants without signal loss, and parts that cannot be drawn, are drawn in two blocks, or whose seeds
+    would coincide.
     """
     blocks = experiment.realizations
     if not blocks:
@@ -57,7 +48,7 @@ def expand_realizations(experiment: Experiment) -> list[Realization]:
         raise ExperimentError(faults)
     base = experiment.reset("realizations", "scales")
     found = [Realization(dict.fromkeys(PARTS, 0), base)]
-    # Besides the experiment itself, only what the pooled quantities are made of is needed.
+    # Besides the experiment itself, only the variants of the pooled quantities are needed.
     lean = base.model_copy(update={"variants": {name: base.variants[name] for name in SIGNAL_LOSS_VARIANTS}})
     for block in blocks:
         for number in range(1, block.count):
@@ -67,7 +58,7 @@ def expand_realizations(experiment: Experiment) -> list[Realization]:
 
 
 def members(experiment: Experiment) -> list[list[int]]:
-    """Return, for each block, which of the realizations of `expand_realizations` belong to it; the first is in all."""
+    """Return the indices of each block's realizations in `expand_realizations`; the first is in all blocks."""
     found, first = [], 1
     for block in experiment.realizations:
         found.append([0, *range(first, first + block.count - 1)])
@@ -148,6 +139,6 @@ def _coinciding_seeds(experiment: Experiment) -> list[str]:
 
 
 def described(draw: Sequence[str]) -> str:
-    """Write what a block draws: ``EoR, gains and noise``."""
+    """Describe the draws of a block: ``EoR, gains and noise``."""
     *others, last = ["EoR" if part == "eor" else part for part in draw]
     return f"{', '.join(others)} and {last}" if others else last

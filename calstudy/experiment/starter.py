@@ -1,4 +1,4 @@
-"""The file with which a user begins: a small experiment, with comments on what can be changed."""
+"""The initial file of a user: a small experiment, with comments on possible changes."""
 
 from __future__ import annotations
 
@@ -97,18 +97,9 @@ SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: f
 
 @dataclass(frozen=True)
 class DataSet:
-    """What a new file says of measured data.
+    """Entries of a new file on measured data: path as it is written, a sentence, and the ends of the band.
 
-    Attributes
-    ----------
-    path
-        As it is to be written.
-    summary
-        A sentence.
-    first, last
-        Ends of the band.
-    in_jansky
-        Whether they are in Jy.
+    `in_jansky` is true for data in Jy.
     """
 
     path: str
@@ -119,22 +110,7 @@ class DataSet:
 
 
 def observed_text(name: str, schema: Path, data: DataSet, beam: str) -> str:
-    """Return the text of a file about measured data.
-
-    Parameters
-    ----------
-    name, schema
-        As for `starter_text`.
-    data
-        What it says of the data.
-    beam
-        Name of the beam.
-
-    Raises
-    ------
-    InputError
-        If the name cannot be one.
-    """
+    """Return the text of a file about measured data, with the name of a beam; see `starter_text`."""
     _require_name(name)
     scale = "# " + SCALE if data.in_jansky else SCALE
     values = {"summary": data.summary, "path": data.path, "first": data.first, "last": data.last}
@@ -142,26 +118,16 @@ def observed_text(name: str, schema: Path, data: DataSet, beam: str) -> str:
 
 
 def starter_text(name: str, schema: Path) -> str:
-    """Return the text of an experiment file.
+    """Return the text of an experiment file with the path of the JSON schema, for editors.
 
-    Parameters
-    ----------
-    name
-        Of the experiment.
-    schema
-        File of the JSON schema, for editors.
-
-    Raises
-    ------
-    InputError
-        If the name cannot be one.
+    Raises InputError if the name is not allowed.
     """
     _require_name(name)
     return f"{MODELINE}{schema}\n{TEXT.format(name=name)}"
 
 
 def copy_text(example: str, name: str, schema: Path) -> str:
-    """Return the text of a published experiment under another name; parameters and errors as `starter_text`."""
+    """Return the text of a published experiment under another name; see `starter_text`."""
     _require_name(name)
     path = find_experiment(Path(example))
     if {"experiments", "calibrators"} & set(read_mapping(path)):

@@ -1,4 +1,4 @@
-"""YAML as experiment files are written in it: no duplicate keys, no numbers that readers take for others."""
+"""Read the YAML of experiment files, without duplicate keys and ambiguous numbers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
 def _whole_number(loader: _Loader, node: yaml.ScalarNode) -> int:
-    """Read a whole number; refuse what YAML 1.1 and a reader take for different numbers."""
+    """Read a whole number; refuse texts that YAML 1.1 and a reader take for different numbers."""
     text = str(node.value)
     number = int(loader.construct_yaml_int(node))
     if OCTAL.fullmatch(text):
@@ -90,7 +90,7 @@ def _problem(error: yaml.MarkedYAMLError) -> str:
 
 
 def read_mapping(path: Path, example: str = "name: quickstart") -> dict[str, Any]:
-    """Read a YAML file that must hold a block of keys, such as the example; raises InputError if it cannot."""
+    """Read a YAML file with a block of keys, such as the example; raises InputError for any other file."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:

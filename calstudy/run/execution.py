@@ -1,4 +1,4 @@
-"""Run the tasks of an experiment that are not done yet, as a dask graph, on this machine or on a cluster."""
+"""Make the missing products of an experiment as a dask graph, on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 BEGUN, WAITS = "begun", "waits"
-"""Topics under which workers report to the scheduler what they begin to make, and for whose lock they wait."""
+"""Topics under which workers report to the scheduler the products that they begin, and their waits for locks."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Which tasks of a run must be made, and which products are there already.
+    """Tasks that a run must make, and products that exist already.
 
     Attributes
     ----------
     todo
         Tasks to make, every one after its inputs.
     ready
-        Products that the run needs and that are intact.
+        Intact products that the run needs, by key.
     damaged
-        Tasks whose product was there, but not as it was written; they are in `todo`.
+        Tasks whose product is damaged; they are in `todo`.
     again
-        Keys of intact products of other code that are to be made again; their tasks are in `todo`.
+        Keys of intact products of other code that are made again; their tasks are in `todo`.
     """
 
     todo: tuple[Task, ...]
@@ -57,14 +57,9 @@ class Schedule:
 class Workers:
     """The processes that make the products.
 
-    Attributes
-    ----------
-    count
-        Worker processes to start on this machine; with one, the work is done in this process.
-    log
-        File to which worker processes of this machine append what they write to standard error.
-    scheduler
-        Address of a running dask scheduler whose workers to use instead, or None.
+    `count` worker processes are started on this machine; with one, the work is done in this process. They append their
+    standard error to the file `log`. `scheduler` is the address of a running dask scheduler whose workers are used
+    instead, or None.
     """
 
     count: int
@@ -73,24 +68,16 @@ class Workers:
 
 
 def found_of(tasks: Iterable[Task], store: Store) -> dict[str, Product]:
-    """Return the products of tasks that are in a store, by key, without reading their files."""
+    """Return the existing products of tasks by key, without reading their files."""
     products = {task.key: store.find(task.stage.name, task.key) for task in tasks}
     return {key: product for key, product in products.items() if product is not None}
 
 
 def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False) -> Schedule:
-    """Find out what must be made: the targets and what they need, as far as it is not in the store, intact.
+    """Find the tasks to make: the targets and all that they need, unless the store has them intact.
 
-    Parameters
-    ----------
-    targets
-        What is wanted.
-    store
-        Where it is looked for.
-    given
-        Keys of products that will be there.
-    strict
-        Whether products that are of other code or other versions of packages are made again.
+    Products with keys in `given` are not made. With `strict`, products of other code or other versions of packages are
+    made again.
     """
     other: Container[str] = ()
     if strict:
@@ -122,14 +109,14 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
 
 
 def _write_errors_to(path: Path) -> None:
-    """Append what this process and its libraries write to standard error to a file from now on."""
+    """Append the standard error of this process and its libraries to a file from now on."""
     with path.open("a") as file:
         os.dup2(file.fileno(), 2)
 
 
 @contextmanager
 def _errors_written_to(path: Path) -> Iterator[None]:
-    """Append what is written to standard error within the block to a file."""
+    """Append the standard error within the block to a file."""
     sys.stderr.flush()
     kept = os.dup(2)
     try:
@@ -153,7 +140,7 @@ def _set_up_worker(log: Path) -> None:
 
 @contextmanager
 def _local_client(workers: int, log: Path) -> Iterator[Client]:
-    """Start workers on this machine: a thread of this process if there is one, else processes that share the cores."""
+    """Start workers on this machine: one thread of this process, or several processes that share the cores."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -202,7 +189,7 @@ def _client(workers: Workers) -> Iterator[Client]:
 
 
 def _announce_and_perform(order: WorkOrder) -> Product:
-    """Tell the scheduler, which outlives this process, what this worker begins to make; and make it."""
+    """Report to the scheduler, which outlives this process, the product that this worker begins, and make it."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -211,16 +198,16 @@ def _announce_and_perform(order: WorkOrder) -> Product:
 
 
 def _last_begun(client: Client, worker: str) -> str | None:
-    """Return what a worker that died was making, if word of it had reached the scheduler."""
+    """Return the product that a dead worker was making, if the worker had reported it."""
     begun = [event["product"] for _, event in client.get_events(BEGUN) or () if event["worker"] == worker]
     return begun[-1] if begun else None
 
 
 class _Queue:
-    """Hands tasks to the workers, each once all that it needs is made.
+    """Submits tasks to the workers, each once all its inputs are made.
 
-    The scheduler knows of no dependencies. If a worker dies, what it was making is made again, but not what it had made
-    before: products are files, and temporary ones may have been dropped.
+    The scheduler does not know the dependencies. If a worker dies, its current product is made again, but not its
+    earlier ones: products are files, and temporary ones may have been removed.
     """
 
     def __init__(self, tasks: Sequence[Task], store: Store, client: Client, again: Container[str]) -> None:
@@ -236,11 +223,11 @@ class _Queue:
                 self._users[needed].append(key)
 
     def first(self) -> dict[Future, Task]:
-        """Submit the tasks that need nothing."""
+        """Submit the tasks without missing inputs."""
         return self._submit(key for key, missing in self._missing.items() if not missing)
 
     def after(self, task: Task) -> dict[Future, Task]:
-        """Submit the tasks that needed nothing but this one any more."""
+        """Submit the tasks for which this one was the last missing input."""
         users = self._users[task.key]
         for key in users:
             self._missing[key].discard(task.key)
@@ -267,32 +254,14 @@ def execute(
     told: Callable[[str], None] = logger.warning,
     again: Container[str] = (),
 ) -> dict[str, Product]:
-    """Make the products of `tasks`, which are in an order that respects their inputs.
+    """Make the products of `tasks`, and return them by key.
 
-    Parameters
-    ----------
-    tasks
-        From `schedule`.
-    store
-        Where they go; on a file system that all workers share.
-    workers
-        Who does the work.
-    done
-        Called after each product.
-    told
-        Called with a sentence for each wait for the lock of another run.
-    again
-        Keys of products that are made even if they are there.
+    Tasks are from `schedule`, ordered so that each follows its inputs. The store is on a file system that all workers
+    share. `done` is called after each product, and `told` with a sentence for each wait for the lock of another run.
+    Products with keys in `again` are made even if they exist.
 
-    Returns
-    -------
-    dict
-        The products by key.
-
-    Raises
-    ------
-    InputError
-        If the scheduler cannot be reached or is lost, a worker dies repeatedly, or a stage refuses its input.
+    Raises InputError if the scheduler cannot be reached or is lost, a worker dies repeatedly, or a stage refuses its
+    input.
     """
     products: dict[str, Product] = {}
     if not tasks:
@@ -323,7 +292,7 @@ def execute(
                     f"{where}the dask scheduler was lost before {task.stage.name} ({task.label}) was made; run again: "
                     "finished products are kept"
                 ) from None
-            # The client would have a result that it holds computed again if its worker dies.
+            # Otherwise the client would compute this result again if its worker dies.
             future.release()
             products[task.key] = product
             started = queue.after(task)
@@ -336,7 +305,7 @@ def execute(
 def _execute_here(
     tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None], again: Container[str]
 ) -> dict[str, Product]:
-    """Make products one after the other in the main thread, where MPI may be used."""
+    """Make products in sequence in the main thread, where MPI may be used."""
     products = {}
     for task in tasks:
         products[task.key] = perform(WorkOrder.of(task, store, task.key in again))
@@ -345,14 +314,9 @@ def _execute_here(
 
 
 class Lifetimes:
-    """How long each temporary product of a run is needed: until the last task that needs it is made.
+    """Lifetimes of the temporary products of a run: until the last task that needs them is made.
 
-    Parameters
-    ----------
-    targets
-        What the run is for. A product is temporary if all tasks that make it say so.
-    todo
-        The tasks that the run makes, from `schedule`.
+    A product is temporary if all tasks of the targets that make it are; `todo` are the tasks from `schedule`.
     """
 
     def __init__(self, targets: Iterable[Task], todo: Sequence[Task]) -> None:
@@ -368,11 +332,11 @@ class Lifetimes:
         return {needed.key for needed in task.needs.values()} & self._temporary.keys()
 
     def unused(self) -> list[Task]:
-        """Return the temporary products that no task needs that is still to be made."""
+        """Return the tasks of temporary products that no remaining task needs."""
         return [self._temporary[key] for key, count in self._users.items() if count == 0]
 
     def after(self, task: Task) -> list[Task]:
-        """Count a task as made; return the temporary products that it was the last to need."""
+        """Count a task as made; return the tasks of temporary products that no remaining task needs any more."""
         needed = self._needed_by(task)
         for key in needed:
             self._users[key] -= 1
@@ -380,7 +344,7 @@ class Lifetimes:
 
 
 def _all_tasks(targets: Iterable[Task]) -> list[Task]:
-    """Return targets and all that they need; tasks that make the same product are all among them."""
+    """Return targets and all that they need, including different tasks that make the same product."""
     found: dict[int, Task] = {}
     waiting = list(targets)
     while waiting:
@@ -392,9 +356,9 @@ def _all_tasks(targets: Iterable[Task]) -> list[Task]:
 
 
 def drop(tasks: Iterable[Task], store: Store) -> None:
-    """Remove the products of tasks, as far as they are there and were made as temporary ones.
+    """Remove existing products of tasks that were made as temporary ones.
 
-    What another run made to be kept stays, and so does everything in a store that can only be read.
+    Products that another run made to be kept stay, and so does everything in a read-only store.
     """
     for task in tasks:
         product = store.find(task.stage.name, task.key)
@@ -404,7 +368,7 @@ def drop(tasks: Iterable[Task], store: Store) -> None:
 
 
 def largest_disk(targets: Iterable[Task], todo: Sequence[Task]) -> float:
-    """Return the most bytes that the products of a run are estimated to hold at once, if it goes in its order."""
+    """Estimate the largest total size, in bytes, of the products of a run at one time, if it follows its order."""
     lifetimes, sizes = Lifetimes(targets, todo), {task.key: task.cost.disk for task in todo}
     held = largest = 0.0
     for task in todo:

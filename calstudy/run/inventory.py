@@ -1,4 +1,4 @@
-"""What lies in a store and in a folder of runs, and which products no run refers to."""
+"""List the products of a store and the runs of a folder, and find products that no run refers to."""
 
 from __future__ import annotations
 
@@ -19,21 +19,7 @@ MANIFEST = "manifest.json"
 
 @dataclass(frozen=True)
 class RunEntry:
-    """A finished run.
-
-    Attributes
-    ----------
-    folder
-        Its folder.
-    name
-        Of the study.
-    finished
-        When.
-    size
-        Bytes of all files in the folder.
-    keys
-        Of the products that its manifest names.
-    """
+    """A finished run: its folder, the name of the study, the size of all files in bytes, and its products' keys."""
 
     folder: Path
     name: str
@@ -43,13 +29,7 @@ class RunEntry:
 
 
 def list_runs(folder: Path) -> list[RunEntry]:
-    """Return the finished runs in a folder and its folders, the latest first.
-
-    Raises
-    ------
-    InputError
-        If there is no such folder.
-    """
+    """Return the finished runs in a folder and its subfolders, the latest first; raises InputError without a folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of runs")
     found = []
@@ -74,16 +54,9 @@ def products(store: Store) -> Iterator[Product]:
 
 @dataclass(frozen=True)
 class Leftover:
-    """A folder that a run was filling or removing when it was killed, or is filling now.
+    """A folder that a killed run was filling or removing, or that a run is filling now.
 
-    Attributes
-    ----------
-    path
-        In the store.
-    size
-        Bytes of its files.
-    age
-        Seconds since it changed.
+    `size` is that of its files in bytes, `age` the time since its last change in seconds.
     """
 
     path: Path
@@ -92,10 +65,10 @@ class Leftover:
 
 
 def leftovers(store: Store) -> list[Leftover]:
-    """Return the folders of a store that are no products."""
+    """Return the folders of a store that are not products."""
     found = []
     for path in sorted([*store.root.glob("*/.building-*"), *store.root.glob("*/.discarded-*")]):
-        with suppress(OSError):  # A run that goes on may have renamed it.
+        with suppress(OSError):  # A run in progress may have renamed it.
             files = [file.stat() for file in (path, *path.rglob("*"))]
             size, changed = sum(file.st_size for file in files[1:]), max(file.st_mtime for file in files)
             found.append(Leftover(path, size, max(0.0, time.time() - changed)))
@@ -109,7 +82,7 @@ def age_of(product: Product) -> float:
 
 
 def unreferenced(found: Iterable[Product], runs: Iterable[RunEntry]) -> list[Product]:
-    """Return the products that no run names, nor any product that a run names was made from."""
+    """Return the products that no run names, and from which no such product was made."""
     known = {product.record["key"]: product for product in found}
     waiting, used = [key for run in runs for key in run.keys], set()
     while waiting:

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class WorkOrder:
-    """A task without the tasks behind it: what a worker must know to make its product."""
+    """A task without the tasks behind it, as sent to a worker."""
 
     stage: Stage
     key: str
@@ -36,7 +36,7 @@ class WorkOrder:
 
     @classmethod
     def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
-        """Return the order for `task`, whose product is made `again` if it is there."""
+        """Return the order for `task`; with `again`, its product is made even if it exists."""
         return cls(
             stage=task.stage,
             key=task.key,
@@ -52,11 +52,8 @@ class WorkOrder:
 def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> Product:
     """Make the ordered product, or return it if another run has made it meanwhile.
 
-    Raises
-    ------
-    InputError
-        If an input vanished or was damaged, the stage refuses a value, or the store cannot be written. Any other error
-        of a stage is a bug, and passes with its traceback.
+    Raises InputError if an input was removed or damaged, the stage refuses a value, or the store cannot be written. Any
+    other error of a stage is a bug, and passes with its traceback.
     """
     store = Store(order.store)
     if not store.root.is_dir():
@@ -71,7 +68,7 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
     except InputError:
         raise
     except SystemExit as error:
-        # It would end the thread of the worker without a word, and the run would wait for it for ever.
+        # It would end the thread of the worker silently, and the run would wait for it forever.
         raise RuntimeError(f"{order.stage.name} ({order.label}): the process was told to exit") from error
     except (OSError, RuntimeError) as error:
         reason = _unwritable(error, store.root)
@@ -84,7 +81,7 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
 
 
 def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:
-    """Return in words why a file of the store could not be written, or None if that is not what happened."""
+    """Return the reason why a file of the store could not be written, or None for any other error."""
     name = getattr(error, "filename", None)
     if isinstance(name, str) and not Path(name).is_relative_to(root):
         return None

@@ -1,4 +1,4 @@
-"""Tell how a run goes: a bar with the remaining time on a terminal, plain lines elsewhere."""
+"""Report the progress of a run: a bar with the remaining time on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calstudy.run.task import Task
 
 
 def duration(seconds: float) -> str:
-    """Write a duration for a person: ``8 s``, ``3 min``, ``2.5 h``."""
+    """Format a duration: ``8 s``, ``3 min``, ``2.5 h``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 5400:
@@ -30,12 +30,7 @@ little of the pace of what follows."""
 class Forecast:
     """Estimate the remaining time of a run from the estimated cost of its tasks and the pace so far.
 
-    Parameters
-    ----------
-    costs
-        Estimated seconds of each task on one core, by key.
-    workers
-        How many tasks are made at a time.
+    Costs are seconds of one core by key; `workers` is the number of tasks that are made at a time.
     """
 
     def __init__(self, costs: dict[str, float], workers: int) -> None:
@@ -45,11 +40,11 @@ class Forecast:
 
     @property
     def fraction(self) -> float:
-        """Part of the work that is made."""
+        """Completed fraction of the estimated cost."""
         return self._made / self._total
 
     def finish(self, key: str) -> float:
-        """Count a task as made; return the seconds that the rest will take at this pace."""
+        """Count a task as made; return the remaining seconds at the present pace."""
         self._made += self._costs[key]
         elapsed = time.perf_counter() - self._start
         pace = (elapsed + PLANNED_SECONDS) / (self._made / self._workers + PLANNED_SECONDS)
@@ -60,19 +55,7 @@ class Forecast:
 def report(
     tasks: Sequence[Task], costs: dict[str, float], workers: int, console: Console
 ) -> Iterator[Callable[[Task, Product], None]]:
-    """Yield a function to call after each product.
-
-    Parameters
-    ----------
-    tasks
-        All that will be made.
-    costs
-        Estimated seconds per task key.
-    workers
-        How many tasks are made at a time.
-    console
-        Where to write.
-    """
+    """Yield a function that reports each product when it is made; costs are estimated seconds by key."""
     forecast = Forecast(costs, workers)
     if not console.is_terminal:
         count = 0

@@ -1,4 +1,4 @@
-"""Where results come from: source, versions, data files of packages, commit, machine, seeds."""
+"""Provenance of results: source, versions, data files of packages, commit, machine, seeds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ PACKAGES = (
     "matplotlib",
 )
 IMPORTED_AS = {"astropy-iers-data": "astropy", "hera-calibration": "hera_cal"}
-"""Names by which packages are imported, where they are others; the tables of the first are read by astropy."""
+"""Import names of packages, where they differ; the tables of the first are read by astropy."""
 
 
 def package_versions() -> dict[str, str | None]:
@@ -60,17 +60,14 @@ def _version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:
-        # Without CUDA the same module comes in a package of another name.
+        # Without CUDA the same module is in a package of another name.
         return _version("tensorflow-cpu") if package == "tensorflow" else None
 
 
 def made_with(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what decides a product besides its key: the source, and versions and data files of packages that it uses.
+    """Return the digest of the source of a stage, and the versions and data files of the packages that it uses.
 
-    Parameters
-    ----------
-    make, settings
-        Of the stage and of the task.
+    Together with its key they determine a product.
     """
     source = source_of(make, settings)
     versions = {name: _version(name) for name in PACKAGES if IMPORTED_AS.get(name, name) in source.packages}
@@ -80,7 +77,7 @@ def made_with(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[str
 
 @cache
 def _digest_of(file: PackageFile) -> str | None:
-    """Return the SHA-256 of a file of a package, or None if it is not there; kept, for the largest takes a second."""
+    """Return the SHA-256 of a file of a package, or None if it is missing; kept, because the largest takes a second."""
     try:
         path, state = file.path, file.path.stat()
     except (InputError, OSError):
@@ -90,15 +87,15 @@ def _digest_of(file: PackageFile) -> str | None:
 
 
 def lineage(own: Mapping[str, Any], needs: Iterable[str]) -> str:
-    """Return the digest of what a product is made with, from `made_with`, and of the lineages of what it needs.
+    """Return the digest of a product's `made_with` and of the lineages of the products that it needs.
 
-    How many pieces it is put together of does not count.
+    It does not depend on the number of pieces.
     """
     return digest_json([own, sorted(set(needs))])
 
 
 def lineages(tasks: Iterable[Task]) -> dict[str, str]:
-    """Return the lineages that products would have that are made now, by key; every task comes after what it needs."""
+    """Return by key the lineages that products would have if they were made now; every task follows its inputs."""
     found: dict[str, str] = {}
     for task in tasks:
         needs = [found[needed.key] for needed in task.needs.values()]
@@ -107,21 +104,16 @@ def lineages(tasks: Iterable[Task]) -> dict[str, str]:
 
 
 def of_other_code(tasks: Sequence[Task], products: Mapping[str, Product]) -> frozenset[str]:
-    """Return the keys of products that have another lineage than they would have if they were made now.
+    """Return the keys of products whose lineage differs from the one that they would have if they were made now.
 
-    Parameters
-    ----------
-    tasks
-        Every one after what it needs.
-    products
-        By key; there need not be one for every task.
+    Every task follows its inputs; products of some tasks may be missing.
     """
     current = lineages(tasks) if products else {}
     return frozenset(key for key, product in products.items() if product.record["lineage"] != current.get(key))
 
 
 def other_code(stages: Sequence[str]) -> str | None:
-    """Say in a sentence how many products, by their stages, are of other code, or return None if there are none."""
+    """Return a sentence that counts products of other code by their stages, or None if there are none."""
     if not stages:
         return None
     counts = ", ".join(f"{stage} {count}" for stage, count in Counter(stages).items())
@@ -133,7 +125,7 @@ def other_code(stages: Sequence[str]) -> str | None:
 
 @cache
 def git_commit() -> str | None:
-    """Return the commit of the checkout that calstudy runs from, with ``-dirty`` if it was changed, or None."""
+    """Return the commit of calstudy's checkout, with ``-dirty`` if it was changed, or None without a checkout."""
     checkout = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
@@ -149,7 +141,7 @@ def git_commit() -> str | None:
 
 
 def processor() -> str:
-    """Return the model of this machine's processor, as far as the system tells."""
+    """Return the model of this machine's processor, if the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -160,7 +152,7 @@ def processor() -> str:
 
 @cache
 def libraries() -> list[str]:
-    """Return the BLAS libraries that are loaded, each with its version and the kind of processor that it works for."""
+    """Return the loaded BLAS libraries, each with its version and the kind of processor that it supports."""
     from threadpoolctl import threadpool_info
 
     found = (item for item in threadpool_info() if item["user_api"] == "blas")

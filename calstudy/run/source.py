@@ -1,12 +1,13 @@
-"""The source that a product is made by: all definitions that its stage and its settings reach.
+"""The source of a product: all definitions that its stage and its settings reach.
 
-A definition is a function, a class or an assignment at the top of a module. Whole modules would say little: through the
-schema of experiment files the module of a stage imports a hundred others, while ``difference`` reaches nine definitions
-and ``simulate-chunk`` about three hundred. From the function that makes a product and from the classes of its settings,
-which include its plug-ins, names are followed from definition to definition through the imports of calstudy.
+A definition is a function, a class or an assignment at the top of a module. Whole modules would be too coarse: through
+the schema of experiment files the module of a stage imports a hundred others, while ``difference`` reaches nine
+definitions and ``simulate-chunk`` about three hundred. From the function that makes a product and from the classes of
+its settings, which include its plug-ins, names are followed from definition to definition through the imports of
+calstudy.
 
-A digest does not change with docstrings, comments, layout, annotations of functions, the order of definitions, or the
-module that a definition is in. It is the same for all versions of Python that calstudy supports.
+A digest does not depend on docstrings, comments, layout, annotations of functions, the order of definitions, or the
+module that contains a definition. It is the same for all versions of Python that calstudy supports.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ PACKAGE = __name__.partition(".")[0]
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 UNREAD = {"ctx", "kind", "returns", "type_comment", "type_params"}
-"""Fields of syntax trees that say nothing about what a definition does."""
+"""Fields of syntax trees that have no effect on a definition."""
 EFFECTS = ""
-"""Under this name are the statements of a module that define nothing, such as a call; they go with all of it."""
+"""Name of the statements of a module that define nothing, such as a call; each definition of the module needs them."""
 
 Address = tuple[str, str]
 """Module and name of a definition."""
@@ -45,17 +46,7 @@ Address = tuple[str, str]
 
 @dataclass(frozen=True)
 class Source:
-    """What some definitions reach.
-
-    Attributes
-    ----------
-    digest
-        Of all definitions.
-    packages
-        Other packages that they import.
-    files
-        Data files of packages that they name.
-    """
+    """The digest of some definitions and all that they reach, the packages they import, and the data files they use."""
 
     digest: str
     packages: frozenset[str]
@@ -64,9 +55,9 @@ class Source:
 
 @dataclass
 class _Module:
-    """The statements of a module by the name that they define, and for each imported name where it is from.
+    """The statements of a module by the names that they define, and the origins of each imported name.
 
-    The name in another module is None if all of that module, or another package, is imported.
+    The name in the other module is None if all of that module, or another package, is imported.
     """
 
     statements: dict[str, list[ast.stmt]] = field(default_factory=dict)
@@ -87,7 +78,7 @@ def source_of(make: Callable[..., Any], settings: Mapping[str, Any]) -> Source:
 
 
 def reached(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[Address, str]:
-    """Return the digests of all definitions that count for what `make` makes, or for a plug-in, by their addresses."""
+    """Return by address the digests of all definitions that affect what `make` makes, or a plug-in."""
     found = frozenset().union(*map(_reach, _roots(make, settings)))
     return {address: _definition(address).digest for address in found}
 
@@ -115,7 +106,7 @@ def _classes(value: Any) -> Iterator[type[BaseModel]]:
 
 @cache
 def _source(roots: frozenset[Address]) -> Source:
-    """Return what definitions reach; an earlier process may have found it (reading all of a study takes a second)."""
+    """Return the source of definitions, from an earlier process if possible (reading all of a study takes a second)."""
     path, stamp = _kept()
     name, kept = digest_json(sorted(roots)), _read_kept(path, stamp)
     if name not in kept:
@@ -131,7 +122,7 @@ def _source(roots: frozenset[Address]) -> Source:
 
 @cache
 def _kept() -> tuple[Path, str]:
-    """Return the file in which sources are kept, and the state of calstudy's files that they are of."""
+    """Return the file that keeps sources between processes, and the state of calstudy's files to which they belong."""
     root = Path(__file__).resolve().parents[1]
     states = [(path.relative_to(root).as_posix(), path.stat()) for path in sorted(root.rglob("*.py"))]
     stamp = digest_json([[name, state.st_mtime_ns, state.st_size] for name, state in states])
@@ -169,7 +160,7 @@ def _reach(root: Address) -> frozenset[Address]:
 
 @cache
 def _module(name: str) -> _Module | None:
-    """Read a module of calstudy, or a file that holds a plug-in; None for any other."""
+    """Read a module of calstudy, or a file with a plug-in; None for any other."""
     path = Path(__file__).resolve().parents[2].joinpath(*name.split("."))
     if name.startswith(FILE_MODULE):
         path = Path(str(sys.modules[name].__file__))
@@ -208,14 +199,14 @@ def _defined(statement: ast.stmt) -> set[str]:
         return set()
     if isinstance(statement, ast.Assign | ast.AnnAssign):
         if _calls(statement.value, Stage):
-            return set()  # What another stage makes is read as a product, which has a source of its own.
+            return set()  # The output of another stage is read as a product, which has its own source.
         targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
         return {node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)}
     return {EFFECTS}
 
 
 def _imports(node: ast.AST) -> Iterator[tuple[str, tuple[str, str | None]]]:
-    """Yield what a module imports anywhere, but for annotations."""
+    """Yield the imports anywhere in a module, except those for annotations."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.ImportFrom):
             module = str(child.module)
@@ -234,7 +225,7 @@ def _imports(node: ast.AST) -> Iterator[tuple[str, tuple[str, str | None]]]:
 def _definition(address: Address) -> _Definition:
     module = _module(address[0])
     assert module is not None, "reached"
-    # A name that a module only imports stands for what it imports.
+    # A name that a module only imports is followed to its origin.
     statements = module.statements.get(address[1], [])
     needs: set[Address] = set()
     packages: set[str] = set()
@@ -260,7 +251,7 @@ def _definition(address: Address) -> _Definition:
 
 
 def _names(node: ast.AST, local: frozenset[str] = frozenset()) -> Iterator[tuple[str, str]]:
-    """Yield the names that are read in a statement and are not local to a function, each with its attribute, if any."""
+    """Yield the names that a statement reads and that are not local to a function, each with its attribute, if any."""
     if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
         if node.value.id not in local:
             yield node.value.id, node.attr
@@ -288,7 +279,7 @@ def _inside(node: ast.AST) -> Iterator[tuple[ast.AST, set[str]]]:
 
 
 def _bound(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
-    """Return the parameters of a function, and what it assigns, but for the variables of its comprehensions."""
+    """Return the parameters and assigned names of a function, without the variables of its comprehensions."""
     bound = {node.arg for node in ast.walk(function.args) if isinstance(node, ast.arg)}
     waiting: list[ast.AST] = list(function.body)
     while waiting:
@@ -303,7 +294,7 @@ def _bound(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
 
 
 def _normal(node: Any) -> str:
-    """Return a syntax tree as text: `ast.dump` writes empty fields in some versions of Python and not in others."""
+    """Return a syntax tree as text; `ast.dump` writes empty fields in some versions of Python and not in others."""
     if isinstance(node, list):
         return f"[{','.join(map(_normal, node))}]"
     if not isinstance(node, ast.AST):

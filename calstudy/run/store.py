@@ -1,8 +1,9 @@
-"""The store of products: content-addressed folders, written atomically, checked before use.
+"""The store of products: content-addressed folders, written atomically, verified before use.
 
-A product is a folder ``<store>/<stage>/<key>/`` of files in standard formats plus ``product.json``, its record: what
-made it, from what, and the SHA-256 of every file and of the record itself. A folder that exists is complete, for it is
-filled under another name and renamed; a folder that no longer fits its record is damaged, and is made again.
+A product is a folder ``<store>/<stage>/<key>/`` of files in standard formats plus ``product.json``, its record: code,
+settings and inputs from which it was made, and the SHA-256 of every file and of the record itself. A folder that exists
+is complete, because it is filled under another name and renamed; a folder that does not match its record is damaged,
+and is made again.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from calstudy.base.files import sha256
 from calstudy.base.identity import digest_json
 
 RECORD, DIGEST = "product.json", "digest"
-"""The record of a product, and its field that has the digest of all others."""
+"""The record of a product, and its field with the digest of all others."""
 SILENT_WAIT, LONGEST_WAIT = 5.0, 24 * 3600.0
-"""Seconds after which a wait for a lock is told, and after which it ends."""
+"""Seconds after which a wait for a lock is reported, and after which it ends."""
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-"""Stages and keys: names of folders, and of nothing above or below."""
+"""Stages and keys: names of folders, without separators or dots."""
 
 
 @dataclass(frozen=True)
@@ -62,16 +63,10 @@ def _inside(name: str) -> bool:
 
 
 def require_writable(folder: Path, name: str) -> None:
-    """Raise InputError if a folder cannot be written, or made; tried by a temporary folder in what is there of it.
+    """Raise InputError if a folder, which need not exist, cannot be created or written.
 
-    Permissions alone do not tell: nobody can make a folder in /proc, not even root.
-
-    Parameters
-    ----------
-    folder
-        Need not exist.
-    name
-        Of the field or option, with its value, for the message.
+    Permissions alone are not sufficient: nobody, not even root, can create a folder in /proc. A temporary folder is
+    therefore created in the existing part of the path. `name` is the field or option, with its value, for the message.
     """
     found = folder
     try:
@@ -85,25 +80,13 @@ def require_writable(folder: Path, name: str) -> None:
 
 
 class Store:
-    """A folder of products that several runs, on several machines, may use at once.
-
-    Parameters
-    ----------
-    root
-        Need not exist before `prepare`.
-    """
+    """A folder of products for several runs on several machines at once; it need not exist before `prepare`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.expanduser().resolve()
 
     def prepare(self) -> None:
-        """Make the folder, if it is not there, and try that it can be written.
-
-        Raises
-        ------
-        InputError
-            If it cannot.
-        """
+        """Create the folder if necessary; raises InputError if it cannot be written."""
         require_writable(self.root, f"outputs.store = {str(self.root)!r}")
         try:
             self.root.mkdir(parents=True, exist_ok=True)
@@ -111,12 +94,9 @@ class Store:
             raise InputError(f"outputs.store = {str(self.root)!r}: cannot be made ({error.strerror})") from None
 
     def folder(self, stage: str, key: str) -> Path:
-        """Return where the product with this stage and key is, or would be.
+        """Return the folder of the product with this stage and key, which need not exist.
 
-        Raises
-        ------
-        ValueError
-            If either is not a plain name, so that the folder would be elsewhere.
+        Raises ValueError if either is not a plain name, because the folder could then be elsewhere.
         """
         if not (PLAIN.fullmatch(stage) and PLAIN.fullmatch(key)):
             raise ValueError(f"stage {stage!r} and key {key!r} of a product must be plain names")
@@ -151,19 +131,19 @@ class Store:
         return product if intact else None
 
     def exists(self, stage: str, key: str) -> bool:
-        """Return whether there is anything under this key, intact or damaged."""
+        """Return whether there is any folder under this key, intact or damaged."""
         try:
             return self.folder(stage, key).exists()
         except OSError:
             return False  # A name that no file can have, or a folder that may not be read.
 
     def addresses(self) -> list[tuple[str, str]]:
-        """Return stage and key of all that is in the store, intact or damaged."""
+        """Return stage and key of every product in the store, intact or damaged."""
         found = (path for path in sorted(self.root.glob("[!.]*/[!.]*")) if path.is_dir())
         return [(path.parent.name, path.name) for path in found]
 
     def discard(self, stage: str, key: str) -> None:
-        """Remove a product, if it is there; it vanishes at once under its name."""
+        """Remove a product, if it exists; its name disappears at once."""
         folder = self.folder(stage, key)
         if folder.exists():
             grave = folder.parent / f".discarded-{key}-{uuid4().hex}"
@@ -172,24 +152,15 @@ class Store:
 
     @contextmanager
     def lock(self, stage: str, key: str, told: Callable[[str], None] = lambda text: None) -> Iterator[None]:
-        """Hold the right to make this product; another run that wants it waits, and then finds it made.
+        """Hold the right to make this product; another run that needs it waits, and then finds it made.
 
-        Parameters
-        ----------
-        stage, key
-            Of the product.
-        told
-            Called with a sentence that names the holder, if there is a wait of more than `SILENT_WAIT`.
-
-        Raises
-        ------
-        InputError
-            If another process holds it for `LONGEST_WAIT`, or the file system has no locks.
+        After a wait of `SILENT_WAIT`, `told` is called with a sentence that names the holder. Raises InputError if
+        another process holds the lock for `LONGEST_WAIT`, or if the file system has no locks.
         """
         locks = self.root / ".locks"
         locks.mkdir(exist_ok=True)
         path, holder = locks / f"{stage}-{key}.lock", locks / f"{stage}-{key}.holder"
-        # Without flock, a marker of a process that died on another host would be waited for in vain.
+        # Without flock, runs would wait forever for the marker of a process that died on another host.
         lock = FileLock(path, fallback_to_soft=False)
         try:
             try:
@@ -220,9 +191,9 @@ class Store:
 
     @contextmanager
     def building(self, stage: str, key: str) -> Iterator[Path]:
-        """Yield an empty folder to fill; call `seal` on it before leaving. What was left by a killed run is removed.
+        """Yield an empty folder to fill, under `lock`; call `seal` on it before leaving.
 
-        Must be used under `lock`.
+        Folders that a killed run has left are removed.
         """
         parent = self.root / stage
         parent.mkdir(exist_ok=True)
@@ -236,21 +207,16 @@ class Store:
             shutil.rmtree(folder, ignore_errors=True)
 
     def seal(self, folder: Path, record: Mapping[str, Any]) -> Product:
-        """Record the files of a filled folder and give it its final name.
+        """Record the files of a filled folder from `building`, and give it its final name.
 
-        Parameters
-        ----------
-        folder
-            From `building`.
-        record
-            JSON-able; must hold `stage` and `key`.
+        The record is JSON-able, and contains `stage` and `key`.
         """
         files = {
             path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": sha256(path)}
             for path in sorted(folder.rglob("*"))
             if path.is_file()
         }
-        # As it will be read: JSON has no tuples, and no keys but text.
+        # The record as it will be read: JSON has no tuples, and only text as keys.
         complete = json.loads(json.dumps({**record, "files": files}, allow_nan=False))
         with (folder / RECORD).open("w", encoding="utf-8") as file:
             json.dump({**complete, DIGEST: digest_json(complete)}, file, indent=1, sort_keys=True)

@@ -1,4 +1,4 @@
-"""Tasks: which products there are, what each is made from, what it costs, and by which code it is made."""
+"""Tasks: the products of a study, their stages, settings, inputs and costs."""
 
 from __future__ import annotations
 
@@ -14,17 +14,7 @@ from calstudy.base.resources import Cost
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What a stage is given to make one product.
-
-    Attributes
-    ----------
-    settings
-        As in `Task`.
-    inputs
-        Folders of the products it reads.
-    output
-        Empty folder to put its files in.
-    """
+    """The input of a stage for one product: settings as in `Task`, folders of the inputs, and an empty folder."""
 
     settings: Mapping[str, Any]
     inputs: Mapping[str, Path]
@@ -38,14 +28,14 @@ class Stage:
     Attributes
     ----------
     name
-        Names the folder of its products in the store.
+        Name of the folder of its products in the store.
     version
-        Raised when its results change, so that products of older code are not taken for new ones.
+        Raised when its results change, so that products of older code are not used as new ones.
     make
-        Writes the files of one product and returns JSON-able notes about it. A function of a module; libraries that
-        take long to import are imported inside it, for plans are made without them.
+        Writes the files of one product and returns JSON-able notes about it. A function of a module; it imports slow
+        libraries inside, because plans are made without them.
     cost
-        Estimates what one task takes.
+        Estimates the cost of one task.
     """
 
     name: str
@@ -60,20 +50,17 @@ class Task:
 
     Attributes
     ----------
-    stage
-        What kind of product.
     label
-        What the product is, in a few words.
+        Description of the product in a few words.
     settings
-        All that the stage reads of the experiment: validated sections, and plain JSON-able values.
+        All settings of the experiment that the stage reads: validated sections, and plain JSON-able values.
     inputs
-        The tasks whose products it reads, by the names it knows them under.
+        The tasks whose products it reads, by their names in the stage.
     pieces
-        Tasks whose products it puts together, likewise. Its settings and inputs, and by which stages the pieces are
-        made, say all that decides the result: into how many pieces it is cut changes it by rounding at most, and is not
-        part of the key.
+        Tasks whose products it joins, likewise. Its settings and inputs, and the stages of the pieces, determine the
+        result: the number of pieces changes it by rounding at most, and is not part of the key.
     temporary
-        Whether the product may be dropped once what needs it is made.
+        Whether the product may be removed once the products that need it are made.
     """
 
     stage: Stage
@@ -98,12 +85,12 @@ class Task:
 
     @cached_property
     def cost(self) -> Cost:
-        """What making it takes."""
+        """Estimated cost of making the product."""
         return self.stage.cost(self)
 
 
 def unique(tasks: Iterable[Task]) -> list[Task]:
-    """Return tasks and all they need, once each, every task after what it needs."""
+    """Return tasks and all that they need, once each, every task after its inputs."""
     found: dict[str, Task] = {}
 
     def visit(task: Task) -> None:

@@ -1,4 +1,4 @@
-"""What the calibrators that minimize w |V - g_a g_b* F|^2 have in common."""
+"""Base class of the calibrators that minimize w |V - g_a g_b* F|^2."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calstudy.calibrate.settings import ForegroundFit, GainFit
 from calstudy.instrument.size import Size
 
 CROWDED = 0.9
-"""A fit can absorb anything from this many unknowns per sample on."""
+"""Number of unknowns per sample from which a fit can absorb any data."""
 
 
 class LeastSquares(GainFit):
@@ -22,23 +22,23 @@ class LeastSquares(GainFit):
 
     @property
     def needs_noise(self) -> bool:
-        """Whether the foregrounds have a finite prior, whose noise the settings do not say."""
+        """Whether the foregrounds have a finite prior, and the settings do not give the noise."""
         if not isinstance(self, ForegroundFit) or not self.foreground_prior.finite:
             return False
         return self.foreground_prior.noise is None and self.weights.kind != "autos"
 
     def cost(self, size: Size) -> Cost:
-        """Return what the solves take, within a factor of about two, as if no baselines shared a foreground model."""
+        """Return the cost of the solves, within a factor of about two, as if no baselines shared a foreground model."""
         return solve_cost(self, size)
 
     def leaner(self) -> Self | None:
-        """Return the calibrator that works on half as many foreground models at a time."""
+        """Return the calibrator with half as many foreground models at a time."""
         if not isinstance(self, ForegroundFit) or self.models_at_once <= LEAST_MODELS:
             return None
         return self.model_copy(update={"models_at_once": max(self.models_at_once // 2, LEAST_MODELS)})
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return that TensorFlow is missing, or why these baselines and channels cannot be fitted, or None."""
+        """Return a sentence if TensorFlow is missing, or these baselines and channels cannot be fitted, else None."""
         if isinstance(self, ForegroundFit) and not has_sky_model:
             for field, value in (("foreground_prior.mean", self.foreground_prior.mean), ("prior", self.prior)):
                 if value == "sky-model":
@@ -55,7 +55,7 @@ class LeastSquares(GainFit):
         return None
 
     def outline(self, frame: Frame) -> Outline:
-        """Return the cost of a solve of these very baselines, and whether it has more unknowns than it should."""
+        """Return the cost of a solve of these baselines, with a note if it has too many unknowns."""
         from calstudy.calibrate.problem import fitted_baselines
         from calstudy.calibrate.structure import make_structure, repeat_structure
 
@@ -78,7 +78,7 @@ class LeastSquares(GainFit):
         return Outline(cost, f"{coefficients} foreground coefficients each", notes)
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
-        """Solve every integration, or group of them, and every polarization."""
+        """Solve every integration or group of them, and every polarization."""
         from calstudy.calibrate.calamity import fit
 
         return fit(observation, assumed, self, progress)
@@ -87,7 +87,7 @@ class LeastSquares(GainFit):
 def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
     """Raise InputError if the channels cannot hold the foreground basis of the longest baseline.
 
-    Or if joint groups cannot be read or do not fit the array; the longest baseline is that of the others then.
+    Also if joint groups cannot be read or do not fit the array; the longest baseline is then that of the others.
     """
     from calstudy.calibrate.basis import require_room
     from calstudy.calibrate.joint import other_baselines, place_groups, read_joint_groups

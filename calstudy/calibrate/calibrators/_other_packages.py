@@ -1,4 +1,4 @@
-"""What the calibrators of other packages have in common: they find gains alone, from data and a sky model."""
+"""Base class of the calibrators of other packages, which find only gains, from data and a sky model."""
 
 from __future__ import annotations
 
@@ -24,14 +24,8 @@ POL, FEED = "nn", "Jnn"
 class Measured:
     """The data of one polarization, without autocorrelations.
 
-    Attributes
-    ----------
-    frame
-        Antennas, baselines and channels.
-    visibilities, sky
-        Data and sky model, complex128, (Ntimes, Nbls, Nfreqs).
-    weights
-        Of each sample, (Ntimes, Nbls, Nfreqs); zero for those that have no influence.
+    Visibilities and sky model are complex128, (Ntimes, Nbls, Nfreqs); weights have the same shape, and are zero for
+    samples without influence.
     """
 
     frame: Frame
@@ -40,14 +34,9 @@ class Measured:
     weights: np.ndarray
 
     def weighted_by(self, gains: np.ndarray, groups: list[slice]) -> Measured:
-        """Return the data with their weights over |g_a g_b|^2, and the same mean weight in every group.
+        """Divide the weights by |g_a g_b|^2, and keep their mean in every group of integrations.
 
-        Parameters
-        ----------
-        gains
-            Complex, (Nants, Nfreqs, Ngroups); where they are not known, they count as unity.
-        groups
-            Integrations that share their gains.
+        Gains are complex, (Nants, Nfreqs, Ngroups); unknown ones count as unity.
         """
         known = np.where(np.isfinite(gains) & (gains != 0), gains, 1)
         weights = self.weights.copy()
@@ -57,15 +46,15 @@ class Measured:
         return replace(self, weights=weights)
 
     def keys(self, rows: np.ndarray) -> list[tuple[int, int, str]]:
-        """Return what hera_cal calls some baselines."""
+        """Return the keys of some baselines in hera_cal."""
         return [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
 
 
 class OtherPackage(WeightedFit):
-    """A calibrator that finds gains alone; the residual is that of the sky model."""
+    """A calibrator that finds only gains; the residual is that of the sky model."""
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return that there is no sky model, or nothing to calibrate."""
+        """Return a sentence if there is no sky model, or nothing to calibrate."""
         if not has_sky_model:
             return "needs a sky model, and there is none"
         if frame.autos.all():
@@ -82,15 +71,9 @@ class OtherPackage(WeightedFit):
     ) -> tuple[np.ndarray, list[Outcome]]:
         """Return gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how each solve ended.
 
-        Parameters
-        ----------
-        measured
-            Data of one polarization; there are some with weight in each group.
-        groups
-            Integrations that share their gains.
-        start
-            Gains of the pass before, as they are returned, if weights come from these: those of `measured` are over
-            |g_a g_b|^2 of them (`Measured.weighted_by`). None in the first pass.
+        The data are of one polarization, with weight in each group of integrations. `start` is None in the first pass.
+        If weights come from the gains, `start` are the gains of the previous pass; the weights are then those of
+        `measured` over |g_a g_b|^2 of these gains (`Measured.weighted_by`).
         """
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
@@ -130,7 +113,7 @@ class OtherPackage(WeightedFit):
         )
 
     def _solve_timed(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
-        """Solve the groups that have data; the others are skipped."""
+        """Solve the groups that have data, and skip the others."""
         full = [number for number, times in enumerate(groups) if measured.weights[times].any()]
         shape = (measured.frame.n_antennas, measured.frame.n_channels, len(groups))
         gains = np.full(shape, np.nan, complex)
@@ -138,7 +121,7 @@ class OtherPackage(WeightedFit):
         ended = [Outcome(status="skipped", message=message, seconds=0.0, cpu_seconds=0.0)] * len(groups)
         if full:
             with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
-                # They divide by what may be zero, and tell of numbers that they replace themselves.
+                # These packages divide by zeros, and warn of numbers that they replace themselves.
                 warnings.simplefilter("ignore")
                 gains[:, :, full], found = self._solve_in_passes(measured, [groups[number] for number in full])
             for number, outcome in zip(full, found, strict=True):
@@ -151,7 +134,7 @@ class OtherPackage(WeightedFit):
         return gains, ended
 
     def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
-        """Solve groups; if weights come from the gains, again with those of the pass before, until they settle."""
+        """Solve groups; with weights from the gains, repeat with those of the previous pass until they settle."""
         settings, weights = self.weights, measured.weights
         gains, outcomes = self.solve(measured, groups)
         if not isinstance(settings, GainWeights):
@@ -180,22 +163,15 @@ def _in_passes(outcome: Outcome, change: float, unsettled: bool, passes: int) ->
 
 
 def _turned(gains: np.ndarray) -> np.ndarray:
-    """Return gains, zero where there are none, whose sum over antennas is real and positive in every channel."""
+    """Rotate gains so that their sum over antennas is real and positive in every channel; unknown ones are zero."""
     flat = gains.reshape(len(gains), -1)
     return fix_phase(flat, np.ones_like(flat)).reshape(gains.shape)
 
 
 def patterns(used: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return which baselines are used together, and in which channels.
+    """Group cells by the set of baselines in use: return each set as bool, (Nbls,), with the indices of its cells.
 
-    Parameters
-    ----------
-    used
-        (Nbls, Ncells) bool, where a cell is a channel, or a channel of an integration.
-
-    Returns
-    -------
-    For each set of baselines that occurs, the set as bool (Nbls,), and the indices of its cells.
+    `used` is bool, (Nbls, Ncells), where a cell is a channel, or a channel of an integration.
     """
     packed = np.ascontiguousarray(np.packbits(used, axis=0).T)
     sets, number = np.unique(packed, axis=0, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Gains that another program found, read from files."""
+"""Read gains of another program from files."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ SECONDS_PER_DAY = 86400.0
 
 
 class ByFile(Calibrator):
-    """Gains, and perhaps models of the foregrounds, that another program found for data of `calstudy export`.
+    """Gains, and optionally models of the foregrounds, that another program found for data of `calstudy export`.
 
-    Gains are for one time, which holds for all, or for every integration. Without a model of its own the sky model is
-    subtracted.
+    Gains are for one time, which holds for all, or for every integration. Without a model in the files, the sky model
+    is subtracted.
     """
 
     calibrator: str = "by-file"
@@ -62,7 +62,7 @@ class ByFile(Calibrator):
         return self.model_copy(update={"folder": None, "gains": found.gains, "model": found.model})
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return what the gains lack, or that there is no model."""
+        """Return a sentence if gains are missing, or if there is no model."""
         if self.gains is None:
             return None
         if self.model is None and not has_sky_model:
@@ -116,7 +116,7 @@ def _gains_at(path: Path, observation: Observation) -> tuple[np.ndarray, np.ndar
 
 
 def _places(path: Path, cal: UVCal, observation: Observation) -> np.ndarray:
-    """Return which of the solutions in time belongs to each integration."""
+    """Return the index of the solution in time for each integration."""
     if cal.Ntimes == 1:
         return np.zeros(observation.n_times, int)
     half = np.full(cal.Ntimes, float(np.min(observation.uvd.integration_time)) / 2 / SECONDS_PER_DAY)

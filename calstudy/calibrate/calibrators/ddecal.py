@@ -1,4 +1,4 @@
-"""Gains that turn the sky model into the data, as DP3's DDECal finds them, for a single direction."""
+"""Fit gains to the sky model by DP3's DDECal, for a single direction."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CORRELATIONS = 4
 
 
 class Ddecal(OtherPackage):
-    """DP3's DDECal with the sky model as its only direction, in a process of its own; the sky model is the truth.
+    """DP3's DDECal with the sky model as its only direction, in a process of its own; the sky model is taken as true.
 
     Every polarization is solved by itself, from a temporary measurement set, which holds single precision.
     """
@@ -55,7 +55,7 @@ class Ddecal(OtherPackage):
     """Part of each step of DDECal's alternating fit that is taken."""
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return what is missing: DP3, python-casacore, a sky model, or data."""
+        """Return a sentence if DP3, python-casacore, a sky model, or data are missing."""
         if _program() is None:
             return NEEDED.format("the program DP3")
         if find_spec("casacore") is None:
@@ -63,7 +63,7 @@ class Ddecal(OtherPackage):
         return super().refusal(frame, has_sky_model)
 
     def cost(self, size: Size) -> Cost:
-        """Return what the solves take; the measurement set has four correlations of data and model."""
+        """Return the cost of the solves; the measurement set has four correlations of data and model."""
         samples = size.samples / size.polarizations
         seconds = 5 + 8 * size.polarizations + 4e-5 * size.samples
         return Cost(seconds, LIBRARIES_MEMORY + 12 * CORRELATIONS * COMPLEX64 * samples)
@@ -85,7 +85,7 @@ class Ddecal(OtherPackage):
                 outcome = Outcome(status="failed", message=f"DP3 ended with exit code {ended.returncode}: {last}")
                 return np.full(shape, np.nan, complex), [outcome] * len(groups)
             gains = _read_gains(folder / "gains.h5")[..., : len(groups)]
-        # A solution without data is one, not a number, or what the solution before it was.
+        # A solution without data is one, NaN, or a copy of the previous solution.
         known = [_antennas_with_weight(measured, times) for times in groups]
         return np.where(np.stack(known, axis=2), gains, np.nan), self._outcomes(ended.stdout, len(groups))
 
@@ -125,7 +125,7 @@ class Ddecal(OtherPackage):
         )
 
     def _outcomes(self, output: str, n_groups: int) -> list[Outcome]:
-        """Return how the solves ended, from what DP3 prints."""
+        """Read from DP3's output how the solves ended."""
         found = re.search(r"Iterations taken: \[([\d,]+)\]", output)
         if found is None:
             raise RuntimeError(f"DP3 does not say how many iterations it took:\n{output}")
@@ -141,7 +141,7 @@ class Ddecal(OtherPackage):
 
 
 def _program() -> str | None:
-    """Return the path of DP3: on the path, or beside the Python that runs."""
+    """Find DP3 on the path, or next to the running Python."""
     beside = str(Path(sys.executable).parent)
     for name in COMMANDS:
         for path in (None, beside):
@@ -151,7 +151,7 @@ def _program() -> str | None:
 
 
 def _antennas_with_weight(measured: Measured, times: slice) -> np.ndarray:
-    """Return which antennas have data in which channels, bool, (Nants, Nfreqs)."""
+    """Return the mask of antennas and channels with data, bool, (Nants, Nfreqs)."""
     used = (measured.weights[times] > 0).any(axis=0)
     known = np.zeros((measured.frame.n_antennas, used.shape[1]), bool)
     for ends in measured.frame.antennas.T:
@@ -160,10 +160,10 @@ def _antennas_with_weight(measured: Measured, times: slice) -> np.ndarray:
 
 
 def _write_measurement_set(folder: Path, measured: Measured, groups: list[slice]) -> None:
-    """Write the data, the sky model as MODEL_DATA, and the weights of all groups, one after another.
+    """Write the data, the sky model as MODEL_DATA, and the weights of all groups in sequence.
 
-    DDECal takes four correlations, of which it fits XX and YY; both are the polarization. It forgets the solution that
-    begins with the last integration, so that one more follows, which is flagged.
+    DDECal needs four correlations, of which it fits XX and YY; both are the polarization. It loses the solution that
+    begins with the last integration, so that a flagged one is appended.
     """
     from casacore.tables import makecoldesc, maketabdesc, table
 
@@ -187,8 +187,9 @@ def _write_measurement_set(folder: Path, measured: Measured, groups: list[slice]
 def _empty(frame: Frame, n_times: int) -> UVData:
     """Return visibilities without values.
 
-    Of each baseline the first antenna has the lower number, for then pyuvdata writes it as measurement sets have it.
-    Site, times and phase centre are any: they are the same for data and model, so that gains do not depend on them.
+    The first antenna of each baseline has the lower number, as pyuvdata then writes it in the order of measurement
+    sets. Site, times and phase centre are arbitrary: they are the same for data and model, so that gains do not depend
+    on them.
     """
     from astropy.coordinates import EarthLocation
     from pyuvdata import Telescope, UVData, utils
@@ -223,7 +224,7 @@ def _empty(frame: Frame, n_times: int) -> UVData:
 
 
 def _write_observatories(folder: Path) -> None:
-    """Write the table of observatories without which DP3 does not start, and the file that says where it is."""
+    """Write the table of observatories that DP3 needs to start, and the file with its path."""
     from casacore.tables import makescacoldesc, maketabdesc, table
 
     columns = {"MJD": 0.0, "Name": "", "Type": "", "Long": 0.0, "Lat": 0.0, "Height": 0.0, "X": 0.0, "Y": 0.0, "Z": 0.0}
@@ -241,7 +242,7 @@ def _write_observatories(folder: Path) -> None:
 
 
 def _read_gains(path: Path) -> np.ndarray:
-    """Return the gains of an H5Parm file, complex, (Nants, Nfreqs, Nsolutions), in the order of the antenna numbers.
+    """Read the gains of an H5Parm file, complex, (Nants, Nfreqs, Nsolutions), in the order of the antenna numbers.
 
     Baselines of a measurement set are those of calstudy reversed, so that its gains are the complex conjugates.
     """

@@ -1,4 +1,4 @@
-"""Gains, and what the sky model lacks: a finite prior on the foregrounds of every baseline (Byrne 2023)."""
+"""Fit gains with a finite prior on the errors of the sky model on every baseline (Byrne 2023)."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ class DelayWeighted(LeastSquares, ForegroundFit):
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
-    # What is left of the foregrounds at the default tolerance is more than the EoR near the wedge.
+    # At the default tolerance the foreground residual exceeds the EoR near the wedge.
     solver: Solver = GaussNewtonSettings(tolerance=1e-5)

@@ -1,4 +1,4 @@
-"""No calibration: what gains that are left alone do to a perfect subtraction of the sky model."""
+"""No calibration: the subtraction of the sky model from data with uncorrected gains."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class NoCalibration(Calibrator):
     calibrator: str = "none"
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return that there is no sky model to subtract, if there is none."""
+        """Return a sentence if there is no sky model to subtract."""
         return None if has_sky_model else "needs a sky model, and there is none"
 
     def cost(self, size: Size) -> Cost:

@@ -1,4 +1,4 @@
-"""Gains from the redundancy of the array, and what that cannot know from the sky model, as hera_cal finds them."""
+"""Fit gains by hera_cal's redundant calibration, and the parameters that it leaves free by the sky model."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ Step = Literal["firstcal", "logcal", "omnical", "abscal"]
 STEPS: tuple[Step, ...] = ("firstcal", "logcal", "omnical", "abscal")
 SAMPLES_AT_ONCE = 4e6
 NEGLIGIBLE = 1e-14
-"""Weight of what stands for samples without weight, over the largest weight."""
+"""Weight of the sky model in place of samples without weight, relative to the largest weight."""
 PERFECT = 10 * NEGLIGIBLE
-"""chi^2, over that of no model, below which nothing but rounding and such samples is left to fit."""
+"""chi^2, over that of no model, below which only rounding and such samples are left to fit."""
 STEP_LENGTH, CHECK_EVERY = 0.3, 10
 """Of omnical: part of the way to the next solution, and after how many steps it looks at chi^2."""
 
@@ -46,8 +46,8 @@ Visibilities = dict[tuple[int, int, str], np.ndarray]
 class Redcal(OtherPackage):
     """hera_cal's redundant calibration: firstcal, logcal and omnical, then abscal against the sky model.
 
-    Redundant baselines are taken to see the same; what redundancy leaves open in each channel, an amplitude and a phase
-    gradient, comes from the sky model (Liu et al. 2010; Kern et al. 2020; Byrne et al. 2019).
+    Redundant baselines are assumed to measure the same visibility. In each channel the sky model determines the
+    amplitude and phase gradient that redundancy leaves free (Liu et al. 2010; Kern et al. 2020; Byrne et al. 2019).
     """
 
     # Amplitude and phase gradient have the weights of calibrated data since 2.
@@ -72,14 +72,14 @@ class Redcal(OtherPackage):
         return steps
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return why redundancy does not tie the gains of all antennas to each other, or None."""
+        """Return why redundancy does not relate the gains of all antennas to each other, or None."""
         if (reason := super().refusal(frame, has_sky_model)) is not None:
             return reason
         fitted = self.fitted(frame.baselines(~frame.autos))
         return _undetermined(fitted.antennas, redundant_groups(fitted.vectors, self.redundancy_tolerance))
 
     def cost(self, size: Size) -> Cost:
-        """Return what the solves take, for some hundred steps of omnical; flags that differ in all cells cost more."""
+        """Return the cost of the solves, for about a hundred steps of omnical; more if flags differ in all cells."""
         cells = size.channels.count * size.times * size.polarizations
         alike = isinstance(self.weights, FlagWeights | GainWeights) or "logcal" not in self.steps
         seconds = 5 + (4e-6 if alike else 1.5e-5) * size.samples + (1e-3 * cells if "abscal" in self.steps else 0)
@@ -89,7 +89,7 @@ class Redcal(OtherPackage):
     def solve(
         self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
     ) -> tuple[np.ndarray, list[Outcome]]:
-        """Solve every integration by itself; gains of those that share them are averaged, phases aligned."""
+        """Solve every integration by itself, and average gains that integrations share, with aligned phases."""
         if start is not None:
             return self._solve_again(measured, groups, start)
         found = redundant_groups(measured.frame.vectors, self.redundancy_tolerance)
@@ -106,9 +106,9 @@ class Redcal(OtherPackage):
     def _solve_again(
         self, measured: Measured, groups: list[slice], start: np.ndarray
     ) -> tuple[np.ndarray, list[Outcome]]:
-        """Solve data that are divided by the gains of the pass before, whose weights are those of unity gains.
+        """Solve data divided by the gains of the previous pass, with the weights of unity gains.
 
-        They are equal if nothing is flagged, which logcal needs for its speed.
+        These weights are equal if nothing is flagged, which logcal needs for its speed.
         """
         known = np.where(np.isfinite(start) & (start != 0), start, 1)
         visibilities = measured.visibilities.copy()
@@ -118,7 +118,7 @@ class Redcal(OtherPackage):
         return gains * known, outcomes
 
     def _outcome(self, status: np.ndarray, steps: np.ndarray) -> Outcome:
-        """Return how a solve ended, from the marks of its channels in `_Redundant.solve`."""
+        """Return how a solve ended, from the status of its channels in `_Redundant.solve`."""
         marks, longest = set(status.ravel()), int(steps.max())
         count = {mark: int(np.sum(status == mark)) for mark in ("max-steps", "stalled", "failed")}
         if not marks & {"converged", "max-steps", "stalled"}:
@@ -139,7 +139,7 @@ class Redcal(OtherPackage):
 
 
 def _average(gains: np.ndarray) -> np.ndarray:
-    """Return the mean of gains (Nants, Ntimes, Nfreqs) over the integrations in which there are any."""
+    """Average gains (Nants, Ntimes, Nfreqs) over the integrations with a solution."""
     known = np.isfinite(gains)
     values = np.where(known, gains, 0)
     reference = values[:, 0]
@@ -152,14 +152,9 @@ def _average(gains: np.ndarray) -> np.ndarray:
 
 
 def _undetermined(antennas: np.ndarray, groups: RedundantGroups) -> str | None:
-    """Return what redundancy leaves open besides one amplitude, one phase and a phase gradient, or None.
+    """Describe degrees of freedom that redundancy leaves besides amplitude, phase and phase gradient, or return None.
 
-    Parameters
-    ----------
-    antennas
-        (Nbls, 2).
-    groups
-        Of these baselines. Each has an unknown visibility, which is eliminated.
+    `antennas` are those of each baseline, (Nbls, 2). Each group has an unknown visibility, which is eliminated.
     """
     present, places = np.unique(antennas, return_inverse=True)
     first, second = places.reshape(-1, 2).T
@@ -184,7 +179,7 @@ def _undetermined(antennas: np.ndarray, groups: RedundantGroups) -> str | None:
 
 
 def _solvable(antennas: np.ndarray, groups: RedundantGroups, used: np.ndarray) -> np.ndarray:
-    """Return in which cells, (Ntimes, Nfreqs), the baselines that are used, (Nbls, Ntimes, Nfreqs), suffice."""
+    """Return the mask of cells, (Ntimes, Nfreqs), whose used baselines, (Nbls, Ntimes, Nfreqs), determine the gains."""
     found = np.zeros(used[0].size, bool)
     for chosen, cells in patterns(used.reshape(len(used), -1)):
         if chosen.any():
@@ -196,8 +191,9 @@ def _solvable(antennas: np.ndarray, groups: RedundantGroups, used: np.ndarray) -
 class _Redundant:
     """Some integrations of redundant baselines, in the terms of hera_cal.
 
-    hera_cal stumbles over samples without weight. The sky model with a negligible weight stands for them, and, with any
-    weight, for all samples of a cell (a channel of an integration) that cannot be solved; cells do not know each other.
+    hera_cal fails on samples without weight. They are replaced by the sky model with a negligible weight. In a cell (a
+    channel of an integration) that cannot be solved, the sky model replaces all samples, with unit weight; cells are
+    independent.
     """
 
     def __init__(self, settings: Redcal, measured: Measured, groups: RedundantGroups, times: slice) -> None:
@@ -248,7 +244,7 @@ class _Redundant:
         return {(antenna, FEED): np.ones(self.solvable.shape, complex) for antenna in antennas}
 
     def _delays(self) -> Gains:
-        """Return a delay and a phase for each antenna and integration."""
+        """Fit a delay and a phase for each antenna and integration."""
         from hera_cal.datacontainer import DataContainer
         from hera_cal.redcal import RedundantCalibrator
 
@@ -292,7 +288,7 @@ class _Redundant:
         return {key: gain * first[key] for key, gain in solution.gains.items()}, status, steps
 
     def _logcal(self, calibrator: RedundantCalibrator, data: DataContainer, weights: DataContainer) -> RedSol:
-        """Return the solution of logcal; cells whose weights are in proportion have the same matrix, inverted once."""
+        """Solve with logcal; cells with proportional weights have the same matrix, which is inverted once."""
         from hera_cal.datacontainer import DataContainer
         from hera_cal.redcal import RedSol
 
@@ -310,7 +306,7 @@ class _Redundant:
         return RedSol(self.reds, sol_dict={key: values.reshape(self.solvable.shape) for key, values in found.items()})
 
     def _absolute(self, gains: Gains) -> Gains:
-        """Return gains whose phase gradient and amplitude fit the sky model best, in each channel."""
+        """Fit phase gradient and amplitude of the gains to the sky model in each channel."""
         from hera_cal.abscal import abs_amp_lincal, complex_phase_abscal
         from hera_cal.datacontainer import DataContainer
 
@@ -331,7 +327,7 @@ class _Redundant:
 
 
 def _power(gains: Gains, key: tuple[int, int, str]) -> np.ndarray:
-    """Return |g_a g_b|^2."""
+    """Return |g_a g_b|^2 of a baseline."""
     return np.abs(gains[key[0], FEED] * gains[key[1], FEED]) ** 2
 
 

@@ -1,4 +1,4 @@
-"""Gains alone, with the sky model taken for the truth."""
+"""Fit only gains, with the sky model as the true foregrounds."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from calstudy.calibrate.calibrators._least_squares import LeastSquares
 
 
 class SkyBased(LeastSquares):
-    """Gains alone are fitted; the sky model is taken for the truth."""
+    """Only gains are fitted; the sky model is taken as the true foregrounds."""
 
     calibrator: str = "sky-based"
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
-        """Return that there is no sky model, if there is none, or that there is nothing to fit."""
+        """Return a sentence if there is no sky model, or nothing to fit."""
         return super().refusal(frame, True) if has_sky_model else "needs a sky model, and there is none"

@@ -1,4 +1,4 @@
-"""Gains that turn the sky model into the data, channel by channel, as hera_cal's skycal finds them."""
+"""Fit gains to the sky model in each channel by hera_cal's skycal."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from calstudy.instrument.size import Size
 
 
 class Skycal(OtherPackage):
-    """hera_cal's skycal: a delay and a phase per antenna, then gains by channel; the sky model is taken for the truth.
+    """hera_cal's skycal: a delay and a phase per antenna, then gains by channel; the sky model is taken as true.
 
-    Amplitudes come from the cross-correlations alone, and not from the autocorrelations as in HERA's own pipeline.
+    Amplitudes come only from the cross-correlations, and not from the autocorrelations as in HERA's own pipeline.
     """
 
     calibrator: str = "skycal"
@@ -23,7 +23,7 @@ class Skycal(OtherPackage):
     max_steps: int = Field(100, ge=1)
 
     def cost(self, size: Size) -> Cost:
-        """Return what the solves take: dense matrices of the antennas for each channel, some ten times."""
+        """Return the cost of the solves: dense matrices of the antennas for each channel, about ten times."""
         channels = size.channels.count * size.times * size.polarizations / self.integrations_per_solve
         seconds = 5 + 1e-6 * size.samples + 10 * channels * (2e-5 + 2e-9 * size.antennas**3)
         solve = size.samples * self.integrations_per_solve / (size.times * size.polarizations)
@@ -41,7 +41,7 @@ class Skycal(OtherPackage):
     def _solve_group(self, measured: Measured, times: slice) -> tuple[np.ndarray, Outcome]:
         """Return gains (Nants, Nfreqs), NaN where there are none.
 
-        The sums of w V M* and w |M|^2 over integrations are all that gains in common depend on.
+        Common gains depend only on the sums of w V M* and w |M|^2 over integrations.
         """
         data, sky, weights = measured.visibilities[times], measured.sky[times], measured.weights[times]
         weight = np.sum(weights * np.abs(sky) ** 2, axis=0)
@@ -59,7 +59,7 @@ class Skycal(OtherPackage):
         return gains, self._outcome(steps)
 
     def _delays(self, measured: Measured, ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Return gains (Nants, Nfreqs) of a delay and a phase each; unity if they are not asked for."""
+        """Return gains (Nants, Nfreqs) with a delay and a phase each; unity if `delays` is false."""
         gains = np.ones((measured.frame.n_antennas, measured.frame.n_channels), complex)
         if not self.delays:
             return gains

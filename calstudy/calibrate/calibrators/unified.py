@@ -1,4 +1,4 @@
-"""Gains, and what the sky model lacks, partly in common to redundant baselines (Byrne et al. 2021)."""
+"""Fit gains with a prior on errors of the sky model, partly common to redundant baselines (Byrne et al. 2021)."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ class Unified(LeastSquares, ForegroundFit):
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
-    # What is left of the foregrounds at the default tolerance is more than the EoR near the wedge.
+    # At the default tolerance the foreground residual exceeds the EoR near the wedge.
     solver: Solver = GaussNewtonSettings(tolerance=1e-5)

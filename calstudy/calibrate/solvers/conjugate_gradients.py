@@ -15,16 +15,8 @@ def conjugate_gradients(
 ) -> tuple[tf.Tensor, tf.Tensor]:
     """Solve ``operator(x) = right_side`` from zero; both operators must be symmetric and positive definite.
 
-    Parameters
-    ----------
-    tolerance
-        Stop when the residual's squared norm, in the metric of the preconditioner, has fallen by this factor.
-    max_iterations
-        int32 scalar.
-
-    Returns
-    -------
-    The solution, and the number of iterations.
+    Iterations stop when the residual's squared norm, in the metric of the preconditioner, has fallen by the factor
+    `tolerance`, or at `max_iterations`, an int32 scalar. Returns the solution and the number of iterations.
     """
     first = preconditioner(right_side)
     squared = inner_product(right_side, first)

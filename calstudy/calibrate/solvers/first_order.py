@@ -1,7 +1,7 @@
 """First-order descent on gains and foreground coefficients together; Adamax at 0.01 is the paper's solver.
 
 One call runs many steps inside one compiled loop. The loss is Eq. LOGLIKELIHOOD of visibilities in units of their rms,
-so that the learning rate is a relative change, plus the prior on the summed model where the problem asks for it.
+so that the learning rate is a relative change, plus the prior on the summed model where the problem has it.
 """
 
 from __future__ import annotations
@@ -35,16 +35,9 @@ STEPS_PER_CALL = 50
 
 
 class Descent(NamedTuple):
-    """What changes from step to step.
+    """Parameters and moments of the gradient after a step, and the parameters with the lowest loss so far.
 
-    Attributes
-    ----------
-    parameters
-        Where the descent is.
-    moments
-        First and second moment of the gradient, each of the shape of the parameters.
-    best, best_loss
-        The parameters with the lowest loss so far, and that loss.
+    The moments, first and second, have the shape of the parameters.
     """
 
     parameters: Parameters
@@ -55,7 +48,7 @@ class Descent(NamedTuple):
 
 @dataclass(frozen=True)
 class Optimizer:
-    """How a gradient becomes a step.
+    """Method and learning rate of the descent.
 
     Attributes
     ----------
@@ -64,11 +57,11 @@ class Optimizer:
     learning_rate
         Size of the first step, for visibilities in units of their rms.
     schedule
-        How the rate falls: not at all, along half a cosine, or by the same factor each step.
+        Decrease of the rate: none, along half a cosine, or by the same factor each step.
     final_rate
         Rate of the last step relative to the first, unless it is constant.
     max_steps
-        The last step.
+        Number of the last step.
     """
 
     method: Method = "adamax"
@@ -88,7 +81,7 @@ class Optimizer:
 
 
 def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
-    """Apply a function to all tensors of parameters, or of several alike."""
+    """Apply a function to all tensors of one or more parameters of the same structure."""
     return tf.nest.map_structure(function, *parameters)
 
 
@@ -100,14 +93,9 @@ def update(
     moments: tuple[Parameters, Parameters],
     gradient: Parameters,
 ) -> tuple[Parameters, tuple[Parameters, Parameters]]:
-    """Return parameters and moments after one step of Adamax, Adam (Kingma & Ba 2014) or plain gradient descent.
+    """Take one step of Adamax, Adam (Kingma & Ba 2014) or plain gradient descent; return parameters and moments.
 
-    Parameters
-    ----------
-    step
-        Number of this step, from one, in the dtype of the parameters.
-    moments
-        First and second moment of the gradient, each of the shape of the parameters.
+    `step` counts from one, in the dtype of the parameters.
     """
     if method == "sgd":
         return _map(lambda x, g: x - learning_rate * g, parameters, gradient), moments
@@ -136,7 +124,7 @@ class JointKernels:
         self.descend = tf.function(self._descend, jit_compile=True, autograph=False)
 
     def load(self, problem: CalibrationProblem, gains: np.ndarray) -> tuple[Parameters, FitData, float]:
-        """Return gains with the foregrounds that fit best, in weighted least squares, the data, and their unit."""
+        """Return gains with their best-fitting foregrounds, in weighted least squares, the data, and their unit."""
         exact = self.tensors.load(problem, tf.float64)
         start = pairs.to_pair(gains, tf.float64)
         coefficients: tuple[tf.Tensor, ...] = ()
@@ -155,14 +143,7 @@ class JointKernels:
     def estimate(self, parameters: Parameters, data: FitData, scale: float) -> Estimate:
         """Return gains and model in the problem's order and unit.
 
-        Parameters
-        ----------
-        parameters
-            Of the descent.
-        data
-            What it fits; holds the model if it is frozen.
-        scale
-            Unit of the visibilities in `data`, in the problem's unit.
+        `data` contain the model if it is frozen; `scale` is their unit, in the problem's unit.
         """
         model = data.model
         if model is None:
@@ -172,7 +153,7 @@ class JointKernels:
     def _descend(
         self, n_steps: tf.Tensor, done: tf.Tensor, descent: Descent, data: FitData
     ) -> tuple[Descent, tf.Tensor, tf.Tensor]:
-        """Take `n_steps` steps after `done`; returns the descent, the loss before each step, and the loss after all."""
+        """Take `n_steps` steps after `done`; return the descent, the loss before each step, and the loss after all."""
 
         def body(index: tf.Tensor, now: Descent, losses: tf.Tensor) -> tuple[tf.Tensor, Descent, tf.Tensor]:
             value, gradient = self.loss.value_and_gradient(now.parameters, data)
@@ -191,19 +172,7 @@ class JointKernels:
 
 @lru_cache(maxsize=4)
 def compiled(structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> JointKernels:
-    """Return the kernels of a structure and setting, compiled once for all its integrations.
-
-    Parameters
-    ----------
-    structure
-        Of the fit.
-    optimizer
-        How a gradient becomes a step.
-    precision
-        Of all that the descent computes.
-    prior
-        Of the overall scale; only ``sum`` is part of the loss.
-    """
+    """Return the kernels of a structure and setting, compiled once for all its integrations."""
     return JointKernels(structure, optimizer, precision, prior)
 
 
@@ -224,10 +193,8 @@ class FirstOrder:
 
     Parameters
     ----------
-    optimizer
-        The method, its learning rate and how many steps it takes at most.
     tolerance
-        In units of the data's mean square. Nothing is below zero: the number of steps is then fixed.
+        In units of the data's mean square. With zero, the number of steps is fixed.
     precision
         Float32 or float64 throughout.
     stop
@@ -236,7 +203,7 @@ class FirstOrder:
         tolerance. In single precision with a tolerance of 1e-14 that is when two consecutive losses are equal, which
         happens by chance once the loss falls slowly.
     keep
-        The ``best`` parameters seen, or the ``last``, as the authors do.
+        Return the ``best`` parameters, or the ``last``, as the authors do.
     """
 
     optimizer: Optimizer = Optimizer()
@@ -246,7 +213,7 @@ class FirstOrder:
     keep: Literal["best", "last"] = "best"
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> FirstOrderState:
-        """Start from the foregrounds that fit best, in weighted least squares, with the first gains."""
+        """Start from the first gains and their best-fitting foregrounds, in weighted least squares."""
         kernels = compiled(problem.structure, self.optimizer, self.precision, problem.prior)
         gains = problem.initial_gains if warm is None else warm.gains
         parameters, data, scale = kernels.load(problem, gains)
@@ -286,7 +253,7 @@ class FirstOrder:
         return None
 
     def terminate(self, state: FirstOrderState) -> Verdict | None:
-        """Judge by the change of the loss, by the rule asked for."""
+        """Decide by the change of the loss, with the chosen rule."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
             return Verdict("failed", f"the loss is not finite after {n_steps} steps; lower the learning rate")
@@ -310,7 +277,7 @@ class FirstOrder:
         return [loss * state.scale**2 for loss in state.history]
 
     def estimate(self, state: FirstOrderState) -> Estimate:
-        """Return the best gains and foregrounds seen, or the last."""
+        """Return the best gains and foregrounds so far, or the last."""
         chosen = state.descent.best if self.keep == "best" else state.descent.parameters
         return state.kernels.estimate(chosen, state.data, state.scale)
 

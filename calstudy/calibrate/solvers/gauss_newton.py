@@ -1,21 +1,22 @@
 """The default solver: foregrounds eliminated exactly, damped Gauss-Newton on the gains.
 
 Each step solves the damped normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`) by
-preconditioned conjugate gradients, with the damping tied to the loss, so that it vanishes towards the minimum. The
-first two steps of a cold start use the antenna blocks of each channel as preconditioner, all others the channel blocks
-of each antenna, which also predict how much the loss can still fall. Where baselines share models without a finite
-prior, the couplings between antennas remain the strong ones, and antenna blocks of each channel are used throughout.
+preconditioned conjugate gradients, with the damping proportional to the loss, so that it vanishes towards the minimum.
+The first two steps of a cold start use the antenna blocks of each channel as preconditioner, all others the channel
+blocks of each antenna, which also predict the decrease of the loss that is still possible. Where baselines share models
+without a finite prior, the couplings between antennas remain the strong ones, and antenna blocks of each channel are
+used throughout.
 
-With a finite prior, whose damping is smaller, it remembers what it was raised to after a step that did not lower the
-loss, and comes down as steps bring what they promise.
+With a finite prior the damping is smaller. It then stays raised after a step that did not lower the loss, and falls
+again as steps achieve their predicted decrease.
 
 Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
 that are smaller. They matter where the noise is far below the foregrounds. Once the loss is so small that single
 precision does not resolve the damping, convergence is checked in double precision, with a hundredth of the damping and
-a solution of the normal equations. If more is predicted to go, the iteration is stalled, or goes on in double precision
-if that is asked for. In such directions steps are long and valleys curved: the damping then remembers what it was
-raised to, gains change by the exponential of a step, along which a phase is only a phase, and steps have their
-geodesic acceleration added (Transtrum & Sethna 2012, arXiv:1201.5885).
+a solution of the normal equations. If a larger decrease is predicted, the iteration is stalled, or continues in double
+precision if that is requested. In such directions steps are long and valleys curved: the damping then stays raised,
+gains change by the exponential of a step, along which a phase is only a phase, and steps have their geodesic
+acceleration added (Transtrum & Sethna 2012, arXiv:1201.5885).
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from calstudy.calibrate.solvers.reduced import (
 CHANNEL_STEPS = 2
 # With a larger damping, no step is small enough to lower the loss.
 MAX_DAMPING = 1e4
-# What the damping is multiplied by once eigenvalues below it matter.
+# Factor on the damping once eigenvalues below it matter.
 CHECK = 1e-2
 # In the curved valleys that follow: what the damping is raised and lowered by; the length of an acceleration, relative
 # to its step, with which a step is too long; what a step gains of what it promises if the next is to be shorter, or may
@@ -78,8 +79,8 @@ class GaussNewtonState:
     data
         Visibilities, weights whose sum is one, and the model if it is frozen.
     channel_steps
-        Steps that are still to be accepted before the antenna blocks are made: none near a minimum, where a warm start
-        is, and a check of convergence.
+        Number of accepted steps until the antenna blocks are made: zero near a minimum, as at a warm start or a check
+        of convergence.
     boost
         Factor on the damping; grows whenever a step did not lower the loss.
     relief
@@ -89,9 +90,9 @@ class GaussNewtonState:
     preconditioner
         The antenna blocks, once they are in use.
     gained
-        Decrease of the loss by the last step that lowered it; infinite before the first. Where the damping remembers
-        what it was raised to, multiplied by that: what a step brings along slow directions is about inversely
-        proportional to the damping.
+        Decrease of the loss by the last step that lowered it; infinite before the first. Where the damping stays
+        raised, multiplied by its factor: the decrease along slow directions is about inversely proportional to the
+        damping.
     predicted
         Decrease of the loss that is predicted for the next step; infinite while unknown.
     """
@@ -119,18 +120,18 @@ class GaussNewtonState:
 
     @property
     def beyond_single(self) -> bool:
-        """Whether products are made in single precision, which does not resolve the damping that is due."""
+        """Whether products are in single precision, which does not resolve the damping for this loss."""
         kernels = self.kernels
         return kernels.dtype == tf.float32 and kernels.damping(self.history[-1]) <= kernels.dampings.least
 
     @property
     def curved(self) -> bool:
-        """Whether steps have their geodesic acceleration, and the damping remembers."""
+        """Whether steps have their geodesic acceleration, and the damping stays raised."""
         return self.relief < 1
 
     @property
     def decrease_to_come(self) -> float:
-        """Decrease of the loss by all steps to come, over the loss: a geometric series, from the last step to the next.
+        """Relative decrease of the loss by all further steps: a geometric series from the last and predicted decreases.
 
         Before the first step it is that of the next step alone.
         """
@@ -145,14 +146,14 @@ class GaussNewton:
     Parameters
     ----------
     tolerance
-        Converged when the next step is predicted to lower the loss by less than this of itself, and either the last
-        step did no more, or all steps to come together will not, if they go on shrinking at the same rate. A fit that
-        crawls by less than this at each step counts as converged.
+        Converged when the next step is predicted to lower the loss by less than this fraction, and either the last
+        step did not lower it more, or all further steps together will not, if they shrink at the same rate. A fit with
+        a long sequence of smaller decreases counts as converged.
     max_steps
-        Gauss-Newton steps at most.
+        Maximum number of Gauss-Newton steps.
     precision
-        Of the inner products; ``double`` goes on where single precision does not resolve the damping that is due, and
-        ``single`` is stalled if there is more to be gained.
+        Precision of the inner products. Where single precision does not resolve the damping for the loss, ``double``
+        continues, and ``single`` is stalled if a larger decrease is possible.
     """
 
     tolerance: float = 1e-3
@@ -160,7 +161,7 @@ class GaussNewton:
     precision: Literal["single", "double"] = "single"
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
-        """Project at the first gains, and take over the preconditioner of the warm start."""
+        """Project at the first gains, and reuse the preconditioner of the warm start."""
         memory: AntennaPreconditioner | None = None if warm is None else warm.memory
         kernels = compiled(problem.structure, problem.frozen)
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
@@ -179,7 +180,7 @@ class GaussNewton:
         return self._prepared(state)
 
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
-        """Try one damped step, and keep it if it lowers the loss; or check whether there is need of one."""
+        """Try one damped step, and accept it if it lowers the loss; or check whether another step is needed."""
         settled = self._settled(state)
         if self._goes_on(state) and (settled or (state.gained < state.history[-1] and not state.curved)):
             return self._checked(state)
@@ -191,7 +192,7 @@ class GaussNewton:
         gains = pairs.multiply(state.gains, pairs.exponential(relative) if state.curved else _one_plus(relative))
         trial = kernels.project(gains, *state.data)
         loss = float(trial.loss)
-        # Refused as well: a loss that is not a number, and no step at all, from blocks that are singular to float32.
+        # This also refuses a loss that is not a number, and a missing step, from blocks that are singular in float32.
         if not loss < state.history[-1]:
             return self._refused(state, step.promised)
         boosted, remembered = state.boost > 1, kernels.dampings.remembered
@@ -210,12 +211,12 @@ class GaussNewton:
         )
         if not kernels.by_channel:
             return self._prepared(state)
-        # Without slow directions, the next step will bring less than this one did. One that a boosted damping kept
-        # small says nothing of the next.
+        # Without slow directions, the next step lowers the loss less than this one. A step that a boosted damping kept
+        # small does not predict the next.
         return state if boosted else replace(state, predicted=step.promised)
 
     def terminate(self, state: GaussNewtonState) -> Verdict | None:
-        """Judge convergence by the decrease of the loss that the next step is predicted to bring."""
+        """Decide by the predicted decrease of the loss in the next step."""
         loss, n_steps = state.history[-1], len(state.history) - 1
         if not math.isfinite(loss):
             return Verdict("failed", "the loss at the first gains is not finite")
@@ -241,11 +242,11 @@ class GaussNewton:
 
     @property
     def _rounding(self) -> float:
-        """Loss relative to the data below which a residual is left as it is."""
+        """Loss relative to the data below which the residual is rounding."""
         return ROUNDING_LOSS_IN_DOUBLE if self.precision == "double" else ROUNDING_LOSS
 
     def _settled(self, state: GaussNewtonState) -> bool:
-        """Whether the loss will hardly fall, as far as the damping lets be seen."""
+        """Whether the predicted decrease of the loss, at this damping, is below the tolerance."""
         loss = state.history[-1]
         if state.checked:
             most = self.tolerance if self.precision == "double" else max(self.tolerance, UNRESOLVED)
@@ -254,7 +255,7 @@ class GaussNewton:
         return state.predicted / loss < self.tolerance and falling < self.tolerance
 
     def _goes_on(self, state: GaussNewtonState) -> bool:
-        """Whether the iteration is, or is to be, in double precision."""
+        """Whether the iteration is in double precision, or must continue there."""
         return self.precision == "double" and (state.beyond_single or state.curved)
 
     def _checked(self, state: GaussNewtonState) -> GaussNewtonState:
@@ -263,7 +264,7 @@ class GaussNewton:
             state = _in_double(state, self.precision == "double")
         state = self._prepared(replace(state, relief=CHECK, boost=1.0))
         promised = self._plain_step(state).promised
-        # A preconditioner that rounding has spoiled promises nothing, and says nothing.
+        # A preconditioner that rounding has spoiled predicts no decrease, and is not evidence of convergence.
         return replace(state, predicted=promised if promised > 0 else math.inf, checked=True)
 
     def _plain_step(self, state: GaussNewtonState) -> _Step:
@@ -277,20 +278,20 @@ class GaussNewton:
         return _Step(eta, float(promised), bool(iterations > CG_REFRESH))
 
     def _curved_step(self, state: GaussNewtonState) -> tuple[GaussNewtonState, _Step]:
-        """Return the state with the damping that keeps a step about straight, and the step with its acceleration."""
+        """Raise the damping until the step is nearly straight; return the state and the step with its acceleration."""
         while True:
             step = self._plain_step(state)
             inverse = None if state.preconditioner is None else state.preconditioner.inverse
             arguments = state.projection, state.gains, inverse, state.kernels.scalar(state.damping), step.eta
             acceleration = state.kernels.accelerate(*arguments)
             relative = float(tf.norm(acceleration) / tf.norm(step.eta))
-            # Written so that what is no number counts as curved.
+            # Written so that NaN counts as curved.
             if relative < TOO_CURVED or state.damping > MAX_DAMPING:
                 return state, step._replace(eta=step.eta + 0.5 * acceleration)
             state = self._prepared(replace(state, boost=RAISE * state.boost))
 
     def _refused(self, state: GaussNewtonState, promised: float) -> GaussNewtonState:
-        # At the minimum itself no step brings anything.
+        # At the minimum itself no step lowers the loss.
         if state.kernels.by_channel and state.boost == 1 and promised > 0:
             state = replace(state, predicted=promised)
         history = (*state.history, state.history[-1])
@@ -301,12 +302,12 @@ class GaussNewton:
         return [loss * state.loss_unit for loss in state.history]
 
     def estimate(self, state: GaussNewtonState) -> Estimate:
-        """Return the current gains, and the foregrounds that fit best with them."""
+        """Return the current gains and their best-fitting foregrounds."""
         model = state.kernels.tensors.unload(state.projection.model, state.scale)
         return Estimate(pairs.to_complex(state.gains), model)
 
     def newton_decrement(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
-        """Return the predicted decrease that convergence is judged by; looked up anew if the iteration has none yet."""
+        """Return the predicted relative decrease of the loss; computed anew if the iteration has no prediction."""
         loss = state.history[-1]
         if loss < self._rounding:
             return 0.0
@@ -318,14 +319,14 @@ class GaussNewton:
         return newton_decrement_at(problem, pairs.to_complex(state.gains))
 
     def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
-        """Return the antenna blocks, which hardly change from one integration to the next.
+        """Return the antenna blocks, which change little from one integration to the next.
 
-        Those of double precision are not kept: each integration finds out by itself whether it goes on there.
+        Those of double precision are not kept: each integration decides by itself whether it continues there.
         """
         return state.preconditioner if state.kernels.dtype == tf.float32 else None
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
-        """Bring the antenna blocks to the damping of the state, or make them, and let them predict the next step."""
+        """Adapt the antenna blocks to the damping of the state, or compute them, and predict the next step."""
         preconditioner = state.preconditioner
         kernels = state.kernels
         # Smooth gains couple all channels from the start.
@@ -349,7 +350,7 @@ class GaussNewton:
 
 
 class _Step(NamedTuple):
-    """A step eta, the decrease of the loss that it promises, and whether its preconditioner is out of date."""
+    """A step eta, the decrease of the loss that its quadratic model predicts, and whether its preconditioner is old."""
 
     eta: tf.Tensor
     promised: float
@@ -361,7 +362,7 @@ def _one_plus(values: tf.Tensor) -> tf.Tensor:
 
 
 def _next_boost(boost: float, gain: float) -> float:
-    """Return the factor on the damping after a step that lowered the loss by `gain` times what it promised."""
+    """Return the factor on the damping after a step with `gain` times the predicted decrease of the loss."""
     if gain < POOR:
         return RAISE * boost
     return max(1.0, boost / LOWER) if gain > GOOD else boost

@@ -1,4 +1,4 @@
-"""What every solver offers, and the loop that drives it."""
+"""The interface of solvers, and the loop that drives them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from calstudy.calibrate.solution import Solution, Status
 
 logger = logging.getLogger(__name__)
 
-# A loss that stands still while more of it than this could go has not converged: fixed learning rates jitter in place.
+# A loss that stalls while it could fall by more than this fraction has not converged: fixed learning rates jitter.
 STILL = 0.01
-# Power of a baseline over that of the strongest of either of its antennas, below which Gauss-Newton steps in single
-# precision do not see it; and what of it may be left then, which is rounding.
+# Power of a baseline relative to the strongest one of either of its antennas, below which Gauss-Newton steps in single
+# precision do not resolve it; and the relative power of its residual that is rounding.
 HIDDEN, ROUNDING = 1e-8, 1e-10
 
 
@@ -31,14 +31,14 @@ class Estimate(NamedTuple):
 
 
 class WarmStart(NamedTuple):
-    """What a solve leaves for the next one with the same structure, such as the next integration.
+    """The start of the next solve with the same structure, such as the next integration, from a previous solution.
 
     Attributes
     ----------
     gains
         The solution's gains, shape (Nants, Nfreqs).
     memory
-        Whatever the solver can reuse; None if nothing.
+        Anything that the solver can reuse; None if nothing.
     """
 
     gains: np.ndarray
@@ -53,11 +53,11 @@ class Verdict(NamedTuple):
 
 
 class Solver(Protocol):
-    """An iteration over states of its own kind. Solvers hold settings only; all that changes is in the state."""
+    """An iteration over states of its own kind. Solvers hold settings only; everything that changes is in the state."""
 
     @property
     def tolerance(self) -> float:
-        """Return what the solver takes for converged, by a measure of its own."""
+        """Return the solver's threshold of convergence, by a measure of its own."""
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> Any:
         """Return the first state, at the warm start's gains if there is one and at the problem's otherwise."""
@@ -78,7 +78,7 @@ class Solver(Protocol):
         """Return the relative Newton decrement at the estimate (see `Solution`); NaN if unknown."""
 
     def memory(self, state: Any) -> Any:
-        """Return what the next solve can reuse, or None."""
+        """Return data that the next solve can reuse, or None."""
 
 
 def solve_warm(
@@ -86,17 +86,9 @@ def solve_warm(
 ) -> tuple[Solution, WarmStart | None]:
     """Solve one problem from a warm start, and return the solution with the warm start for the next.
 
-    The solution has its degeneracies fixed (see `calstudy.calibrate.degeneracy`). Not converging is a status, not an
-    error; after a failed solve there is no warm start.
-
-    Parameters
-    ----------
-    problem
-        What is fitted.
-    solver
-        Its settings; all that changes is in its states.
-    warm
-        Of an earlier solve with the same structure; None to start from the problem's initial gains.
+    The solution has its degeneracies fixed (see `calstudy.calibrate.degeneracy`). A lack of convergence is a status,
+    not an error; after a failed solve there is no warm start. With `warm` of None the solve starts from the problem's
+    initial gains.
     """
     solution, state = _solve(problem, solver, warm)
     return solution, WarmStart(solution.gains, solver.memory(state)) if solution.usable else None
@@ -141,7 +133,7 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
 
 
 def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> str | None:
-    """Say that baselines are too weak for a solver to see their residuals, beside others of both their antennas."""
+    """Report baselines whose residuals a solver does not resolve beside those of much stronger baselines."""
     antennas, weights = problem.structure.antennas, problem.weights
     count = np.maximum(np.count_nonzero(weights, axis=1), 1)
     residual = problem.visibilities - gain_products(gains, antennas) * model
@@ -160,16 +152,10 @@ def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -
 
 
 def decrement_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem, newton_decrement: float) -> float:
-    """Return the rms of the part of the residual that is left because the iteration stopped, in the unit of the data.
+    """Return the rms of the part of the residual that is due to the end of the iteration, in the unit of the data.
 
-    Parameters
-    ----------
-    gains, model
-        The estimate, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    problem
-        What was fitted.
-    newton_decrement
-        Relative: the share of this part in the weighted power of V / (g_a g_b*) - F.
+    `newton_decrement` is the fraction of this part in the weighted power of V / (g_a g_b*) - F. The estimate is
+    complex, (Nants, Nfreqs) and (Nbls, Nfreqs).
     """
     products = gain_products(gains, problem.structure.antennas)
     loss = np.sum(problem.weights * np.abs(problem.visibilities - products * model) ** 2)

@@ -1,7 +1,7 @@
 """L-BFGS on the gains, foregrounds eliminated exactly (scipy's implementation of Byrd et al. 1995).
 
-Gains are scaled by the square root of what their antenna adds to the curvature of the loss, so that all unknowns have
-about the same, which is what the method starts from.
+Gains are scaled by the square root of their antenna's contribution to the curvature of the loss, so that all unknowns
+have about the same curvature, which is the initial assumption of the method.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class LbfgsState:
     Attributes
     ----------
     coordinates
-        Of the gains in their space, times `unit`, float64.
+        Coordinates of the gains in their space, times `unit`, float64.
     unit
         Scale of each antenna's coordinates, (1, Nants, 1), float64.
     newton_decrement
         Relative Newton decrement (see `Solution`); infinite while unknown.
     message
-        What scipy said at the end; None before.
+        Message of scipy at the end; None before.
     """
 
     problem: CalibrationProblem
@@ -57,11 +57,11 @@ class LbfgsState:
         return self.kernels.exact_space.expand(tf.constant(coordinates / self.unit))
 
     def newton_decrement_at(self, coordinates: np.ndarray) -> float:
-        """Return the relative Newton decrement there."""
+        """Return the relative Newton decrement at these coordinates."""
         return newton_decrement_at(self.problem, pairs.to_complex(self.gains(coordinates)))
 
     def project(self, coordinates: np.ndarray) -> tuple[tf.Tensor, Projection]:
-        """Return the gains with these coordinates, and the foregrounds eliminated there."""
+        """Return the gains with these coordinates, and the projection there."""
         gains = self.gains(coordinates)
         return gains, self.kernels.project(gains, *self.reduced.data)
 
@@ -73,11 +73,11 @@ class Lbfgs:
     Parameters
     ----------
     tolerance
-        Converged when a Gauss-Newton step would lower the loss by less than this of itself.
+        Converged when a Gauss-Newton step would lower the loss by less than this fraction.
     max_steps
-        Steps at most.
+        Maximum number of steps.
     memory_size
-        Pairs of steps and gradients that are kept.
+        Number of pairs of steps and gradients that are kept.
     """
 
     tolerance: float = 1e-3
@@ -136,7 +136,7 @@ class Lbfgs:
         )
 
     def terminate(self, state: LbfgsState) -> Verdict | None:
-        """Judge by the Newton decrement."""
+        """Decide by the Newton decrement."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
             return Verdict("failed", f"the loss is not finite after {n_steps} steps")

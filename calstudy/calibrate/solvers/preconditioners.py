@@ -1,21 +1,21 @@
 """Approximations of the Gauss-Newton matrix of the gains, and their inverses.
 
 Far from the minimum the couplings between antennas within a channel matter most; close to it, those between channels
-within an antenna, which the eliminated foregrounds bring in. Where the damping is so small that smooth gains of all
-antennas together, which foregrounds can follow, are to be resolved, both matter.
+within an antenna, which the eliminated foregrounds cause. Where the damping is so small that smooth gains of all
+antennas together, which foregrounds can follow, must be resolved, both matter.
 
 In the notation of `calstudy.calibrate.projection`, the block of one antenna is K - C. K is diagonal, the sum of D |F|^2
-over the antenna's baselines: its degrees. C is what the foregrounds of these baselines absorb, the sum of
-(D F)^* P S^T S P^T (D F) with the span P of a baseline's batch, conjugated where the antenna is the second of its
-baseline. Foregrounds of few vectors follow only what is smooth, so that K - C is close to zero for some gains in the
-span of the common basis Q of all foregrounds only, and not much below K for others. The preconditioner M has the values
+over the antenna's baselines: its degrees. C is the part that the foregrounds of these baselines absorb, the sum of (D
+F)^* P S^T S P^T (D F) with the span P of a baseline's batch, conjugated where the antenna is the second of its
+baseline. Foregrounds of few vectors follow only smooth changes, so that K - C is close to zero only for some gains in
+the span of the common basis Q of all foregrounds, and not much below K for others. The preconditioner M has the values
 of the block on that span, and is K on its complement in the metric of K:
 
     M = K - L (Q^T C Q) L^T, L = K Q (Q^T K Q)^-1
     M^-1 = K^-1 + Q [ (Q^T (K - C) Q)^-1 - (Q^T K Q)^-1 ] Q^T
 
-M is positive definite, because C nowhere exceeds K. With a damping relative to the diagonal, K stands for
-(1 + damping) K, which leaves L as it is.
+M is positive definite, because C nowhere exceeds K. With a damping relative to the diagonal, K is replaced by (1 +
+damping) K, which does not change L.
 
 The coupled blocks have the same form, with all antennas in one: M has the values of the whole Gauss-Newton matrix on
 the span of Q, for gains of any antennas, and is K on its complement.
@@ -33,12 +33,12 @@ from calstudy.calibrate.batches import Piece, column_products, joined
 from calstudy.calibrate.projection import Linearization, Projection, Projector
 from calstudy.calibrate.tensors import Ends, FitTensors
 
-# Antennas and channels with hardly any data count as having this fraction of the mean.
+# Floor of the degrees relative to their mean, for antennas and channels with few data.
 DEGREE_FLOOR = 1e-4
 
 
 class Inverse(Protocol):
-    """What a preconditioner is to the iteration."""
+    """The inverse of a preconditioner."""
 
     def apply(self, values: tf.Tensor) -> tf.Tensor:
         """Return the inverse times real and imaginary parts of the gains, or of their coordinates, (2, Nants, N)."""
@@ -67,19 +67,11 @@ class ChannelInverse(NamedTuple):
 
 
 def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Tensor) -> ChannelInverse:
-    """Return the inverse of the damped antenna blocks of each channel.
+    """Invert the damped antenna blocks of each channel.
 
     Foregrounds are held fixed in these blocks, so that real and imaginary parts of eta decouple: the blocks are the
-    degree plus and minus the coupling matrix.
-
-    Parameters
-    ----------
-    tensors
-        Of the fit.
-    projection
-        The reduced problem at the gains in question.
-    damping
-        Relative to the diagonal, scalar, in the precision of the projection.
+    degree plus and minus the coupling matrix. The damping is relative to the diagonal, scalar, in the precision of the
+    projection.
     """
     shape = [tensors.n_antennas, tensors.n_antennas, tensors.n_frequencies]
     coupling = tf.transpose(tf.scatter_nd(tf.stack(tensors.ends, axis=1), projection.power(), shape), [2, 0, 1])
@@ -102,7 +94,7 @@ class AntennaBlocks(NamedTuple):
     degrees
         K, (Nants, Nfreqs).
     common
-        Q, (Nfreqs, rank); None, like all that follows, if there are no foregrounds to absorb anything.
+        Q, (Nfreqs, rank); None, like all that follows, if there are no foregrounds.
     gram
         Q^T K Q, (Nants, rank, rank).
     absorbed
@@ -116,7 +108,7 @@ class AntennaBlocks(NamedTuple):
 
 
 def antenna_blocks(projector: Projector, projection: Projection) -> AntennaBlocks:
-    """Return the channel blocks of each antenna.
+    """Compute the channel blocks of each antenna.
 
     Couplings between baselines that share a foreground model are left out; the blocks stay positive.
     """
@@ -154,14 +146,8 @@ def _absorbed(projector: Projector, piece: Piece, span: tf.Tensor | None, part: 
 class AntennaInverse(NamedTuple):
     """Inverse of the channel blocks of each antenna, ``diagonal + Q correction Q^T``.
 
-    Attributes
-    ----------
-    common
-        Q, (Nfreqs, rank).
-    diagonal
-        1 / ((1 + damping) K), (Nants, Nfreqs).
-    correction
-        Hermitian, real and imaginary part, (2, Nants, rank, rank).
+    `common` is Q, (Nfreqs, rank), and `diagonal` is 1 / ((1 + damping) K), (Nants, Nfreqs). `correction` is Hermitian,
+    real and imaginary part, (2, Nants, rank, rank).
     """
 
     common: tf.Tensor
@@ -179,7 +165,7 @@ class AntennaInverse(NamedTuple):
 
 
 def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse:
-    """Return the inverse of the damped blocks, for gains of any value in any channel."""
+    """Invert the damped blocks, for gains of any value in any channel."""
     # The inverse of a small difference of large numbers: what float32 has lost of it is below the damping.
     gram = tf.cast(1 + damping, tf.float64) * tf.cast(blocks.gram, tf.float64)
     real, imaginary = tf.unstack(tf.cast(blocks.absorbed, tf.float64))
@@ -191,8 +177,9 @@ def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse
 class CoupledBlocks(NamedTuple):
     """The Gauss-Newton matrix on the span of the common basis, for baselines that each have their own model.
 
-    A baseline sees eta_a + eta_b*. Real parts of both antennas have the same matrix, `alike`, imaginary parts have its
-    negative between the two, and real parts have `crossed` with imaginary ones, negative for those of the second.
+    A baseline depends on eta_a + eta_b*. Real parts of both antennas have the same matrix, `alike`. Imaginary parts
+    have its negative between the two antennas. Real parts couple to imaginary ones by `crossed`, negative for those of
+    the second antenna.
 
     Attributes
     ----------
@@ -203,9 +190,9 @@ class CoupledBlocks(NamedTuple):
     gram
         Q^T K Q, (Nants, rank, rank).
     alike
-        Q^T (D |F|^2 - C) Q of each baseline, its symmetric part, (Nbls, rank, rank).
+        Symmetric part of Q^T (D |F|^2 - C) Q of each baseline, (Nbls, rank, rank).
     crossed
-        The antisymmetric part of what it absorbs.
+        Antisymmetric part of Q^T C Q, of the same shape.
     """
 
     degrees: tf.Tensor
@@ -230,7 +217,7 @@ class CoupledBlocks(NamedTuple):
 
 
 def coupled_blocks(projector: Projector, projection: Projection) -> CoupledBlocks:
-    """Return the Gauss-Newton matrix on the span of the common basis."""
+    """Compute the Gauss-Newton matrix on the span of the common basis."""
     common, degrees = projector.common, antenna_degrees(projector.tensors, projection)
     both = joined([_absorbed(projector, *of_piece) for of_piece in projector.of_pieces(projection)], 0)
     turned = tf.linalg.matrix_transpose(both)
@@ -241,16 +228,8 @@ def coupled_blocks(projector: Projector, projection: Projection) -> CoupledBlock
 class CoupledInverse(NamedTuple):
     """Inverse of the damped coupled blocks.
 
-    Attributes
-    ----------
-    common
-        Q, (Nfreqs, rank).
-    diagonal
-        1 / ((1 + damping) K), (Nants, Nfreqs).
-    factor
-        Cholesky factor of the damped matrix.
-    gram_inverse
-        Of (1 + damping) Q^T K Q, (Nants, rank, rank).
+    `common` is Q, (Nfreqs, rank), and `diagonal` is 1 / ((1 + damping) K), (Nants, Nfreqs). `factor` is the Cholesky
+    factor of the damped matrix, and `gram_inverse` the inverse of (1 + damping) Q^T K Q, (Nants, rank, rank).
     """
 
     common: tf.Tensor
@@ -267,16 +246,9 @@ class CoupledInverse(NamedTuple):
 
 
 def coupled_inverse(blocks: CoupledBlocks, ends: Ends, damping: float) -> CoupledInverse:
-    """Return the inverse of the damped coupled blocks; one of no numbers if rounding has left them indefinite.
+    """Invert the damped coupled blocks, in double precision; all NaN if rounding has left them indefinite.
 
-    Parameters
-    ----------
-    blocks
-        In double precision.
-    ends
-        Antennas of the baselines.
-    damping
-        Relative to the diagonal.
+    The damping is relative to the diagonal.
     """
     matrix, gram = blocks.matrix(ends), blocks.gram.numpy()
     n_antennas, rank = gram.shape[:2]
@@ -310,12 +282,10 @@ class CoordinateInverse(NamedTuple):
 
 
 def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Tensor) -> CoordinateInverse:
-    """Return the inverse of the damped blocks for gains in a space of smooth ones.
+    """Invert the damped blocks for gains in a space of smooth ones.
 
-    Parameters
-    ----------
-    columns
-        Relative change of each antenna's gain for a unit of each coordinate, (Nants, Nfreqs, Ngain), complex64.
+    `columns` are the relative changes of each antenna's gain for a unit of each coordinate, (Nants, Nfreqs, Ngain),
+    complex64.
     """
     diagonal = tf.cast((1 + damping) * blocks.degrees, columns.dtype)
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
@@ -329,6 +299,6 @@ def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Te
 
 
 def _inverse(matrices: tf.Tensor) -> tf.Tensor:
-    """Return the inverses of positive definite matrices, (..., N, N)."""
+    """Invert positive definite matrices, (..., N, N)."""
     identity = tf.eye(tf.shape(matrices)[-1], batch_shape=tf.shape(matrices)[:-2], dtype=matrices.dtype)
     return tf.linalg.cholesky_solve(tf.linalg.cholesky(matrices), identity)

@@ -1,4 +1,4 @@
-"""The problem for the gains alone, with the foregrounds eliminated: what its solvers have in common.
+"""The problem for the gains alone, with the foregrounds eliminated, as all its solvers use it.
 
 Eliminating the foregrounds (`calstudy.calibrate.projection`) leaves a least-squares problem for relative changes eta of
 the gains, g (1 + eta). At given gains it has a loss L, half of its negative gradient d (the descent direction) and a
@@ -8,8 +8,8 @@ Gauss-Newton matrix H. The damped normal equations
 
 with the diagonal K of `calstudy.calibrate.solvers.preconditioners.antenna_degrees`, are solved by preconditioned
 conjugate gradients. The step is predicted to lower the loss by d^T eta. With a damping that vanishes with the loss this
-is the Newton decrement; relative to the loss it says how far from the minimum any solver has stopped. Where the
-preconditioner has the channel blocks of each antenna, its inverse stands for that of H + mu K.
+is the Newton decrement; relative to the loss it measures the distance from the minimum at which any solver has stopped.
+Where the preconditioner has the channel blocks of each antenna, its inverse approximates that of H + mu K.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ class Dampings(NamedTuple):
     Attributes
     ----------
     per_loss
-        Over the loss relative to the data; `MOST_DAMPING` at most.
+        Damping over the loss relative to the data; the damping is `MOST_DAMPING` at most.
     least
-        What products in a precision can resolve.
+        Smallest damping that products in a precision can resolve.
     preconditioner
-        Blocks in a precision cannot be inverted with less.
+        Smallest damping with which blocks in a precision can be inverted.
     remembered
-        Whether what the damping was raised to is kept for the next steps.
+        Whether the damping stays raised for the next steps.
     """
 
     per_loss: float
@@ -89,7 +89,7 @@ class ReducedData(NamedTuple):
     Attributes
     ----------
     gains
-        Where to start, (2, Nants, Nfreqs), float64.
+        Gains to start from, (2, Nants, Nfreqs), float64.
     data
         Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) whose sum is one, and the model if it is frozen; float64.
     scale
@@ -105,18 +105,9 @@ class ReducedData(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """The damped Gauss-Newton equations at one point, and what preconditions them.
+    """The damped Gauss-Newton equations at gains (2, Nants, Nfreqs), and the inverse of their preconditioner.
 
-    Attributes
-    ----------
-    projection
-        The reduced problem there.
-    gains
-        (2, Nants, Nfreqs).
-    damping
-        Relative to the diagonal, scalar.
-    inverse
-        Preconditioner.
+    The damping is relative to the diagonal, scalar.
     """
 
     projection: Projection
@@ -128,9 +119,9 @@ class NormalEquations(NamedTuple):
 def as_graph(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that TensorFlow runs as a graph, without the passes of its graph optimizer.
 
-    They take a quarter to a half of the time that compiling takes, and change results by rounding alone. Without them
-    solves of 350 antennas take 1 to 7 percent longer: ten of these use up what is gained. The option is one of the
-    whole process; it is put back after each call.
+    They take a quarter to a half of the compilation time, and change results by rounding only. Without them solves of
+    350 antennas take 1 to 7 percent longer, so that ten of these offset the gain. The option applies to the whole
+    process; it is restored after each call.
     """
     graph = tf.function(function, autograph=False)
 
@@ -155,11 +146,11 @@ class ReducedKernels:
         the strong ones where baselines share models or coefficients without a finite prior, and are the only ones where
         the foregrounds are frozen.
     dampings
-        Of the fit in its precision.
+        Dampings of the fit in its precision.
     coupled
         Whether the preconditioner has the couplings between smooth gains of all antennas, besides the blocks of each
-        antenna: of thorough kernels, if the array is not too large and each baseline has a model and coefficients of
-        its own only.
+        antenna: for thorough kernels, if the array is not too large and each baseline has only its own model and
+        coefficients.
     """
 
     def __init__(
@@ -193,7 +184,7 @@ class ReducedKernels:
         return alone and self.structure.gain_vectors is None and rows <= MOST_COUPLED
 
     def in_double(self, thorough: bool) -> ReducedKernels:
-        """Return the kernels of the same fit whose inner products are float64 (see `compiled`)."""
+        """Return the kernels of the same fit with inner products in float64 (see `compiled`)."""
         return compiled(self.structure, self.frozen, tf.float64, thorough)
 
     def scalar(self, value: float) -> tf.Tensor:
@@ -221,7 +212,7 @@ class ReducedKernels:
     def _channel_step(
         self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor
     ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta, and the decrease of the loss that its quadratic model promises."""
+        """Return eta, and the decrease of the loss that its quadratic model predicts."""
         inverse = channel_inverse(self.tensors, projection, damping)
         descent = tf.cast(projection.descent, self.dtype)
         equations = NormalEquations(projection, gains, damping, inverse)
@@ -233,17 +224,9 @@ class ReducedKernels:
     ) -> tf.Tensor:
         """Return the geodesic acceleration of a step eta (Transtrum & Sethna 2012), (2, Nants, Nfreqs).
 
-        It solves the damped normal equations of the step for the second derivative of the residual along eta, and half
-        of it added to eta keeps a long step in a curved valley.
-
-        Parameters
-        ----------
-        projection, gains, damping
-            As for the step.
-        inverse
-            Its preconditioner; None for the antenna blocks of each channel.
-        eta
-            The step.
+        It solves the damped normal equations of the step for the second derivative of the residual along eta. Half of
+        it added to eta keeps a long step in a curved valley. With `inverse` of None, the preconditioner has the antenna
+        blocks of each channel.
         """
         if inverse is None:
             inverse = channel_inverse(self.tensors, projection, damping)
@@ -254,7 +237,7 @@ class ReducedKernels:
     def _antenna_step(
         self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
     ) -> tuple[tf.Tensor, tf.Tensor, tf.Tensor]:
-        """Return eta, the decrease of the loss that its quadratic model promises, and the iterations it took."""
+        """Return eta, the decrease of the loss that its quadratic model predicts, and the number of iterations."""
         descent = tf.cast(projection.descent, self.dtype)
         equations = NormalEquations(projection, gains, damping, inverse)
         eta, iterations = self.solve(equations, descent, self.cg_tolerance, CG_ANTENNA_ITERATIONS)
@@ -263,16 +246,10 @@ class ReducedKernels:
     def solve(
         self, equations: NormalEquations, descent: tf.Tensor, tolerance: float, iterations: int
     ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta for a descent direction, both (2, Nants, Nfreqs), and the iterations it took.
+        """Return eta for a descent direction, both (2, Nants, Nfreqs), and the number of iterations.
 
-        Parameters
-        ----------
-        equations
-            What is solved.
-        descent
-            Minus half the gradient in eta.
-        tolerance, iterations
-            See `calstudy.calibrate.solvers.conjugate_gradients.conjugate_gradients`.
+        `descent` is minus half the gradient in eta; for tolerance and iterations see
+        `calstudy.calibrate.solvers.conjugate_gradients.conjugate_gradients`.
         """
         projection = equations.projection
         diagonal = equations.damping * antenna_degrees(self.tensors, projection)
@@ -298,7 +275,7 @@ class ReducedKernels:
         return (coupled_blocks if self.coupled else antenna_blocks)(self.projector, projection)
 
     def inverse(self, blocks: AntennaBlocks | CoupledBlocks, damping: tf.Tensor, gains: tf.Tensor) -> Inverse:
-        """Return the inverse of damped blocks, at gains (2, Nants, Nfreqs)."""
+        """Invert damped blocks, at gains (2, Nants, Nfreqs)."""
         if isinstance(blocks, CoupledBlocks):
             return coupled_inverse(blocks, self.tensors.ends, float(damping))
         return self._antenna_inverse(blocks, damping, gains)
@@ -318,15 +295,9 @@ def compiled(
 ) -> ReducedKernels:
     """Return the kernels of a structure, compiled once for all its integrations.
 
-    Parameters
-    ----------
-    structure, frozen
-        Of the fit.
-    dtype
-        Of the inner products (see `calstudy.calibrate.projection.Projector`).
-    thorough
-        Whether gains that foregrounds can nearly follow are to be resolved, with coupled blocks and foregrounds that
-        answer twice: for an iteration in double precision, not for a look whether there is need of one.
+    `dtype` is that of the inner products (see `calstudy.calibrate.projection.Projector`). With `thorough`, they resolve
+    gains that foregrounds can nearly follow, by coupled blocks and foregrounds that respond twice: for an iteration in
+    double precision, not for a check whether one is needed.
     """
     return _kernels(structure, frozen, dtype, thorough)
 
@@ -336,15 +307,7 @@ _kernels = lru_cache(maxsize=6)(ReducedKernels)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
-    """Return the relative Newton decrement of the reduced problem at given gains (see `Solution`).
-
-    Parameters
-    ----------
-    problem
-        Data and weights.
-    gains
-        Where any solver stopped, (Nants, Nfreqs).
-    """
+    """Return the relative Newton decrement of the reduced problem at gains (Nants, Nfreqs) (see `Solution`)."""
     kernels = compiled(problem.structure, problem.frozen)
     reduced = kernels.reduce(problem, gains)
     projection = kernels.project(reduced.gains, *reduced.data)
