@@ -1,4 +1,4 @@
-"""Calibrators in worlds side by side: the scores of all cases, and the table of them."""
+"""Calibrators in several worlds: the scores of all cases, and their table."""
 
 from __future__ import annotations
 
@@ -23,23 +23,15 @@ if TYPE_CHECKING:
 
 CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
-"""What is compared in bands of k, and how it is headed."""
+"""Quantities compared in bands of k, and their symbols."""
 DIFFERENCES = ("transfer", "transfer_error", "bias", "bias_error")
 SPECTRA = ("signal", "response", "residual", "residual_without_eor")
-"""What the scores are made from, and what differences of two of them are."""
+"""Spectra that scores, and differences of two scores, are computed from."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One calibrator in one world.
-
-    Attributes
-    ----------
-    bins, bands
-        Its scores in the experiment's bins of k, and in wide bands.
-    summary
-        All of its numbers, as in score.json.
-    """
+    """Scores of one calibrator in one world, in the experiment's bins of k and in wide bands, and its score.json."""
 
     bins: Score
     bands: Score
@@ -47,7 +39,7 @@ class Case:
 
 
 def case_name(world: int, calibrator: int) -> str:
-    """Return the name of a case among the inputs of a task, from the places of world and calibrator."""
+    """Return the name of a case among the inputs of a task, from the indices of world and calibrator."""
     return f"{world:03d}:{calibrator:03d}"
 
 
@@ -56,24 +48,23 @@ def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Task]
 
     Parameters
     ----------
-    title
-        Name of the study.
     labels
-        ``calibrators`` and ``worlds`` in order, and ``refusals``: world, calibrator and why it cannot work there.
+        ``calibrators`` and ``worlds`` in order, and ``refusals``: world, calibrator and the reason why it cannot work
+        there.
     scores
-        Of all other cases, by `case_name`.
+        Tasks of all other cases, by `case_name`.
     notes
-        What stands in for the papers' own ingredients.
+        Substitutions for the papers' own ingredients.
     """
     powers = {f"{case}:{name}": task.inputs[name] for case, task in scores.items() for name in SPECTRA}
-    # All cases are measured alike.
+    # All cases have the same settings of spectra.
     buffers = {task.settings["power"].wedge_buffer for task in scores.values()}
     settings = {"title": title, **labels, "notes": list(notes), "wedge_buffer": max(buffers, default=0.0)}
     return Task(COMPARISON, "comparison", settings, {**scores, **powers})
 
 
 def read_cases(job: Job) -> dict[str, dict[str, Case]]:
-    """Return the cases of a job by the labels of world and calibrator, in the order of the file; none if refused."""
+    """Return the cases of a job by labels of world and calibrator, in the order of the file, without refused ones."""
     return {
         world: {
             calibrator: _read(job.inputs[case_name(row, column)])
@@ -93,9 +84,9 @@ def _read(folder: Path) -> Case:
 
 
 def best(found: Mapping[str, Case], band: int) -> str | None:
-    """Return the best calibrator of a world in a band of k, or None if nothing is known there.
+    """Return the best calibrator of a world in a band of k, or None if no result is known there.
 
-    It has the largest T of those whose bias is below the EoR with two standard deviations; if all are above, the
+    It has the largest T of those whose bias is below the EoR by two standard deviations; if no bias is, it has the
     smallest upper limit of the bias.
     """
     limits = {
@@ -117,22 +108,11 @@ def _read_spectra(job: Job, case: str) -> CalibratedSpectra:
 
 
 def differences(job: Job, world: str, found: Mapping[str, Case]) -> dict[str, list[dict[str, Any]]]:
-    """Return T and bias of every calibrator less those of the best in each band, with paired errors.
+    """Return T and bias of every calibrator of a world minus those of the best in each band, with paired errors.
 
-    Both are of the same sky, gains and noise, and the error is that of leaving out the same antennas in both.
-
-    Parameters
-    ----------
-    job
-        With the spectra of all cases.
-    world
-        Its label.
-    found
-        The cases there, by calibrator.
-
-    Returns
-    -------
-    By calibrator, for each band what ``best`` is called, and ``transfer`` and ``bias`` with errors; None if not known.
+    Both have the same sky, gains and noise, and the error comes from leaving out the same antennas in both. For each
+    calibrator and band, the result holds the name of the ``best``, and ``transfer`` and ``bias`` with errors; None if
+    they are not known.
     """
     from calstudy.power.score import BANDS, difference
 
@@ -244,7 +224,7 @@ def _markdown(
 
 
 def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> list[str]:
-    """Return the severity of every fault at which the bias of each calibrator reaches the limit, as Markdown."""
+    """Return as Markdown the severity of every fault at which the bias of each calibrator reaches the limit."""
     rows = []
     for fault in faults(list(cases)):
         cells = []
@@ -258,7 +238,7 @@ def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
             bias, error = (np.array([getattr(item, name)[band] for item in bands]) for name in ("bias", "bias_error"))
             found = tolerance([fault.severities[place] for place in there], bias, error)
             known = "" if found.relation == "=" else f"{found.relation} "
-            # Two digits, and powers of ten for what is not between 0.0001 and a million alone.
+            # Two digits; powers of ten only below 0.0001 and above a million.
             severity = f"{float(f'{found.severity:.2g}'):g}"
             cells.append("noise" if found.relation == "?" else f"{known}{severity} {fault.unit}".strip())
         rows.append((fault.name, *cells))
@@ -273,7 +253,7 @@ def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
 
 
 def _sky_models(found: Mapping[str, Case]) -> str:
-    """Say in a sentence how wrong the sky models of a world are, which are the same for all calibrators as a rule."""
+    """Describe in a sentence the errors of the sky models of a world, usually the same for all calibrators."""
     errors = {case.summary["sky_model_error"] for case in found.values()}
     if errors == {0.0}:
         return "The sky model is the truth."
@@ -282,13 +262,7 @@ def _sky_models(found: Mapping[str, Case]) -> str:
 
 
 def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return the scores of one world as a table, a row for each calibrator.
-
-    Parameters
-    ----------
-    found
-        Contents of score.json by calibrator.
-    """
+    """Return the scores of one world, by calibrator as in score.json, as a table with a row for each calibrator."""
     bands = [band["k"] for band in next(iter(found.values()))["bands"]]
     measured = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
     cost = ("CPU s per integration", "memory")
@@ -312,7 +286,7 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
-    """Return differences from the best calibrator as a table, a row for each calibrator."""
+    """Return differences from the best calibrator as a table with a row for each calibrator."""
     bands = [band["k"] for band in next(iter(less.values()))]
     headings = [f"Δ{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
     rows = [
@@ -330,7 +304,7 @@ def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
 
 
 def _cost_cells(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """Return processor seconds and memory; of gains from files nobody knows what they took."""
+    """Return processor seconds and memory, which are not known for gains from files."""
     # Scores of earlier versions have wall time under another name, which is not comparable.
     seconds, memory = summary.get("cpu_seconds_per_integration"), summary["peak_memory"]
     return "-" if seconds is None else f"{seconds:.2g}", "-" if memory is None else f"{memory / 1e9:.1f} GB"
