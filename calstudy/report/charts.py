@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-# Series in the order of the legend: field, label, and colour by its name in page.css.
+# Series in the order of the legend: field, label, and name of the colour in page.css.
 SERIES = {
     "eor": ("EoR, P^S", "grey"),
     "uncorrupted": ("perfect gains, P^(S+F+N)", "black"),
