@@ -221,7 +221,7 @@ def _load(request: _Request, selection: Selection, autos: bool) -> tuple[UVData,
 def _plan(
     data: UVData, calibrator: Calibrator, has_sky_model: bool, notes: list[str], budget: float | None
 ) -> tuple[Calibrator, str]:
-    """Fit the calibrator to the memory, describe it, collect notes on likely problems, and refuse what cannot fit."""
+    """Fit the calibrator to the memory, describe it, and collect notes; raises InputError if it cannot fit."""
     from calstudy.base.observation import Observation
     from calstudy.base.plugins import guarded
     from calstudy.base.resources import free_memory

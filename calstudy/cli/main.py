@@ -294,7 +294,7 @@ def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
         _flush()
         leave(EXIT_INPUT)
     except (KeyboardInterrupt, SystemExit) as end:
-        # Typer ends an interrupted command with this status, and says nothing.
+        # Typer ends an interrupted command with this status and no message.
         if isinstance(end, SystemExit) and end.code != EXIT_INTERRUPTED:
             raise
         how = "terminated" if termination.asked else "interrupted"

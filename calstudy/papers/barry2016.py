@@ -41,7 +41,7 @@ JOINT = "the precision of the catalogue and the spectral smoothness of the anten
 
 
 def _bias(run: RunResults, incomplete: bool = True) -> Finding:
-    """Return the bias in the window if the array is large enough and, with `incomplete`, a realistic part is missing."""
+    """Return the bias in the window if the array is large enough and, if `incomplete`, a realistic part is missing."""
     require_long_baselines(run, WINDOW[1])
     lacking = run.sky_model_error
     if incomplete and not REALISTIC[0] <= lacking <= REALISTIC[1]:

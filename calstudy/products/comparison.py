@@ -323,7 +323,7 @@ def _percent(value: float | None) -> str:
 def _cost(task: Task) -> Cost:
     cases = len(task.settings["worlds"]) * len(task.settings["calibrators"])
     size = size_of(task)
-    # Spectra of two cases, and what their units owe to two antennas each.
+    # Spectra of two cases, and the shares of each unit's two antennas.
     held = 2 * len(SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
     return Cost(2 + cases * (0.5 + held * 1e-8), LIBRARIES_MEMORY + held, 1e6)
 

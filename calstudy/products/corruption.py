@@ -1,4 +1,4 @@
-"""From simulated components to measurements: the levels of EoR and noise, and the effects with what they draw."""
+"""From simulated components to measurements: the levels of EoR and noise, and the effects with their draws."""
 
 from __future__ import annotations
 

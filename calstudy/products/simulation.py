@@ -247,7 +247,7 @@ def _node_counts(
 
 
 def _is_regular(instrument: InstrumentSettings) -> bool:
-    """Return whether antennas are on a flat lattice."""
+    """Return true if the antennas are on a flat lattice."""
     return layout_of(instrument.layout).regular and not instrument.as_built.positions.scatter
 
 

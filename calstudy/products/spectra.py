@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from calstudy.power.average import Block
     from calstudy.power.spectra import DelaySpectra
 
-# Inputs of the spectra besides the variants, whose names cannot hold a colon.
+# Further inputs of the spectra; names of variants cannot contain a colon.
 EOR_REFERENCE, NOISE_REFERENCE = "reference:eor", "reference:noise"
 EXCISION = {"all-modes": False, "outside-wedge": True}
 """Spherical averages; true for the one without the wedge."""

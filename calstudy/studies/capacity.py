@@ -49,7 +49,7 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     if scheduler is not None:
         return experiment, workers or 1
     memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    # The parent process holds the libraries, too.
+    # The parent process has the libraries in memory, too.
     memory -= LIBRARIES_MEMORY
     hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
     lean = _stream(_cut(_Work(experiment, targets), memory / hoped), memory / hoped)

@@ -44,7 +44,7 @@ INJECTION_FIGURES = ("observed-signal-loss",)
 
 
 class ObservedOutputs(Section):
-    """What is drawn, and where products and run folders go."""
+    """Figures, and the folders of products and runs."""
 
     figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] | None = (
         Field(None, description="Figures of measured data; null: all.")
@@ -54,7 +54,7 @@ class ObservedOutputs(Section):
 
 
 class ObservedFile(Section):
-    """Measured data: what is calibrated and how, and what is measured of it."""
+    """Measured data: their selection, calibration and power spectra, and an injected signal."""
 
     name: StudyName
     description: str = ""

@@ -83,7 +83,7 @@ class Line(Section):
 
 
 class SampleCounts(Section):
-    """How often each thing is timed, for every array."""
+    """Number of samples of each measurement, for every array."""
 
     steps: int = Field(200, ge=10, description="Single steps of the paper's solver.")
     calls: int = Field(20, ge=3, description="Calls of our Adamax, of 50 compiled steps each; their means are samples.")
@@ -128,7 +128,7 @@ class RuntimeSettings(Section):
 
 
 class RuntimeOutputs(Section):
-    """Where products and run folders go."""
+    """Folders of products and runs."""
 
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")

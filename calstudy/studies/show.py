@@ -185,7 +185,7 @@ def _show_products(run: Run, console: Console) -> None:
 
 
 def _show_signal(folder: Path, console: Console) -> None:
-    """Print T and bias of a run, and a warning if more power than the EoR's is left besides it, if it has any."""
+    """Print T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
     signal = read_signal(folder)
     if signal is None:
         return
