@@ -1,1 +1,1 @@
-"""What finished runs show to the statements of papers, and the products that hold the verdicts."""
+"""Evaluation of papers' statements on finished runs, and the products with the verdicts."""

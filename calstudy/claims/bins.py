@@ -1,4 +1,4 @@
-"""Comparisons of spherical spectra bin by bin, as statements of papers and steps of the validation ladder need them."""
+"""Comparisons of spherical spectra bin by bin, for statements of papers and steps of the validation ladder."""
 
 from __future__ import annotations
 
@@ -16,16 +16,13 @@ if TYPE_CHECKING:
 
 SIGMAS_95 = 1.96
 TINY = 1e-9
-"""h/Mpc: a bin belongs to one range, whatever the last digit of its centre."""
+"""Tolerance of the limits of a range of k, h/Mpc: a bin belongs to one range, whatever the rounding of its centre."""
 
 
 def used_bins(*spectra: SphericalSpectrum, k_min: float = 0.0, k_max: float = np.inf) -> np.ndarray:
     """Return the bins, (Nk,) bool, between two wavenumbers in h/Mpc in which all spectra have power.
 
-    Raises
-    ------
-    Unevaluated
-        If there is none, or the bins of the spectra differ.
+    Raises Unevaluated if there is none, or the bins of the spectra differ.
     """
     first = spectra[0]
     if any(not np.array_equal(first.bin_edges, other.bin_edges) for other in spectra):
@@ -39,21 +36,10 @@ def used_bins(*spectra: SphericalSpectrum, k_min: float = 0.0, k_max: float = np
 
 
 def bins_at_delays(spectrum: SphericalSpectrum, wedge: CylindricalSpectrum, low: float, high: float) -> np.ndarray:
-    """Return the bins of k, (Nk,) bool, that delays from `low` to `high` (s) fall into.
+    """Return the bins of k, (Nk,) bool, of the positive delays from `low` to `high` (s).
 
-    Parameters
-    ----------
-    spectrum
-        Has the bins.
-    wedge
-        A cylindrical spectrum of the same experiment, which relates delays to wavenumbers.
-    low, high
-        Both positive.
-
-    Raises
-    ------
-    Unevaluated
-        If they are in no bin with modes.
+    The wedge, a cylindrical spectrum of the same experiment, relates delays to wavenumbers. Raises Unevaluated if
+    the delays are in no bin with modes.
     """
     per_second = wedge.k_parallel[-1] / wedge.delay[-1]
     chosen = (spectrum.bin_edges[1:] > low * per_second) & (spectrum.bin_edges[:-1] < high * per_second)
@@ -64,15 +50,7 @@ def bins_at_delays(spectrum: SphericalSpectrum, wedge: CylindricalSpectrum, low:
 
 
 def recovered(residual: SphericalSpectrum, eor: SphericalSpectrum, k_min: float, k_max: float = np.inf) -> Finding:
-    """Return the ratio P^R / P^S, averaged over bins with the inverse variance of the difference of the two.
-
-    Parameters
-    ----------
-    residual, eor
-        P^R and P^S in the same bins.
-    k_min, k_max
-        Bins that are used, h/Mpc.
-    """
+    """Return P^R / P^S over bins of k (h/Mpc), weighted with the inverse variance of the difference of the two."""
     used = used_bins(residual, eor, k_min=k_min, k_max=k_max)
     signal, error = eor.power.real[used], residual.difference_error[used]
     weights = signal / error**2
@@ -81,13 +59,13 @@ def recovered(residual: SphericalSpectrum, eor: SphericalSpectrum, k_min: float,
 
 
 def fraction_within(value: np.ndarray, error: np.ndarray) -> Finding:
-    """Return which part of the values is within its 95 % bar of zero, with the binomial error for 95 %."""
+    """Return the fraction of the values within their 95 % error bars of zero, with the binomial error for 95 %."""
     inside = np.abs(value) <= SIGMAS_95 * error
     return Finding(float(np.mean(inside)), float(np.sqrt(0.95 * 0.05 / inside.size)))
 
 
 def rms_power(spectrum: SphericalSpectrum, used: np.ndarray) -> Finding:
-    """Return the rms of P over bins, and its uncertainty for that many independent ones."""
+    """Return the rms of P over bins, and its uncertainty for that many independent bins."""
     value = float(np.sqrt(np.mean(spectrum.power.real[used] ** 2)))
     return Finding(value, value / np.sqrt(2 * used.sum()))
 
@@ -100,14 +78,10 @@ def ratio(above: Finding, below: Finding) -> Finding:
 
 @dataclass(frozen=True)
 class RecoveredPower:
-    """What two runs are compared by, in the same bins.
+    """Quantities by which two runs are compared, in the same bins.
 
-    Attributes
-    ----------
-    residual, eor
-        P^R and P^S.
-    loss_error
-        Standard deviation of the transfer function, (Nk,): the runs lose different amounts by chance.
+    `loss_error` is the standard deviation of the transfer function, (Nk,): the runs lose different amounts by
+    chance.
     """
 
     residual: SphericalSpectrum
@@ -116,18 +90,11 @@ class RecoveredPower:
 
 
 def difference_of_ratios(first: RecoveredPower, second: RecoveredPower, used: np.ndarray) -> Finding:
-    """Return P^R / P^S of one run minus that of another: the mean of the differences of single bins.
+    """Return P^R / P^S of one run minus that of another: the mean of the differences of single bins, (Nk,) bool.
 
-    Each bin has the same weight in both runs, the inverse variance of its difference, so that a difference between the
-    runs cannot come from how bins of unlike ratios are averaged. Noise is independent from bin to bin. What the gains
-    absorb by chance is taken as common to all bins, because they share the gains.
-
-    Parameters
-    ----------
-    first, second
-        The runs.
-    used
-        Bins, (Nk,) bool, in which all of it is known.
+    Each bin has the same weight in both runs, the inverse variance of its difference, so that a difference between
+    the runs cannot come from the averaging of bins with different ratios. Noise is independent from bin to bin. The
+    chance losses to the gains are taken as common to all bins, because they share the gains.
     """
     ratios, variances, common = [], [], []
     for run in (first, second):
@@ -144,7 +111,7 @@ def difference_of_ratios(first: RecoveredPower, second: RecoveredPower, used: np
 def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
     """Return the mean of known values with inverse variances as weights; the errors are taken as common to all.
 
-    Bins of k share the gains, and what the gains absorb by chance does not average down over bins.
+    Bins of k share the gains, so that chance losses to the gains do not average down over bins.
     """
     known = np.isfinite(values) & np.isfinite(errors)
     if not known.any():
@@ -165,10 +132,10 @@ def difference_of_losses(first: RunResults, second: RunResults, k_min: float, k_
 def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
     """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error.
 
-    That is the upper edge of the last such bin before two in succession are not. The lowest bin may be one that is not,
-    if the next is: few modes are in it. Without any bias it is the lower edge of the first bin. The uncertainty is the
-    standard deviation of a number that is anywhere within half a bin, or what a deviation by 3 sigma instead of 95 %
-    makes of it if that is more.
+    It is the upper edge of the last such bin before two successive bins without a bias. The lowest bin, which has
+    few modes, may be unbiased if the next is biased. Without any bias it is the lower edge of the first bin. The
+    uncertainty is that of a uniform distribution over a bin, or the change for deviations of 3 sigma instead of 95 %
+    if that is larger.
     """
     used = np.flatnonzero(used_bins(residual, eor))
     pull = ((eor.power.real - residual.power.real) / residual.difference_error)[used]
@@ -181,7 +148,7 @@ def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
 
 
 def _last_biased(biased: np.ndarray) -> int | None:
-    """Return the last bin that is biased before two that are not, or None if none of the first two is."""
+    """Return the index of the last biased bin before two unbiased ones, or None if the first two are unbiased."""
     last = None
     for place, is_biased in enumerate(biased):
         if is_biased:
@@ -192,25 +159,13 @@ def _last_biased(biased: np.ndarray) -> int | None:
 
 
 def power_without_eor(run: RunResults, used: np.ndarray, weights: np.ndarray) -> Finding:
-    """Return a mean of P^R0 over bins outside the wedge, mK^2 h^-3 Mpc^3: the residual of data without EoR.
+    """Return a weighted mean of P^R0 over bins outside the wedge, mK^2 h^-3 Mpc^3: the residual of data without EoR.
 
-    Errors come from leaving out antennas (`calstudy.power.score`), for power that foregrounds leave is not noise. The
-    part of them that thermal noise explains is independent from bin to bin; the rest is taken as common to all bins,
-    which share the gains. The error of a bin with a single baseline or group, whose scatter is not known, is its power.
-
-    Parameters
-    ----------
-    run
-        With the variants `eor` and `residual_without_eor`, and scores.
-    used
-        Bins, (Nk,) bool.
-    weights
-        Of the bins that are used, of any sum.
-
-    Raises
-    ------
-    Unevaluated
-        If it lacks one of them.
+    The bins are (Nk,) bool; the weights of the used bins may have any sum. Errors come from leaving out antennas
+    (`calstudy.power.score`), because power left by foregrounds is not noise. The part of them that thermal noise
+    explains is independent from bin to bin; the rest is taken as common to all bins, which share the gains. In a bin
+    with a single baseline or group, whose scatter is not known, the error is the power itself. Raises Unevaluated
+    without the variants `eor` and `residual_without_eor`, or scores.
     """
     eor, residual = (run.spherical(variant, "outside-wedge") for variant in ("eor", "residual_without_eor"))
     score = run.score
@@ -227,19 +182,8 @@ def power_without_eor(run: RunResults, used: np.ndarray, weights: np.ndarray) ->
 def bias(run: RunResults, k_min: float, k_max: float) -> Finding:
     """Return s^2 P^R0 / P^S outside the wedge: the residual without EoR over the EoR, free of the flux scale s.
 
-    Bins are weighted with their modes. For the uncertainty see `power_without_eor`.
-
-    Parameters
-    ----------
-    run
-        With the variants `eor` and `residual_without_eor`, and scores.
-    k_min, k_max
-        h/Mpc.
-
-    Raises
-    ------
-    Unevaluated
-        If it lacks one of them, or has no modes there.
+    Bins of k (h/Mpc) are weighted with their modes. For uncertainty and errors see `power_without_eor`; it also
+    raises Unevaluated if there are no modes in the range.
     """
     eor, residual = (run.spherical(variant, "outside-wedge") for variant in ("eor", "residual_without_eor"))
     used = used_bins(eor, residual, k_min=k_min, k_max=k_max)

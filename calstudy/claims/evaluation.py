@@ -1,4 +1,4 @@
-"""The statements of papers, evaluated on the runs that there are."""
+"""Evaluation of the statements of papers on runs."""
 
 from __future__ import annotations
 
@@ -21,14 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What came of holding runs to papers.
+    """Verdicts on the statements of papers, one for each statement.
 
-    Attributes
-    ----------
-    verdicts
-        One for each statement.
-    without_role
-        A sentence for each paper in which a run plays no role, with the reasons; such a paper has no verdicts.
+    `without_role` has a sentence, with the reasons, for each paper in which a run plays no role, and which therefore
+    has no verdicts.
     """
 
     verdicts: list[Verdict]
@@ -36,7 +32,7 @@ class Evaluation:
 
 
 def evaluate_run(papers: Sequence[Paper], results: RunResults | PooledResults) -> Evaluation:
-    """Evaluate the statements of papers that are about a role that one run plays."""
+    """Evaluate the statements of papers on the roles that one run plays."""
     verdicts: list[Verdict] = []
     without_role = []
     for paper in papers:
@@ -50,13 +46,13 @@ def evaluate_run(papers: Sequence[Paper], results: RunResults | PooledResults) -
 
 
 def refusals_of_run(paper: Paper, results: RunResults | PooledResults) -> dict[str, str | None]:
-    """Return why a run cannot play each role of a paper, None for the roles that it plays."""
+    """Return the reason why a run cannot play each role of a paper, None for the roles that it plays."""
     with guarded(paper):
         return {role: paper.refusal_of_run(role, results) for role in paper.roles}
 
 
 def _told(paper: Paper, refusals: Mapping[str, str | None]) -> str:
-    """Say in one sentence why a run plays no role, every reason once."""
+    """Explain in one sentence why a run plays no role, with every reason once."""
     roles: dict[str, list[str]] = {}
     for role, refusal in refusals.items():
         roles.setdefault(str(refusal), []).append(role)
@@ -77,15 +73,10 @@ def evaluate_run_times(papers: Sequence[Paper], run: RunTimes) -> Evaluation:
 
 
 def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults | PooledResults]) -> Evaluation:
-    """Evaluate every statement of papers on the runs that play its roles.
+    """Evaluate every statement of papers on the runs by role.
 
-    Parameters
-    ----------
-    papers
-        Whose statements.
-    runs
-        By the role that they play; statements whose roles nobody plays come back as not evaluated, with the reason. If
-        all runs pool realizations, statements on single runs are left out.
+    A statement whose roles no run plays is not evaluated, with the reason. If all runs pool realizations, statements
+    on single runs are left out.
     """
     pooled = bool(runs) and all(isinstance(run, PooledResults) for run in runs.values())
     return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs), pooled)])
@@ -94,19 +85,10 @@ def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults | Po
 def evaluate_by_solver(
     papers: Sequence[Paper], runs: Mapping[str, RunResults | PooledResults]
 ) -> dict[str, list[Verdict]]:
-    """Evaluate every statement of papers on the runs with the paper's own solver, and on the same runs with another.
+    """Evaluate every statement of papers on the runs (by role) with the paper's own solver, and on those with another.
 
-    Parameters
-    ----------
-    papers
-        Whose statements; those in which no run plays both roles of a pair in `Paper.own_solver_roles` are left out.
-    runs
-        By the role that they play.
-
-    Returns
-    -------
-    dict
-        Verdicts by solver, on the same statements in the same order; empty without any.
+    Papers in which no run plays both roles of a pair in `Paper.own_solver_roles` are left out. The result has
+    verdicts by solver, on the same statements in the same order; it is empty without any.
     """
     own: list[Verdict] = []
     other: list[Verdict] = []
@@ -130,7 +112,7 @@ def _solver(run: RunResults | PooledResults) -> str:
 
 
 def _accepted(paper: Paper, runs: Mapping[str, RunResults | PooledResults]) -> dict[str, RunResults | PooledResults]:
-    """Return the runs that a paper lets play their roles: another paper may have a role of the same name."""
+    """Return the runs whose roles a paper accepts, because another paper may have a role of the same name."""
     with guarded(paper):
         return {
             role: run
@@ -142,7 +124,7 @@ def _accepted(paper: Paper, runs: Mapping[str, RunResults | PooledResults]) -> d
 def _evaluate(
     paper: Paper, runs: Mapping[str, RunResults | PooledResults | RunTimes], only_played: bool = False
 ) -> list[Verdict]:
-    """Evaluate the statements of a paper; with `only_played`, those alone that are about one of the roles."""
+    """Evaluate the statements of a paper; with `only_played`, only those with a role that a run plays."""
     found = []
     with guarded(paper):
         for statement in paper.statements():
@@ -153,7 +135,7 @@ def _evaluate(
 
 
 def _measured_on(statement: Statement, runs: Mapping[str, Any]) -> tuple[Statement, dict[str, Any]]:
-    """Return a statement as it is measured on realizations, if these play its roles, and the runs it is measured on."""
+    """Return a statement, with its measure on realizations if these play its roles, and the runs for its measure."""
     played = [runs[role] for role in statement.roles if role in runs]
     if statement.pooled and played and all(isinstance(run, PooledResults) for run in played):
         return replace(statement, measure=statement.pooled), dict(runs)
@@ -163,16 +145,10 @@ def _measured_on(statement: Statement, runs: Mapping[str, Any]) -> tuple[Stateme
 def members_by_role(
     papers: Sequence[Paper], members: Mapping[str, Experiment], named: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the members of a collection by the role that they play in any of some papers.
+    """Return the members of a collection by the role that they play in any of the papers.
 
-    Parameters
-    ----------
-    papers
-        The usual members of the first that has a role count.
-    members
-        The experiments by name.
-    named
-        Members by role, in place of the usual ones. Members that a paper refuses are left out.
+    The usual members are those of the first paper that has a role; `named` has members by role in place of the usual
+    ones. Members that a paper refuses are left out.
     """
     usual = {role: name for paper in reversed(papers) for role, name in paper.usual_members.items() if name in members}
     return {
@@ -183,17 +159,7 @@ def members_by_role(
 
 
 def refusal_of_role(papers: Sequence[Paper], role: str, experiment: Experiment) -> str | None:
-    """Return why an experiment cannot play a role in any of the papers that have it, or None if it can in one.
-
-    Parameters
-    ----------
-    papers
-        Those that do not have the role are not asked.
-    role
-        Its name.
-    experiment
-        That would play it.
-    """
+    """Return why an experiment cannot play a role in any of the papers that have it, or None if it can in one."""
     found: list[str | None] = []
     for paper in papers:
         if role in paper.roles:

@@ -48,7 +48,7 @@ class EvaluatedRun:
 def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> EvaluatedRun:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
-    If members of a collection are the same but for the paper's own solver, also claims-by-solver.json and .md.
+    If members of a collection differ only in the paper's own solver, claims-by-solver.json and .md are written too.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     papers
         Names of papers, or files, in place of those that the run names.
     run_code
-        Whether Python files that the folder's experiments name may be run; those of `papers` are.
+        Whether Python files in the folder's experiments may be run; those of `papers` always are.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a published paper is to a study: statements with thresholds, and the roles that runs play in them."""
+"""The interface of papers: statements with thresholds, and the roles of runs in them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 
 
 class Paper(Plugin):
-    """The base of all papers.
+    """Base class of papers.
 
     Attributes
     ----------
     citation
         Authors, year, title, identifier.
     roles
-        The roles that runs play in the paper's statements, and which run plays each, in words that follow "needs".
+        Roles of runs in the paper's statements, with a description of the run in words that follow "needs".
     usual_members
-        Names of members of a collection that play a role unless its file says otherwise.
+        Name of the member of a collection that plays a role, unless its file names another.
     own_solver_roles
-        For a role, the role of the run that is the same but for its solver, which is the paper's own. If both are
+        For a role, the role of the run that differs only in its solver, which is the paper's own. If both are
         played, every statement is evaluated with either solver.
     """
 
@@ -43,16 +43,16 @@ class Paper(Plugin):
         return ()
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return in words why an experiment cannot play a role, as far as its settings tell, or None.
+        """Return in words why the settings of an experiment do not allow it to play a role, or None.
 
-        Be strict: a run that is judged by sentences on something else misleads. Scale alone (fewer antennas, channels,
-        integrations, sources) should not decide.
+        Be strict: statements mislead if they are evaluated on a run of something else. Scale alone (fewer antennas,
+        channels, integrations, sources) should not decide.
         """
         del role, experiment
         return None
 
     def refusal_of_run(self, role: str, results: RunResults | PooledResults) -> str | None:
-        """Return in words why a finished run cannot play a role, or None; by default as `refusal` of its experiment."""
+        """Return in words why a finished run cannot play a role, or None; by default `refusal` of its experiment."""
         return self.refusal(role, results.experiment)
 
     def substitutions(self, experiment: Experiment) -> tuple[str, ...]:
@@ -62,14 +62,14 @@ class Paper(Plugin):
 
 
 def distinct_papers(named: Iterable[Plugin]) -> list[Paper]:
-    """Return what fields of papers hold, once each; their registry lets no other plug-ins in."""
+    """Return the papers in plug-in fields once each; only papers are possible in these fields."""
     return cast(list[Paper], list({paper.reference: paper for paper in named}.values()))
 
 
 def stand_ins(experiment: Experiment) -> tuple[str, ...]:
-    """Return what must be printed on every figure of an experiment: what stands in for its papers' ingredients.
+    """Return the notes printed on every figure of an experiment: substitutions for its papers' ingredients.
 
-    If they name nothing, whether the foregrounds are synthetic. And how the instrument as built differs.
+    If there are none, a note on synthetic foregrounds may follow, and finally one on the instrument as built.
     """
     notes: list[str] = []
     for paper in distinct_papers(experiment.papers):
@@ -82,5 +82,5 @@ def stand_ins(experiment: Experiment) -> tuple[str, ...]:
 
 
 def unique_notes(notes: Iterable[str]) -> tuple[str, ...]:
-    """Return notes once each, in their order."""
+    """Return each note once, in order."""
     return tuple(dict.fromkeys(notes))

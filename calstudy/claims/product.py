@@ -1,4 +1,4 @@
-"""The claims of a run, or of the members of a collection: the statements of papers, measured on tables of products."""
+"""The claims of a run or a collection: the statements of papers, evaluated on tables of products."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from calstudy.claims.results import RunResults
 
 REALIZATIONS = "realizations"
-"""The figure that has what all realizations of an experiment measured."""
+"""Figure with the measurements on all realizations of an experiment."""
 TABLES = ("spectra", "agreement", "transfer", "score", "sky_model")
 
 
 def _facts(experiment: Experiment) -> Experiment:
-    """Return the experiment without what no statement reads, so that it does not decide the key of the claims."""
+    """Return the experiment without settings that no statement reads, to keep them out of the key of the claims."""
     return experiment.reset("description", "sweep", "scales", "outputs")
 
 
@@ -44,12 +44,7 @@ def _inputs(graph: Graph) -> dict[str, Task]:
 def claims(graph: Graph, notes: Sequence[str]) -> Task | None:
     """Return the task that evaluates the statements of an experiment's papers on it alone; None without papers.
 
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    notes
-        Its stand-ins.
+    The notes are its substitutions for the papers' ingredients.
     """
     experiment = graph.experiment
     if not experiment.papers:
@@ -61,20 +56,9 @@ def claims(graph: Graph, notes: Sequence[str]) -> Task | None:
 def combined_claims(
     title: str, graphs: Mapping[str, Graph], papers: Sequence[Paper], roles: Mapping[str, str], notes: Sequence[str]
 ) -> Task | None:
-    """Return the task that evaluates the statements of papers on several runs; None without papers.
+    """Return the task that evaluates the statements of papers on several runs by role; None without papers.
 
-    Parameters
-    ----------
-    title
-        Name of the collection.
-    graphs
-        Of the members, by name.
-    papers
-        Whose statements.
-    roles
-        The member that plays each role.
-    notes
-        Stand-ins of all members.
+    The notes are the substitutions of all members for the papers' ingredients.
     """
     playing = {name: graphs[name] for name in roles.values()}
     if not papers:
@@ -94,17 +78,7 @@ def _inputs_of(graphs: Mapping[str, Graph]) -> dict[str, Task]:
 
 
 def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Task | None:
-    """Return the task that evaluates the statements of papers on the run times of a study; None without papers.
-
-    Parameters
-    ----------
-    title
-        Name of the study.
-    papers
-        Whose statements.
-    run_times
-        The task of the table of measurements.
-    """
+    """Return the task that evaluates the statements of papers on a table of run times; None without papers."""
     if not papers:
         return None
     return Task(EVALUATE_RUN_TIMES, "claims", {"papers": list(papers), "title": title}, {"runtime": run_times})

@@ -1,4 +1,4 @@
-"""Realizations of an experiment as the claims see them: means over all that was drawn, with errors by their scatter."""
+"""Realizations of an experiment for statements of papers: means over all draws, with errors from their scatter."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class PooledResults:
     experiment
         With its realizations.
     arrays
-        Of the figure of the realizations, such as ``outside-wedge.values.bias`` (K, Nk) and ``outside-wedge.k`` (Nk,).
+        Of the figure of the realizations, such as ``outside-wedge.values.bias`` (K, Nk) and ``outside-wedge.k``
+        (Nk,).
     """
 
     experiment: Experiment
@@ -35,7 +36,7 @@ class PooledResults:
 
     @classmethod
     def of(cls, experiment: Experiment, folder: Path) -> PooledResults:
-        """Read the arrays from a folder that has them."""
+        """Read the arrays from the folder of the figure."""
         with np.load(folder / ARRAYS) as arrays:
             return cls(experiment, dict(arrays))
 
@@ -57,17 +58,17 @@ class PooledResults:
         Parameters
         ----------
         quantity
-            Of `calstudy.power.realizations.QUANTITIES` or `TRANSFER_QUANTITIES`, or "eor" for P^S over the power that
-            the sky was drawn from.
+            Of `calstudy.power.realizations.QUANTITIES` or `TRANSFER_QUANTITIES`, or "eor" for P^S over the power
+            that the sky was drawn from.
         modes
             "outside-wedge", "inside-wedge" or "all-modes".
         k_min, k_max
-            Bins that are used, h/Mpc.
+            Range of the bins, h/Mpc.
 
         Raises
         ------
         Unevaluated
-            If there is none in which it is known in all realizations.
+            If there is no bin in which it is known in all realizations.
         """
         k, array = self.arrays[f"{modes}.k"], self.arrays.get(f"{modes}.values.{quantity}")
         if quantity == "eor":
@@ -90,5 +91,5 @@ class PooledResults:
 def over_realizations(
     quantity: str, modes: str, k_min: float = 0.0, k_max: float = np.inf
 ) -> Callable[[PooledResults], Finding]:
-    """Return what measures a mean over realizations for a statement; parameters as for `PooledResults.mean`."""
+    """Return the measure of a statement by a mean over realizations; parameters as for `PooledResults.mean`."""
     return lambda run: run.mean(quantity, modes, k_min, k_max)

@@ -1,4 +1,4 @@
-"""A finished run as statements of papers see it: its experiment and its tables."""
+"""A finished run for statements of papers: its experiment and its tables."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class RunResults:
     Attributes
     ----------
     experiment
-        What was run.
+        The experiment of the run.
     folders
-        Where tables are looked for: spectra as ``<variant>.<kind>.h5``, ``transfer.<region>.h5``, score-bins.h5,
+        Folders of tables: spectra as ``<variant>.<kind>.h5``, ``transfer.<region>.h5``, score-bins.h5,
         agreement.json and sky-model.json.
     """
 
@@ -56,7 +56,7 @@ class RunResults:
 
     @property
     def sky_model_error(self) -> float:
-        """Rms of truth less sky model of the calibrator over that of the foregrounds; zero if it is the truth."""
+        """Rms of the error of the calibrator's sky model over that of the true foregrounds; zero if it is perfect."""
         experiment = self.experiment
         if not assumed_changes(experiment.calibration.assumed) and experiment.instrument.as_built.note is None:
             return 0.0
@@ -82,7 +82,7 @@ class RunResults:
 
     @property
     def score(self) -> Score:
-        """The scores of the calibration in bins of k, with errors by leaving out antennas."""
+        """The scores of the calibration in bins of k, with errors from leaving out antennas."""
         path = self._find(BINS)
         if path is None:
             raise Unevaluated("the run has no scores of its calibration, or is of a version that wrote none")

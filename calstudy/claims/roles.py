@@ -1,4 +1,4 @@
-"""What papers ask of the runs that play their roles: calibrator, weights, sky model, array, and what is true."""
+"""Conditions of papers on the runs that play their roles: calibrator, weights, sky model, array, and true world."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 INCOMPLETE = ("sky.foregrounds.flux_limit", "sky.foregrounds.count")
 """Fields of the assumed sky that leave sources out."""
 INVERSE_VARIANCES = ("gains", "autos")
-"""Kinds of weights."""
+"""Kinds of weights that are inverse variances."""
 SMOOTH = 100e-9
-"""s, the largest delay of gains that are smooth in frequency."""
+"""Largest delay of gains that are smooth in frequency, s."""
 
 
 def other_calibrator(experiment: Experiment, allowed: Sequence[str]) -> str | None:
-    """Return in words that an experiment has none of the allowed calibrators, or None if it has one."""
+    """Return a refusal of an experiment with none of the allowed calibrators, or None."""
     found = experiment.calibration.label
     return None if found in allowed else f"calibration.calibrator is {found!r}, not {' or '.join(map(repr, allowed))}"
 
@@ -47,9 +47,9 @@ def structured_gains(experiment: Experiment) -> str | None:
 
 
 def other_weights(experiment: Experiment) -> str | None:
-    """Return in words that weights are no inverse variances and gains not smooth, or None.
+    """Return a refusal if the weights are not inverse variances and the gains are not smooth, or None.
 
-    A smooth error of the model then becomes errors of the gains that are white, which no paper is about.
+    With such weights, a smooth error of the model causes white errors of the gains, and no paper is about these.
     """
     calibration = experiment.calibration
     rough = structured_gains(experiment)
@@ -59,15 +59,10 @@ def other_weights(experiment: Experiment) -> str | None:
 
 
 def other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
-    """Return in words why the sky model is not what it should be, or None.
+    """Return a refusal of the sky model, or None.
 
-    Parameters
-    ----------
-    experiment
-        That would play the role.
-    incomplete
-        Whether sources have to be missing, and nothing else is to be assumed wrongly; otherwise the sky model has to be
-        that of the nominal instrument and the true sky.
+    With `incomplete`, sources have to be missing and no other assumption may be wrong; otherwise the sky model has
+    to be that of the nominal instrument and the true sky.
     """
     changes = assumed_changes(experiment.calibration.assumed)
     others = [path for path in changes if path not in INCOMPLETE]
@@ -79,14 +74,9 @@ def other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
 
 
 def other_faults(experiment: Experiment, allowed: str | None = None) -> str | None:
-    """Return in words what is wrong with the instrument as built or with the data, besides gains, or None.
+    """Return in words a fault of the instrument as built or of the data, besides gains, or None.
 
-    Parameters
-    ----------
-    experiment
-        That would play the role.
-    allowed
-        The field of `instrument.as_built` in which the role wants it to differ, such as "dipoles.dead_tiles".
+    A role may require a fault in the field `allowed` of `instrument.as_built`, such as "dipoles.dead_tiles".
     """
     nominal = dict(_fields(AsBuilt().model_dump()))
     for path, value in _fields(experiment.instrument.as_built.model_dump()):
@@ -111,10 +101,10 @@ def k_of_delay(experiment: Experiment, delay: float) -> float:
 
 
 def require_long_baselines(run: RunResults, k: float) -> None:
-    """Raise Unevaluated unless the horizon of the longest baseline, and the buffer of the wedge, reach k (h/Mpc).
+    """Raise Unevaluated unless the horizon of the longest baseline plus the buffer of the wedge reaches k (h/Mpc).
 
-    Errors of a sky model have delays up to the horizon of the longest baseline that gains are fitted to, and so have
-    those of the gains.
+    Errors of a sky model, and the errors of gains they cause, have delays up to the horizon of the longest baseline
+    in the fit of the gains.
     """
     experiment = run.experiment
     lengths = pdist(make_array(experiment.instrument).enu)
@@ -139,5 +129,5 @@ def require_same_world(first: RunResults, second: RunResults) -> None:
 
 
 def first_refusal(*refusals: str | None) -> str | None:
-    """Return the first reason that there is."""
+    """Return the first reason that is not None."""
     return next((refusal for refusal in refusals if refusal is not None), None)

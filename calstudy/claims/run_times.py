@@ -1,4 +1,4 @@
-"""Run times as the claims see them: the table that a run-time study leaves."""
+"""Run times for statements of papers: the table of a run-time study."""
 
 from __future__ import annotations
 
@@ -15,19 +15,14 @@ from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
 RUN_TIME = "run_time"
-"""The role that a run-time study plays."""
+"""Role of a run-time study."""
 
 
 @dataclass(frozen=True)
 class RunTimes:
-    """One run-time study.
+    """One run-time study: the name of the run with the machine, and the table of `calstudy.products.run_times`.
 
-    Attributes
-    ----------
-    name
-        Of the run, and the machine.
-    table
-        What `calstudy.products.run_times` wrote: ``cases``, one per array and device, and ``descent``.
+    The table has ``cases``, one per array and device, and ``descent``.
     """
 
     name: str
@@ -47,57 +42,28 @@ class RunTimes:
         return sorted(found, key=lambda case: case["size"])
 
     def medians(self, panel: str, kind: str, device: str = "cpu") -> np.ndarray:
-        """Return median seconds of each array, (Nsizes,).
+        """Return the median seconds of a kind of step or solve for each array, (Nsizes,).
 
-        Parameters
-        ----------
-        panel
-            Family of arrays, "rows" or "line".
-        kind
-            What was timed.
-        device
-            "cpu" or "gpu".
+        The panel is "rows" or "line", the device "cpu" or "gpu".
         """
         return np.array([case["seconds"][kind]["median"] for case in self.cases(panel, device)])
 
     def column(self, panel: str, name: str, device: str = "cpu") -> np.ndarray:
-        """Return a property of each array, (Nsizes,).
-
-        Parameters
-        ----------
-        panel
-            Family of arrays, "rows" or "line".
-        name
-            Of the property, such as "size".
-        device
-            "cpu" or "gpu".
-        """
+        """Return a property of each array, (Nsizes,), such as "size"; panel and device as for `medians`."""
         return np.array([case[name] for case in self.cases(panel, device)], float)
 
     def scaling(self, panel: str, kind: str, against: str = "size", device: str = "cpu") -> PowerLaw:
-        """Fit the medians as a power of a property of the arrays.
-
-        Parameters
-        ----------
-        panel
-            Family of arrays, "rows" or "line".
-        kind
-            What was timed.
-        against
-            Name of the property.
-        device
-            "cpu" or "gpu".
-        """
+        """Fit the medians as a power of a property of the arrays; panel, kind and device as for `medians`."""
         return fit_power_law(self.column(panel, against, device), self.medians(panel, kind, device))
 
     def steps_to(self, excess: str) -> Finding:
-        """Return how many steps the paper's solver took to come within a fraction of the minimum, or took in vain."""
+        """Return the steps of the paper's solver to within a fraction of the minimum, or its steps as a lower bound."""
         descent = self.table["descent"]
         steps = descent["steps_to"][excess]
         return Finding(descent["max_steps"], 0.0, "at least") if steps is None else Finding(steps, 0.0)
 
 
 def machine_in_words(machine: Mapping[str, Any]) -> str:
-    """Return processor, cores and memory of a machine, and its GPU if one was timed."""
+    """Return processor, cores and memory of a machine, and its GPU if it was timed."""
     words = f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB"
     return f"{words}, {machine['gpu']}" if machine.get("gpu") else words

@@ -1,4 +1,4 @@
-"""``calstudy calibrate``: the calibrator on anyone's data."""
+"""``calstudy calibrate``: calibration of measured data."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from calstudy.observed.pieces import Given
 
 EXIT_UNCONVERGED = 3
-# More solves than this that did not converge are counted instead of named.
+# More unconverged solves than this are counted instead of named.
 NAMED = 5
 SECONDS_BETWEEN_LINES = 10.0
 
@@ -87,9 +87,9 @@ def calibrate(
 ) -> None:
     """Calibrate visibilities: solve for gains and foregrounds, write both and the residual.
 
-    Writes gains.calh5, model.uvh5, residual.uvh5, solution.json and a diagnostic figure, and warns of channels,
-    antennas and integrations that stand out. An interrupted calibration is resumed by the same command. Exit status: 0
-    if every solve converged, 3 if some did not, 2 if something given cannot be used.
+    Writes gains.calh5, model.uvh5, residual.uvh5, solution.json and a diagnostic figure, and warns of outliers among
+    channels, antennas and integrations. The same command resumes an interrupted calibration. Exit status: 0 if every
+    solve converged, 3 if some did not, 2 if an input cannot be used.
     """
     from calstudy.base.resources import parse_memory
     from calstudy.measured.defaults import defaults
@@ -113,7 +113,7 @@ def calibrate(
 
 @dataclass(frozen=True)
 class _Request:
-    """What is to be calibrated, with how much memory (bytes, None for what is free), and what is to be written."""
+    """The data and the calibration, the memory (bytes, None for all that is free), and the requested output."""
 
     paths: list[Path]
     sky_path: Path | None
@@ -160,7 +160,7 @@ def _run(request: _Request, calibrator: Calibrator) -> int:
     require_free(request.output, request.extras, request.overwrite)
     if EXPECTED in request.extras and not isinstance(calibrator, GainFit):
         raise InputError(f"--expected-loss: is known for fits by least squares, and {calibrator.label} is none")
-    # These import pyuvdata: after what can be refused without it.
+    # These import pyuvdata, so they come after all refusals that do not need it.
     from calstudy.observed.pieces import Given, pieces_folder
     from calstudy.products.files import quiet_libraries
 
@@ -221,7 +221,7 @@ def _load(request: _Request, selection: Selection, autos: bool) -> tuple[UVData,
 def _plan(
     data: UVData, calibrator: Calibrator, has_sky_model: bool, notes: list[str], budget: float | None
 ) -> tuple[Calibrator, str]:
-    """Fit the calibrator to the memory, say what will be done, note what will not work well, refuse what cannot fit."""
+    """Fit the calibrator to the memory, describe it, and collect notes; raises InputError if it cannot fit."""
     from calstudy.base.observation import Observation
     from calstudy.base.plugins import guarded
     from calstudy.base.resources import free_memory
@@ -259,7 +259,7 @@ def _start(gains_path: Path | None) -> UVCal | None:
 
 
 def _calibrate(given: Given, calibrator: Calibrator, folder: Path, console: Console) -> CalibrationResult:
-    """Calibrate with a bar on a terminal, and with lines of text elsewhere."""
+    """Calibrate with a progress bar on a terminal, and with lines of text elsewhere."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -286,7 +286,7 @@ def _calibrate(given: Given, calibrator: Calibrator, folder: Path, console: Cons
 
 
 class _ProgressLines:
-    """Says how far a calibration is, in a line of text at most every `SECONDS_BETWEEN_LINES`."""
+    """Reports the progress of a calibration in a line of text at most every `SECONDS_BETWEEN_LINES`."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
@@ -294,7 +294,7 @@ class _ProgressLines:
         self.first: int | None = None
 
     def tell(self, done: int, total: int) -> None:
-        """Print a line if it is time for one; the first call may be of solves that were done before."""
+        """Print a line if the interval has passed; the first call may count solves of an earlier process."""
         from calstudy.run.progress import duration
 
         now = time.perf_counter()
@@ -309,7 +309,7 @@ class _ProgressLines:
 
 
 def _qualities(data: UVData, result: CalibrationResult, console: Console) -> list[dict[str, Any]]:
-    """Return what stands out, for each polarization, and warn of it."""
+    """Return the outliers of each polarization, and warn of them."""
     from calstudy.measured.quality import assess
 
     found = [assess(data, result, index) for index in range(result.model.Npols)]
@@ -339,7 +339,7 @@ def _expected(data: UVData, sky: UVData | None, calibrator: GainFit, result: Cal
 
 
 def _tell_distance(result: CalibrationResult, console: Console) -> None:
-    """Say how much the residual still holds because the iterations stopped."""
+    """Print the part of the residual that is left because the iterations stopped."""
     left = [record for record in result.solutions if math.isfinite(record.newton_decrement)]
     if left:
         worst = max(left, key=lambda record: record.newton_decrement)
@@ -351,7 +351,7 @@ def _tell_distance(result: CalibrationResult, console: Console) -> None:
 
 
 def _tell_scale(result: CalibrationResult, console: Console) -> None:
-    """Say how the calibrated data compare with the sky model, if there is one: medians over the solves."""
+    """Print the scale of the calibrated data relative to the sky model, if there is one: medians over the solves."""
     known = [record.diagnostics for record in result.solutions if "sky_model_slope" in record.diagnostics]
     if known:
         slope, shape = (

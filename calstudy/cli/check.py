@@ -1,4 +1,4 @@
-"""``calstudy check``: how good the ingredients of an experiment's simulation are, in figures and numbers."""
+"""``calstudy check``: quality of the ingredients of an experiment's simulation, in figures and numbers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from calstudy.validation.engine_agreement import EngineAgreement
 
 WAVENUMBERS = (0.1, 0.2, 0.5, 1.0, 2.0)
-"""Where the ranges of k begin for which `simulation` prints a ratio, h/Mpc."""
+"""Lower limits of the ranges of k, h/Mpc, for which `simulation` prints a ratio."""
 
 check_app = typer.Typer(
     help="Check the ingredients of an experiment's simulation; writes a figure and its arrays.", no_args_is_help=True
@@ -148,7 +148,7 @@ def engine(
     max_memory: MaxMemory = None,
     folder: Folder = Path("checks"),
 ) -> None:
-    """Compare the foregrounds with the same foregrounds made in full by another engine.
+    """Compare the foregrounds with the same foregrounds simulated completely by another engine.
 
     Both are products in the store: what a run has made is not made again, and an interrupted check is resumed.
     """
@@ -228,7 +228,7 @@ def simulation(
 
 
 def _within(agreement: EngineAgreement, tolerance: float, names: tuple[str, str], console: Console) -> bool:
-    """Print the verdict on the largest difference, and return whether it is within the tolerance."""
+    """Print the verdict on the largest difference, and return true if it is within the tolerance."""
     criterion = Criterion(
         name="largest difference",
         section="",

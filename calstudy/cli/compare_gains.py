@@ -1,4 +1,4 @@
-"""``calstudy compare-gains``: how far the gains of two files differ, free of what no calibration can know."""
+"""``calstudy compare-gains``: differences of the gains of two files, after alignment of the degenerate terms."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def compare_gains(
 ) -> None:
     """Compare two files of gains by antenna, channel and delay.
 
-    Antennas, feeds and channels that only one of them has are left out. One phase in every channel and one real scale
-    are taken out in every integration, for no data determine them.
+    Antennas, feeds and channels that are in one file only are left out. One phase in every channel and one real
+    scale are removed in every integration, because no data determine them.
     """
     from calstudy.base.gains import at_common_channels, read_gains
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains

@@ -44,9 +44,9 @@ def export(
 ) -> None:
     """Write what a calibrator may know: data, nominal telescope, sky model; nothing of the truth.
 
-    Four data sets, of both realizations of the noise, with the EoR and without, under names that do not tell, and a
-    README that says what to return. `calstudy score` takes the gains back. With --blind, the SHA-256 that is printed is
-    to be published at once, and the recipe at the end.
+    Writes four data sets, of both realizations of the noise, with the EoR and without, under names that do not
+    reveal which is which, and a README that says what to return. `calstudy score` reads the gains. With --blind,
+    publish the printed SHA-256 at once, and the recipe at the end.
     """
     from calstudy.products.files import quiet_libraries
     from calstudy.studies.blind import write_recipe
@@ -101,8 +101,8 @@ def score(
 ) -> None:
     """Score gains of another program, found for data of `calstudy export`, as built-in calibrators are scored.
 
-    One row for each world: T and bias free of the flux scale in three bands of k, the flux scale, errors of the gains,
-    and χ² of data that were not fitted.
+    Prints one row for each world: T and bias free of the flux scale in three bands of k, the flux scale, errors of
+    the gains, and χ² of data that were not fitted.
     """
     from calstudy.base.errors import InputError
     from calstudy.products.files import quiet_libraries

@@ -122,7 +122,7 @@ def run(
 ) -> None:
     """Run an experiment or a collection: simulate, corrupt, calibrate, measure power spectra, draw figures.
 
-    Products that are in the store already are not made again; an interrupted run is resumed by the same command.
+    Products that are in the store are not made again; the same command resumes an interrupted run.
     """
     from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
@@ -148,7 +148,7 @@ def plan(
     strict: Strict = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show what a run would do: stages, what is in the store already, estimated time, memory and disk."""
+    """Show what a run would do: stages, products in the store, estimated time, memory and disk."""
     from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import describe_plan, show_plan
@@ -156,7 +156,7 @@ def plan(
 
     study = load_study(file, scale, overrides or ())
     if finished:
-        # Of JSON nothing else is on standard output.
+        # With JSON, nothing else is on standard output.
         study = with_finished(study, finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
     found = describe_plan(study, Budget(workers, max_memory), strict)
     if as_json:
@@ -180,8 +180,8 @@ def claims(
 
     A statement is supported, contradicted or undecided by the 95 % interval of the number.
 
-    Writes claims.json and claims.md into the folder, and for a collection that has studies with the paper's own solver
-    and with another one claims-by-solver.json and claims-by-solver.md.
+    Writes claims.json and claims.md into the folder. For a collection with studies by the paper's own solver and by
+    another one, also writes claims-by-solver.json and claims-by-solver.md.
     """
     from calstudy.claims.folders import evaluate_folder
     from calstudy.verdicts.tables import show_verdicts, to_json
@@ -246,7 +246,7 @@ def fetch(
 
 
 class _Termination:
-    """SIGTERM as an interrupt of the main thread; Typer does not tell it from Ctrl-C."""
+    """Handler of SIGTERM that interrupts the main thread; Typer does not distinguish it from Ctrl-C."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -265,14 +265,12 @@ def _flush() -> None:
 def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
     """Run the command line; a user's mistake ends with sentences on standard error and exit status 2.
 
-    Parameters
-    ----------
-    leave
-        Ends the process where a file could not be written, without the clean-up of libraries: HDF5 would crash there.
+    If a file could not be written, `leave` ends the process without the clean-up of libraries: HDF5 would crash
+    there.
     """
     logging.getLogger().addHandler(logging.NullHandler())
     if not faulthandler.is_enabled():
-        # Where a crash of a library was, on the terminal: a run writes standard error itself to a file.
+        # The terminal shows the place of a library's crash: a run writes standard error itself to a file.
         faulthandler.enable(os.dup(2), all_threads=False)
     if ranks.is_helper():
         ranks.serve()
@@ -296,7 +294,7 @@ def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
         _flush()
         leave(EXIT_INPUT)
     except (KeyboardInterrupt, SystemExit) as end:
-        # Typer ends an interrupted command with this status, and says nothing.
+        # Typer ends an interrupted command with this status and no message.
         if isinstance(end, SystemExit) and end.code != EXIT_INTERRUPTED:
             raise
         how = "terminated" if termination.asked else "interrupted"

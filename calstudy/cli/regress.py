@@ -1,4 +1,4 @@
-"""``calstudy regress``: whether studies, made again, still give their reference results."""
+"""``calstudy regress``: comparison of studies, made again, with their reference results."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ def regress(
     """Make reference results again and compare every array with its tolerance; exit status 1 if any is beyond it.
 
     Products in the store are made again only if they are of other code or other versions of packages; --set
-    outputs.store=DIR chooses another store, or a fresh one. What moved is listed, by how much and by how many sigma,
-    and written to regression.json in the run's folder. Nothing is overwritten without --update; with --against and
-    --update, a folder that does not exist becomes a new reference.
+    outputs.store=DIR chooses another store, or a fresh one. Changes, in values and in sigma, are listed and written
+    to regression.json in the run's folder. Nothing is overwritten without --update; with --against and --update, a
+    folder that does not exist becomes a new reference.
     """
     from calstudy.base.package_files import reference_folder
     from calstudy.regression.reference import accept, find_references
@@ -71,7 +71,7 @@ def regress(
         write_json(regression, run)
         made[reference] = run
         holds = holds and (regression.holds or update)
-    # After all runs, whose manifests would otherwise call the checkout changed.
+    # After all runs, because their manifests would otherwise record a changed checkout.
     for reference, run in made.items() if update else ():
         accept(run, reference)
         console.print(f"{reference}: updated", markup=False)

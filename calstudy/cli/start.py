@@ -1,4 +1,4 @@
-"""``calstudy examples``, ``init`` and ``schema``: how to begin an experiment file."""
+"""``calstudy examples``, ``init`` and ``schema``: the first steps of an experiment file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ KINDS = {
     "calibrators": "comparison",
     "observed": "measured data",
 }
-"""Files that are not one experiment, by the key that says so."""
+"""Kinds of files that are not one experiment, by their key."""
 
 
 def examples() -> None:
@@ -49,7 +49,7 @@ def examples() -> None:
 def init(name: Name = "my-study", example: Example = None, data: Data = None, beam: Beam = "hera") -> None:
     """Write a commented experiment file, NAME.yaml, into this folder; nothing is overwritten.
 
-    With --data it is about measured data: calibration, power spectra, and signal loss by injection.
+    With --data it is one of measured data: calibration, power spectra, and signal loss by injection.
     """
     from calstudy.base.package_files import published
     from calstudy.experiment.starter import copy_text, observed_text, starter_text
@@ -70,7 +70,7 @@ def init(name: Name = "my-study", example: Example = None, data: Data = None, be
 
 
 def _described(data: str) -> DataSet:
-    """Return what a file about measured data says of them, after a look at their metadata."""
+    """Return the section of a file on measured data, after a look at their metadata."""
     from calstudy.experiment.starter import DataSet
     from calstudy.measured.halves import read_facts
     from calstudy.measured.selection import Selection

@@ -1,4 +1,4 @@
-"""``calstudy runs`` and ``store``: what lies in the folders of runs and products; nothing is deleted unasked."""
+"""``calstudy runs`` and ``store``: contents of the folders of runs and products; nothing is deleted unasked."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SECONDS = {"h": 3600.0, "d": 86_400.0}
 
 
 def runs(folder: RunsFolder = Path("runs")) -> None:
-    """List finished runs: when, how large, of how many products."""
+    """List finished runs: time, size, and number of products."""
     from calstudy.run.inventory import list_runs
     from calstudy.verdicts.tables import Table
 
@@ -59,9 +59,9 @@ def store(
 ) -> None:
     """Show what is in a store by stage, or delete chosen products.
 
-    A deleted product is made again by the next run that needs it. Folders that killed runs left are listed too, and
+    A deleted product is made again by the next run that needs it. Folders left by killed runs are listed too, and
     deleted with --older-than. Without --delete nothing is changed; with it, at least one of --older-than,
-    --larger-than, --unreferenced and --verify must say which products are meant. Do not delete during a run.
+    --larger-than, --unreferenced and --verify must choose the products. Do not delete during a run.
     """
     from calstudy.run.inventory import age_of, leftovers, list_runs, products
     from calstudy.run.inventory import unreferenced as without_run
@@ -104,7 +104,7 @@ def _delete(chosen: list[Product], store: Store, console: Console) -> None:
 
 
 def _verify(store: Store, delete: bool) -> None:
-    """Read all products against their records; name what is damaged, and delete it if that is wanted."""
+    """Compare all products with their records; name damaged ones, and delete them on request."""
     console, addresses = Console(highlight=False, soft_wrap=True), store.addresses()
     damaged = [address for address in addresses if store.verify(*address) is None]
     for stage, key in damaged:

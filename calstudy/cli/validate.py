@@ -1,4 +1,4 @@
-"""``calstudy validate``: the validation ladder, every stage of the chain tested against a known answer."""
+"""``calstudy validate``: the validation ladder, which tests every stage of the chain against a known answer."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Papers whose published statements runs are compared with: one module or package each."""
+"""Papers with published statements that runs are compared with: one module or package each."""

@@ -32,16 +32,16 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 WINDOW = (0.2, 0.5)
-"""h/Mpc, beyond the wedge and its leakage by the taper."""
+"""Range of k beyond the wedge and its leakage by the taper, h/Mpc."""
 REALISTIC = (0.01, 0.2)
-"""Part of the rms of the foregrounds that a catalogue of realistic completeness lacks; one of all sources above 0.1 Jy
-lacks 0.07."""
+"""Fraction of the rms of the foregrounds that a catalogue of realistic completeness lacks; one of all sources above 0.1
+Jy lacks 0.07."""
 MISSING = Source("Abstract", ("incomplete_sky_model",))
 JOINT = "the precision of the catalogue and the spectral smoothness of the antennas constrain each other"
 
 
 def _bias(run: RunResults, incomplete: bool = True) -> Finding:
-    """Return the bias in the window, if the array is large enough and the sky model lacks a realistic part."""
+    """Return the bias in the window if the array is large enough and, if `incomplete`, a realistic part is missing."""
     require_long_baselines(run, WINDOW[1])
     lacking = run.sky_model_error
     if incomplete and not REALISTIC[0] <= lacking <= REALISTIC[1]:
@@ -129,7 +129,7 @@ class Barry2016(Paper):
         ]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return what of an experiment is not that of the role, or None."""
+        """Return in words an unsuitable setting of an experiment for a role, or None."""
         return first_refusal(
             other_calibrator(experiment, ("sky-based", "skycal")),
             _other_smoothing(experiment, smoothed=role in ("smooth_antennas", "structured_antennas")),
@@ -146,14 +146,14 @@ def _other_smoothing(experiment: Experiment, smoothed: bool) -> str | None:
         return "calibration.gain_delay is set, so that channels are not fitted by themselves"
     if not smoothed:
         return None if calibration.smooth_gains is None else "calibration.smooth_gains is set"
-    # Other kinds may keep structure at the delays of the window.
+    # Other kinds may leave structure at the delays of the window.
     if isinstance(calibration.smooth_gains, PolynomialSmoothing):
         return None
     return "calibration.smooth_gains is no polynomial"
 
 
 def _no_structure(experiment: Experiment) -> str | None:
-    """Return in words that no gains have structure at delays of the window, or None if some have."""
+    """Return a refusal if no gains have structure at delays of the window, or None."""
     for effect in experiment.corruption.effects:
         reflected = isinstance(effect, ReflectionGains) and k_of_delay(experiment, effect.delay)
         if isinstance(effect, PerChannelGains) or (reflected and WINDOW[0] <= reflected <= WINDOW[1]):

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 CRUCIAL = (0.1, 0.2)
-"""h/Mpc, where the noise allows a detection first."""
+"""Range of k in which the noise allows a detection first, h/Mpc."""
 EXACT = 1e-3
-"""m, within which redundant baselines of a lattice are equal."""
+"""Distance within which redundant baselines of a lattice are equal, m."""
 MISSING = Source("Abstract", ("redundant_incomplete",))
 
 
@@ -72,7 +72,7 @@ class Byrne2019(Paper):
         return [absolute_calibration_overwhelms_eor, complete_model_leaves_crucial_modes]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return what of an experiment is not that of the role, or None."""
+        """Return in words an unsuitable setting of an experiment for a role, or None."""
         steps = getattr(experiment.calibration, "steps", ())
         return first_refusal(
             other_calibrator(experiment, ("redcal",)),
@@ -85,7 +85,7 @@ class Byrne2019(Paper):
 
 
 def _no_lattice(experiment: Experiment) -> str | None:
-    """Return in words that baselines which count as redundant are not equal, or None if they are."""
+    """Return a refusal if baselines that count as redundant are not equal, or None."""
     enu = make_array(experiment.instrument).enu
     first, second = np.triu_indices(len(enu), 1)
     tolerances = EXACT, getattr(experiment.calibration, "redundancy_tolerance", EXACT)

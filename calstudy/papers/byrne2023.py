@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 WINDOW = (0.2, 0.5)
-"""h/Mpc."""
+"""Range of k, h/Mpc."""
 HUNDRED = Within(10**1.5, 10**2.5)
 BOTH = Source("Abstract", ("sky_based", "delay_weighted"))
 
@@ -88,7 +88,7 @@ class Byrne2023(Paper):
         return [error_of_calibration_is_reduced, sensitivity_improves_hundredfold]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return what of an experiment is not that of the role, or None."""
+        """Return in words an unsuitable setting of an experiment for a role, or None."""
         allowed = ("delay-weighted",) if role == "delay_weighted" else ("sky-based", "skycal")
         return first_refusal(
             other_calibrator(experiment, allowed),

@@ -1,7 +1,7 @@
 """Chokshi et al. 2024: sky-based calibration of MWA tiles whose beams are deformed.
 
-The statements are in our words, after the paper's abstract. The deformation is that of unequal amplitudes of dipoles;
-the paper's are fitted to beams that were measured with satellites.
+The statements are in our words, after the paper's abstract. The deformation is that of unequal amplitudes of
+dipoles; the paper's deformations are fits to beams measured with satellites.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 MODES = (0.1, 1.0)
-"""h/Mpc."""
+"""Range of k, h/Mpc."""
 SCATTER = "dipoles.amplitude_scatter"
 DIPOLES = "instrument.as_built.dipoles"
 AMPLITUDES = f"instrument.as_built.{SCATTER}"
 LEAST = 0.05
-"""Of the amplitudes: less is not the deformation of tiles in the field."""
+"""Scatter of the amplitudes below which it is not a deformation of tiles in the field."""
 DEFORMED = Source("Abstract", ("one_beam",))
 
 
@@ -81,7 +81,7 @@ class Chokshi2024(Paper):
         return [leakage_exceeds_signal_thousandfold, known_beams_leave_less_than_signal]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return what of an experiment is not that of the role, or None."""
+        """Return in words an unsuitable setting of an experiment for a role, or None."""
         found = experiment.instrument.as_built.dipoles.amplitude_scatter
         refusal = first_refusal(
             other_calibrator(experiment, ("sky-based", "skycal")),

@@ -1,8 +1,8 @@
 """Joseph et al. 2020: sky-based calibration of MWA tiles of which some have a dead dipole.
 
-The statements are in our words, after the paper's abstract. The paper's 10^3 mK^2 h^-3 Mpc^3 are after subtraction of
-sources, as here, where the residual is that of the sky model. They belong to its foregrounds, and are compared through
-the expected signal, which the paper says is two orders of magnitude less.
+The statements are in our words, after the paper's abstract. The paper's 10^3 mK^2 h^-3 Mpc^3 are after subtraction
+of sources; here the residual is that of the sky model. They depend on its foregrounds, and are compared through the
+expected signal, which is two orders of magnitude smaller according to the paper.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 TILES = (0.15, 0.4)
-"""Part of the tiles that have at least one dead dipole."""
+"""Range of the fraction of tiles with at least one dead dipole."""
 MODES = (0.1, 1.0)
-"""h/Mpc."""
+"""Range of k, h/Mpc."""
 DEAD = Source("Abstract", ("dead_dipoles",))
 
 
@@ -75,7 +75,7 @@ class Joseph2020(Paper):
         return [bias_is_a_hundred_signals, bias_exceeds_expected_signal]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return what of an experiment is not that of the role, or None."""
+        """Return in words an unsuitable setting of an experiment for a role, or None."""
         del role
         dead = experiment.instrument.as_built.dipoles.dead_tiles
         few = (

@@ -1,1 +1,1 @@
-"""The products of an experiment: what each is made from, what it costs, and how it is made."""
+"""The products of an experiment: the inputs of each, its cost, and the function that makes it."""

@@ -1,4 +1,4 @@
-"""How far the calibration of the variant `residual` agrees with the truth of the simulation."""
+"""Agreement of the calibration of variant `residual` with the truth of the simulation."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ if TYPE_CHECKING:
 
 AGREEMENT = "agreement.json"
 MOST_SAMPLES = 112 * 630 * 384
-"""Visibilities that are compared at most, twice the paper's: more would need ever more memory."""
+"""Maximum number of visibilities compared, twice the paper's: it limits the memory."""
 
 
 @once
 def agreement(graph: Graph) -> Task | None:
-    """Return the task that measures how far the calibration of variant `residual` agrees with the truth.
+    """Return the task that compares the calibration of variant `residual` with the truth, or None if there is none.
 
-    None if there is nothing to measure: no such calibrated variant of foregrounds and noise, or no variant of noise
-    alone to compare with.
+    It needs a calibrated variant `residual` of foregrounds and noise with effects, and a variant of noise alone.
     """
     variants, foregrounds = graph.experiment.variants, simulation.foregrounds(graph)
     residual, noise = variants.get("residual"), variants.get("noise")
@@ -49,7 +48,7 @@ def agreement(graph: Graph) -> Task | None:
 
 
 def measure(job: Job) -> Mapping[str, Any]:
-    """Write the measurements of the first polarization, and how redundant the array is, to agreement.json."""
+    """Write the measurements of the first polarization and the redundant fraction of the array to agreement.json."""
     import numpy as np
 
     from calstudy.base.errors import InputError
@@ -76,7 +75,7 @@ def measure(job: Job) -> Mapping[str, Any]:
         frequency=data.freq_array,
         buffer=job.settings["buffer"],
     )
-    # What is flagged is zero in all that is compared.
+    # Flagged samples are zero in all compared arrays.
     used, known = ~flags[chosen][:, observed], ~fitted.flags[chosen][:, np.searchsorted(fitted.numbers, numbers)]
 
     def visibilities(name: str, file: str) -> np.ndarray:
@@ -104,12 +103,12 @@ def measure(job: Job) -> Mapping[str, Any]:
 
 
 def integrations_compared(size: Size) -> int:
-    """Return how many integrations are compared, spread over the run: all, if they have few enough visibilities."""
+    """Return the number of integrations compared: all, or fewer if they have more than `MOST_SAMPLES` visibilities."""
     return min(size.times, max(1, MOST_SAMPLES // (size.baselines * size.channels.count)))
 
 
 def spread(places: np.ndarray, most: int) -> np.ndarray:
-    """Return places, (N,), or `most` of them from the first to the last at equal distances if there are more."""
+    """Return places, (N,), or `most` of them at equal distances from the first to the last if there are more."""
     import numpy as np
 
     return places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))]

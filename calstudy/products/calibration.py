@@ -1,4 +1,4 @@
-"""The calibration under test: gains, foreground models and residuals, solved in pieces of consecutive integrations."""
+"""The calibration under test: gains, foreground models and residuals, solved in runs of consecutive integrations."""
 
 from __future__ import annotations
 
@@ -37,18 +37,8 @@ if TYPE_CHECKING:
 
 @once
 def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
-    """Return the task of the calibration of one noise realization of a variant.
-
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    variant
-        What is calibrated.
-    parity
-        "even" or "odd".
-    """
-    # What is assumed decides the sky model, which is an input, and nothing else.
+    """Return the task of the calibration of one noise realization ("even" or "odd") of a variant."""
+    # The assumed world enters only through the sky model, which is an input.
     inputs = calibration_inputs(graph, variant, parity)
     model = inputs.get("sky_model")
     calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model.key if model else None)
@@ -56,7 +46,7 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
 
 
 def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str, Task]:
-    """Return what the calibration of one noise realization of a variant needs."""
+    """Return the inputs of the calibration of one noise realization ("even" or "odd") of a variant."""
     inputs, calibrator = {"data": corruption.data(graph, variant, parity)}, graph.experiment.calibration
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
@@ -70,19 +60,12 @@ def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str,
 def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: bool = False) -> Task:
     """Return the task of the calibration of any data.
 
-    Parameters
-    ----------
-    settings
-        The calibrator.
-    inputs
-        ``data``; ``sky_model``, if there is one; ``levels``, if the calibrator needs to know the noise;
-        ``autocorrelations``, if it needs them and the data have none.
-    temporary
-        Of the task.
+    The inputs are ``data``; ``sky_model``, if there is one; ``levels``, if the calibrator needs the level of the noise;
+    and ``autocorrelations``, if it needs them and the data have none.
     """
     data = inputs["data"]
     solves = -(-size_of(data).times // settings.integrations_per_solve)
-    # Gains that are smoothed in time are those of all integrations.
+    # Gains smoothed in time need all integrations.
     together = settings.smooth_gains is not None and settings.smooth_gains.over_time
     count = 1 if together else min(settings.chunks, solves)
     chunks = {
@@ -99,9 +82,9 @@ def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: 
 
 
 def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.ndarray:
-    """Return the times of run number `index` of `count` runs of consecutive integrations, as equal as can be.
+    """Return the times of run `index` of `count` runs of consecutive integrations, which are as equal as possible.
 
-    A run ends where one group of integrations that are solved `together` ends.
+    A run ends at the end of a group of integrations that are solved `together`.
     """
     import numpy as np
 
@@ -115,14 +98,9 @@ def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.nda
 def read_calibrated(
     inputs: Mapping[str, Path], times: np.ndarray | None = None
 ) -> tuple[UVData, UVData | None, float | None]:
-    """Read what a calibration is given: data, sky model and the level of the noise, as far as there are any.
+    """Read data, sky model and noise level of a calibration at some integrations (JD), by default all.
 
-    Parameters
-    ----------
-    inputs
-        Folders of the products of `calibration_inputs`.
-    times
-        JD of the integrations that are read; None for all.
+    The folders are those of `calibration_inputs`; a sky model or noise level that is not an input is None.
     """
     from calstudy.calibrate.sky_model import common_baselines
 
@@ -137,7 +115,7 @@ def read_calibrated(
 
 
 def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
-    """Return data whose integrations have autocorrelations after all other baselines."""
+    """Return data with the autocorrelations of each integration after all other baselines."""
     import numpy as np
 
     joined = data.fast_concat([autos], "blt", inplace=False)

@@ -1,4 +1,4 @@
-"""How much of the foregrounds two noise realizations have in common after so many steps of a solver."""
+"""Foregrounds that two noise realizations have in common, as a function of the number of steps of a solver."""
 
 from __future__ import annotations
 
@@ -27,18 +27,9 @@ PATHS = "convergence.json"
 
 
 def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
-    """Return the task that follows one solver on one integration of both realizations of a variant.
+    """Return the task that follows a solver, in place of the experiment's own, on one integration of a variant.
 
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    name
-        Of the variant.
-    solver
-        Settings of the solver, in place of the experiment's own.
-    integration
-        Counted from 0.
+    Both realizations are solved; integrations are counted from 0.
     """
     experiment = graph.experiment
     variant = experiment.variants[name]
@@ -61,7 +52,7 @@ def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
 
 
 def follow(job: Job) -> Mapping[str, Any]:
-    """Solve one integration of both realizations, and write what they have in common after so many steps.
+    """Solve one integration of both realizations, and write the power they have in common after numbers of steps.
 
     Powers are sums over the delays outside the wedge, one per baseline, of the first polarization.
     """
@@ -104,7 +95,7 @@ def follow(job: Job) -> Mapping[str, Any]:
 def _abreast(
     even: list[Checkpoint], odd: list[Checkpoint], steps: Sequence[int]
 ) -> Iterator[tuple[Checkpoint, Checkpoint]]:
-    """Yield what both realizations held after the same numbers of steps; one that has ended stays where it is."""
+    """Yield the states of both realizations after the same numbers of steps; one that has ended does not change."""
     last = max(even[-1].n_steps, odd[-1].n_steps)
     seen = -1
     for step in sorted({step for step in steps if step < last} | {last}):
@@ -122,7 +113,7 @@ def _integration(job: Job, name: str) -> np.ndarray:
 
 
 def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Baselines]:
-    """Return a realization, what the solver held on the way, as often as is asked for, and the baselines."""
+    """Return a realization, the states of the solver after the numbers of steps in the settings, and the baselines."""
     import numpy as np
 
     from calstudy.base.observation import Observation

@@ -1,4 +1,4 @@
-"""From simulated components to measurements: the levels of EoR and noise, what effects draw, and what they do."""
+"""From simulated components to measurements: the levels of EoR and noise, and the effects with their draws."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LEVELS, TRUTH = "levels.json", "truth.h5"
 
 
 def truths(graph: Graph) -> list[Task]:
-    """Return the tasks of what each effect of the experiment draws, in the order of the effects."""
+    """Return the tasks that draw the truth of each effect of the experiment, in the order of the effects."""
     return [_truth(graph, place) for place in range(len(graph.experiment.corruption.effects))]
 
 
@@ -47,7 +47,7 @@ def _truth(graph: Graph, place: int) -> Task:
 
 
 def _antennas(graph: Graph, effects: Sequence[Effect]) -> InstrumentSettings:
-    """Return the instrument that effects happen in: without beams, but with the true positions for what uses them."""
+    """Return the instrument on which effects act: without beams, with true positions if an effect uses them."""
     instrument = graph.experiment.instrument
     nominal = instrument.without_beams()
     if not any(effect.uses_positions for effect in effects):
@@ -71,7 +71,7 @@ def _numbered(tasks: Sequence[Task]) -> dict[str, Task]:
 
 @once
 def levels(graph: Graph) -> Task:
-    """Return the task of the levels: how the EoR and the noise are scaled."""
+    """Return the task of the levels: the factors of the EoR and the noise."""
     inputs = {"eor": simulation.eor(graph)}
     if (foregrounds := simulation.foregrounds(graph)) is not None:
         inputs["foregrounds"] = foregrounds
@@ -85,19 +85,9 @@ def levels(graph: Graph) -> Task:
 
 @once
 def data(graph: Graph, variant: Variant, parity: str) -> Task:
-    """Return the task of the measurement of one noise realization of a variant, before any calibration.
-
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    variant
-        Its components, and whether effects happen to them.
-    parity
-        "even" or "odd".
-    """
+    """Return the task of one noise realization ("even" or "odd") of a variant before calibration."""
     experiment = graph.experiment
-    # Variants are compared, and give each other's errors: all have the same samples.
+    # All variants need the same samples, because they are compared and provide errors for each other.
     flagging = [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]
     effects = experiment.corruption.effects if variant.effects else ()
     acting = effects or [experiment.corruption.effects[place] for place in flagging]
@@ -127,18 +117,9 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
 
 @once
 def autocorrelations(graph: Graph, variant: Variant, parity: str) -> Task:
-    """Return the task of the autocorrelations of one noise realization of a variant.
+    """Return the task of the autocorrelations of one noise realization ("even" or "odd") of a variant.
 
-    They are the same with the EoR and without it, which is far below their noise.
-
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    variant
-        Whether effects happen to it.
-    parity
-        "even" or "odd".
+    They do not contain the EoR, which is far below their noise.
     """
     noise = graph.experiment.corruption.noise
     if isinstance(noise, NoNoise):
@@ -155,7 +136,7 @@ def autocorrelations(graph: Graph, variant: Variant, parity: str) -> Task:
 
 
 def draw_effect(job: Job) -> Mapping[str, Any]:
-    """Write what an effect draws to truth.h5, a data set for each array."""
+    """Write the arrays drawn by an effect to truth.h5, one data set each."""
     import h5py
 
     from calstudy.base.observation import Observation
@@ -196,7 +177,7 @@ def multiply_gains(job: Job) -> Mapping[str, Any]:
 
     template = make_template(job.settings["instrument"])
     factors = [read_truth(folder)["gains"] for folder in job.inputs.values()]
-    # Gains that hold for the whole run have a single time.
+    # Gains that are constant during the run have a single time.
     n_times = max((gains.shape[2] for gains in factors), default=1)
     product = np.ones((template.telescope.Nants, template.Nfreqs, n_times, template.Npols), dtype=complex)
     rows = antenna_rows(template)
@@ -226,7 +207,7 @@ def measure_levels(job: Job) -> Mapping[str, Any]:
 
 
 def _floor_warnings(job: Job) -> list[str]:
-    """Warn if the simulated foregrounds leak more beyond the horizon than the EoR that is put on them."""
+    """Warn if the simulated foregrounds leak more power beyond the horizon than the EoR has."""
     level = job.settings["corruption"].eor_level
     if "foregrounds" not in job.inputs or level is None:
         return []
@@ -240,9 +221,9 @@ def _floor_warnings(job: Job) -> list[str]:
 
 
 def corrupt(job: Job) -> Mapping[str, Any]:
-    """Write the sum of F, S and N, or of those that are asked for, after all effects, to data.uvh5.
+    """Write the sum of F, S and N, or of those in the settings, after all effects, to data.uvh5.
 
-    The flags of all effects are set in all data, whether effects happen to them or not.
+    The flags of all effects are set in all data, even where the effects do not act.
     """
     import numpy as np
 
@@ -280,7 +261,7 @@ def corrupt(job: Job) -> Mapping[str, Any]:
 
 
 def autocorrelate(job: Job) -> Mapping[str, Any]:
-    """Write the autocorrelations after the gains to data.uvh5. Other effects leave them as they are."""
+    """Write the autocorrelations after the gains to data.uvh5; other effects do not change them."""
     import numpy as np
 
     from calstudy.base.gains import read_gains
@@ -326,7 +307,7 @@ def _cost_of_levels(task: Task) -> Cost:
 
 
 def _cost_of_gains(task: Task) -> Cost:
-    """Return the cost of gains, which are as many as antennas, channels and, where they drift, integrations."""
+    """Return the cost of gains, whose number depends on antennas, channels and, if they drift, integrations."""
     size = size_of(task)
     effects = (
         [task.settings["effect"]] if "effect" in task.settings else [t.settings["effect"] for t in task.needs.values()]

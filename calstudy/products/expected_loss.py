@@ -1,4 +1,4 @@
-"""What the fit of one integration leaves of the EoR to first order, from its own tangent space."""
+"""Fraction of the EoR that the fit of one integration leaves, to first order, from its own tangent space."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def expected_loss(graph: Graph) -> Task:
 
 @once
 def linear_response(graph: Graph) -> Task | None:
-    """Return the task of the linear response to the EoR itself, or None if there is none that T can be compared with.
+    """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T.
 
-    Calibrators must fit by least squares, integration by integration, and gains must be used as they are; and spectra
-    must be of each baseline with itself, for a fit responds differently on different baselines of a group.
+    Calibrators must fit each integration by least squares and use the gains without smoothing. Spectra must be of each
+    baseline with itself, because a fit responds differently on different baselines of a group.
     """
     settings = graph.experiment.calibration
     fits = isinstance(settings, GainFit) and settings.integrations_per_solve == 1 and settings.smooth_gains is None
@@ -69,7 +69,7 @@ def _settings(graph: Graph) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Solution:
-    """The problem of one integration, and its solution; gains (Nants, Nfreqs), model (Nbls, Nfreqs)."""
+    """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs)."""
 
     problem: CalibrationProblem
     gains: np.ndarray
@@ -80,7 +80,7 @@ class _Solution:
 
 
 def _solution(job: Job) -> _Solution | None:
-    """Return what was solved, or None if antennas or channels have no gains, or nothing was."""
+    """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
     import numpy as np
 
     from calstudy.base.observation import Observation
@@ -171,19 +171,7 @@ def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSe
 
 
 def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power: PowerSettings) -> ExpectedBins:
-    """Return an expected T in bins of k and of baseline length and delay.
-
-    Parameters
-    ----------
-    expected
-        Per baseline and delay.
-    lengths
-        Of the baselines, m, (Nbls,).
-    centre
-        Of the band, Hz.
-    power
-        Bins, buffer of the wedge, cosmology.
-    """
+    """Return an expected T of baselines (lengths in m, band centre in Hz) in bins of k and of length and delay."""
     from calstudy.power.expected import bin_expected
     from calstudy.power.spherical import make_bin_edges
 

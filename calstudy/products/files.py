@@ -1,4 +1,4 @@
-"""Read and write the files that products consist of."""
+"""Read and write the files of products."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def spectrum_file(name: str, kind: str) -> str:
     name
         A variant, or one of the names in `calstudy.products.signal_loss`.
     kind
-        "wedge" for the cylindrical one; "all-modes", "outside-wedge" or "inside-wedge" for spherical ones.
+        "wedge" for the cylindrical spectrum; "all-modes", "outside-wedge" or "inside-wedge" for spherical ones.
     """
     return f"{name}.{kind}.h5"
 
@@ -49,7 +49,7 @@ def quiet_libraries() -> Iterator[None]:
 
 
 def read_visibilities(path: Path, times: np.ndarray | None = None) -> UVData:
-    """Read a UVH5 product as it was written, or some of its integrations (JD)."""
+    """Read a UVH5 product as it was written, or only some of its integrations (JD)."""
     from pyuvdata import UVData
 
     keep_compiled_pyuvdata()
@@ -68,18 +68,10 @@ def integration_times(path: Path) -> np.ndarray:
 
 
 def read_in_parts(paths: Sequence[Path], samples: int) -> Iterator[tuple[range, list[UVData]]]:
-    """Read UVH5 products of the same times side by side, consecutive integrations at a time.
+    """Read UVH5 products of the same times in parallel, in pieces of consecutive integrations.
 
-    Parameters
-    ----------
-    paths
-        Of the files.
-    samples
-        Visibilities of one file that are read at a time, at most; one integration at least.
-
-    Yields
-    ------
-    Places of the integrations in the run, and the data of each file.
+    A piece has at most `samples` visibilities of each file, but at least one integration. Yield the indices of its
+    integrations in the run, and the data of each file.
     """
     header, times = _header(paths[0]), integration_times(paths[0])
     step = max(1, samples // (header.Nbls * header.Nfreqs * header.Npols))
@@ -89,17 +81,7 @@ def read_in_parts(paths: Sequence[Path], samples: int) -> Iterator[tuple[range, 
 
 
 def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:
-    """Write UVH5; `single` stores complex64, whose rounding (6e-8) is far below any noise that a study adds.
-
-    Parameters
-    ----------
-    uvd
-        Visibilities in Jy.
-    path
-        Of the file.
-    single
-        Whether complex64 is stored.
-    """
+    """Write UVH5; `single` stores complex64, whose rounding (6e-8) is far below any noise that a study adds."""
     uvd.write_uvh5(path, data_write_dtype=np.dtype(np.complex64 if single else np.complex128))
 
 
@@ -109,10 +91,10 @@ def read_json(path: Path) -> Any:
 
 
 def json_number(value: float) -> float | None:
-    """Return a number as JSON has it: null if it is not finite."""
+    """Return a number for JSON: None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write a JSON file; NaN and infinity are refused, for they are not JSON."""
+    """Write a JSON file; raises ValueError for NaN and infinity, which JSON does not have."""
     path.write_text(json.dumps(value, indent=1, allow_nan=False), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The graph of an experiment: its tasks, each made once however many others need it."""
+"""The graph of an experiment: its tasks, each made once and shared by all tasks that need it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Arguments = ParamSpec("Arguments")
 
 
 class Memory:
-    """What is made of one file, each thing once; see `once`."""
+    """Cache of the objects that are made from one file; see `once`."""
 
     def __init__(self) -> None:
         self.made: dict[Hashable, Any] = {}
@@ -25,15 +25,10 @@ Owner = TypeVar("Owner", bound=Memory)
 
 
 class Graph(Memory):
-    """The tasks of one experiment; the modules of this package make them, each those of its own products.
+    """The tasks of one experiment; each module of this package makes those of its own products.
 
-    Parameters
-    ----------
-    experiment
-        Validated.
-    keep_visibilities
-        Whether measurements and calibrated visibilities stay in the store; if not, they are removed once all that needs
-        them is made. Simulated components and averages over the run always stay.
+    If `keep_visibilities` is false, measurements and calibrated visibilities are removed from the store as soon as all
+    products made from them exist. Simulated components and averages over the run always stay.
     """
 
     def __init__(self, experiment: Experiment, keep_visibilities: bool = True) -> None:
@@ -44,7 +39,7 @@ class Graph(Memory):
 
 
 def once(make: Callable[Concatenate[Owner, Arguments], Made]) -> Callable[Concatenate[Owner, Arguments], Made]:
-    """Make ``make(graph, ...)`` return the same task whenever it is called with the same graph and arguments."""
+    """Make ``make(graph, ...)`` return the same object whenever it is called with the same graph and arguments."""
 
     @wraps(make)
     def task(graph: Owner, *arguments: Arguments.args, **named: Arguments.kwargs) -> Made:
@@ -57,17 +52,14 @@ def once(make: Callable[Concatenate[Owner, Arguments], Made]) -> Callable[Concat
 
 
 def required(task: Task | None) -> Task:
-    """Return the task of a product that an experiment may lack, where it must have it; raises LookupError if not."""
+    """Return a task that an experiment may lack; raises LookupError if it is None."""
     if task is None:
         raise LookupError("the experiment does not have a product that is needed of it")
     return task
 
 
 def size_of(task: Task) -> Size:
-    """Return the size of the data that a task works on: as its settings say, or those of the nearest it is made from.
-
-    That is the size of an instrument's data, or of measured ones.
-    """
+    """Return the size of the simulated or measured data of a task, from its settings or those of its nearest input."""
     size = _size_in(task)
     if size is None:
         raise LookupError(f"{task.stage.name} ({task.label}): made from no instrument")

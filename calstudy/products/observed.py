@@ -34,22 +34,17 @@ if TYPE_CHECKING:
     from calstudy.measured.halves import Halves
 
 NOISE = "noise.uvh5"
-"""Of an average: sigma by the autocorrelations."""
+"""Sigma of an average's noise from the autocorrelations."""
 WHAT = ("data", "calibrated", "residual")
-"""What has power spectra: the data as given, V / (g g*), and V / (g g*) - F."""
+"""Data whose power spectra are estimated: as given, calibrated V / (g g*), and residual V / (g g*) - F."""
 SOURCES = ("difference", "autos")
-"""From what the noise is known: the difference of the halves, the autocorrelations."""
+"""Sources of the noise level: the difference of the halves, the autocorrelations."""
 
 
 class ObservedGraph(Memory):
-    """The tasks of one study of measured data.
+    """The tasks of one study of measured data, from the sections of its file and the two halves of the data.
 
-    Parameters
-    ----------
-    observed, calibration, power, injection
-        Sections of its file; no injection if None.
-    halves
-        Of the files.
+    There is no injection if `injection` is None.
     """
 
     def __init__(
@@ -99,7 +94,7 @@ def observed(graph: ObservedGraph, parity: str) -> Task:
 
 
 def calibration_inputs(graph: ObservedGraph, data: Task, parity: str) -> dict[str, Task]:
-    """Return what a calibration of data of one half needs."""
+    """Return the inputs of a calibration of data of one half."""
     inputs, source = {"data": data}, observed(graph, parity)
     if graph.observed.sky_model is not None:
         inputs["sky_model"] = source
@@ -117,25 +112,13 @@ def calibrated(graph: ObservedGraph, parity: str) -> Task:
 
 @once
 def average(graph: ObservedGraph, what: str, parity: str) -> Task:
-    """Return the task of one half, fringe-stopped and averaged; `what` is one of `WHAT`."""
+    """Return the task of the fringe-stopped average of one half; `what` is one of `WHAT`."""
     inputs = {"data": observed(graph, parity), "calibration": calibrated(graph, parity)}
     return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, **graph.halves.averaging(graph.power)}, inputs)
 
 
 def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: PowerSettings | None = None) -> Task:
-    """Return the task of the delay power spectra of two averages.
-
-    Parameters
-    ----------
-    graph
-        Of the study.
-    label
-        What the data are.
-    even, odd
-        Averages.
-    power
-        In place of the study's own.
-    """
+    """Return the task of the delay power spectra of two averages; `power` replaces the study's own settings."""
     settings = {**graph.beam_settings, "power": (power or graph.power).reset(*NOT_OF_DELAY_SPECTRA)}
     return Task(POWER, label, settings, {"even": even, "odd": odd})
 
@@ -148,17 +131,7 @@ def power_of(graph: ObservedGraph, what: str) -> Task:
 
 @once
 def noise_power(graph: ObservedGraph, what: str, source: str) -> Task:
-    """Return the task of the power of the noise of each baseline.
-
-    Parameters
-    ----------
-    graph
-        Of the study.
-    what
-        "data" as given, or "residual": calibrated.
-    source
-        One of `SOURCES`.
-    """
+    """Return the task of the noise power of each baseline from one of `SOURCES`, for "data" or "residual"."""
     inputs = {parity: average(graph, what, parity) for parity in PARITIES}
     label = f"noise of {what} from {source}"
     noise = Task(NOISE_STAGE, label, {"source": source}, inputs)
@@ -209,7 +182,7 @@ def observe(job: Job) -> Mapping[str, Any]:
 
 
 def _factor(job: Job, data: UVData) -> float:
-    """Return what one unit of the data is in Jy."""
+    """Return the value of one unit of the data in Jy."""
     import numpy as np
 
     from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
@@ -237,7 +210,7 @@ def _factor(job: Job, data: UVData) -> float:
 
 
 def _write_level(job: Job, data: UVData) -> None:
-    """Write the rms of the noise as the calibrators that need it find it, if the autocorrelations tell."""
+    """Write the rms of the noise for calibrators that need it, if the autocorrelations give it."""
     from calstudy.measured.noise import sample_noise
 
     noise = sample_noise(data)
@@ -293,7 +266,7 @@ def _rows(data: UVData, chosen: np.ndarray) -> np.ndarray:
 
 
 def _variances(data: UVData, pairs: np.ndarray) -> np.ndarray | None:
-    """Return sigma^2 of all samples by the autocorrelations, (Ntimes, Nbls, Nfreqs, Npols), or None."""
+    """Return sigma^2 of all samples from the autocorrelations, (Ntimes, Nbls, Nfreqs, Npols), or None without them."""
     import numpy as np
 
     from calstudy.measured.noise import radiometer_variance

@@ -1,4 +1,4 @@
-"""A simulated EoR put into measured data under the solved gains, calibrated again: what is left of it."""
+"""Signal loss of measured data: a simulated EoR is added under the solved gains, and the data are calibrated again."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def eor(graph: ObservedGraph, parity: str) -> Task:
 
 @once
 def factor(graph: ObservedGraph) -> Task:
-    """Return the task of what the EoR is multiplied by, which is the same for both halves."""
+    """Return the task of the factor of the EoR, which is the same for both halves."""
     inputs = {"eor": eor(graph, "even"), "calibration": calibrated(graph, "even")}
     level = graph.injection.level if graph.injection else None
     return Task(SET_LEVEL, "level of the eor", {"level": level}, inputs)
@@ -73,7 +73,7 @@ def factor(graph: ObservedGraph) -> Task:
 
 @once
 def injected(graph: ObservedGraph, parity: str) -> Task:
-    """Return the task of the data of one half with the EoR in them."""
+    """Return the task of the data of one half with the EoR added."""
     inputs = {
         "data": observed(graph, parity),
         "eor": eor(graph, parity),
@@ -96,7 +96,7 @@ def response(graph: ObservedGraph, parity: str) -> Task:
 
 @once
 def signal(graph: ObservedGraph, parity: str) -> Task:
-    """Return the task of the averaged EoR of one half, as it is put in but for the gains."""
+    """Return the task of the averaged EoR of one half, as added but without the gains."""
     inputs = {"eor": eor(graph, parity), "factor": factor(graph), "calibration": calibrated(graph, parity)}
     return Task(AVERAGE_EOR, f"eor {parity}", graph.halves.averaging(graph.power), inputs)
 
@@ -118,7 +118,7 @@ def transfer(graph: ObservedGraph) -> Task | None:
 
 @once
 def expected(graph: ObservedGraph) -> Task | None:
-    """Return the task of the T that the fit predicts of itself, or None if it is no fit by least squares."""
+    """Return the task of the T that the fit itself predicts, or None if it is not a least-squares fit."""
     if not isinstance(graph.calibration, GainFit):
         return None
     inputs = {"data": observed(graph, "even"), "calibration": calibrated(graph, "even")}
@@ -137,7 +137,7 @@ def injection_tables(graph: ObservedGraph) -> list[Task]:
 
 
 def simulate_eor(job: Job) -> Mapping[str, Any]:
-    """Write the EoR of one half, in Jy and as its P(k) says, to visibilities.uvh5."""
+    """Write the EoR of one half, in Jy and with the power of its P(k), to visibilities.uvh5."""
     import numpy as np
 
     from calstudy.base.visibilities import antenna_pairs, from_cube
@@ -168,7 +168,7 @@ def simulate_eor(job: Job) -> Mapping[str, Any]:
 
 
 def set_level(job: Job) -> Mapping[str, Any]:
-    """Write what the EoR is multiplied by to factor.json."""
+    """Write the factor of the EoR to factor.json."""
     import numpy as np
 
     level, found = job.settings["level"], 1.0
@@ -185,7 +185,7 @@ def set_level(job: Job) -> Mapping[str, Any]:
 
 
 def inject(job: Job) -> Mapping[str, Any]:
-    """Write the data with g_a g_b* times the EoR added to data.uvh5; where there is no solution, nothing is added."""
+    """Write the data plus g_a g_b* times the EoR to data.uvh5; nothing is added where there is no solution."""
     import numpy as np
     from pyuvdata import UVCal
 
@@ -206,7 +206,7 @@ def inject(job: Job) -> Mapping[str, Any]:
 
 
 def _signal(job: Job) -> UVData:
-    """Return the EoR at its level."""
+    """Return the EoR multiplied by its factor."""
     sky = read_visibilities(job.inputs["eor"] / VISIBILITIES)
     sky.data_array *= read_json(job.inputs["factor"] / FACTOR)["factor"]
     return sky
@@ -239,7 +239,7 @@ def measure(job: Job) -> Mapping[str, Any]:
 
     settings = job.settings["power"]
     delays = {name: read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
-    # The signal went in under the gains that were fitted: T is free of the flux scale, which nobody knows.
+    # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
     summary = signal_loss.write_transfer(job.output, Injection(**delays), settings, 1.0)
     signals = {}
     for modes, excise in EXCISION.items():

@@ -1,4 +1,4 @@
-"""How well a calibration of measured data fits the noise, and what stands out in it."""
+"""Quality of a calibration of measured data: chi^2 against the noise, and outliers."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 QUALITY = "quality.json"
 NUMBERS = ("newton_decrement", "decrement_rms", "first_loss", "last_loss")
-"""Of a record, which JSON has as null where they are not known."""
+"""Fields of a record that are null in JSON if they are not known."""
 
 
 @once
 def quality(graph: ObservedGraph) -> Task:
-    """Return the task that measures how well the calibration of both halves fits."""
+    """Return the task that measures the quality of the calibration of both halves."""
     inputs: dict[str, Task] = {}
     for parity in PARITIES:
         inputs |= {f"data:{parity}": observed(graph, parity), f"calibration:{parity}": calibrated(graph, parity)}
@@ -50,7 +50,7 @@ def quality(graph: ObservedGraph) -> Task:
 
 
 def read_result(folder: Path) -> CalibrationResult:
-    """Read a product of stage `calibrate`; its records have the first and the last loss only."""
+    """Read a product of stage `calibrate`, whose records have only the first and the last loss."""
     import numpy as np
     from pyuvdata import UVCal
 
@@ -63,7 +63,7 @@ def read_result(folder: Path) -> CalibrationResult:
             name: math.nan if value is None and name in NUMBERS else value for name, value in summary.items()
         }
         losses = np.array([known.pop("first_loss"), known.pop("last_loss")], dtype=float)
-        # Products of earlier versions do not say it.
+        # Products of earlier versions lack this field.
         records.append(SolveRecord(**{"cpu_seconds": None, **known}, loss_history=losses))
     return CalibrationResult(
         gains=UVCal.from_file(folder / GAINS), model=model, residual=residual, solutions=tuple(records)
@@ -71,7 +71,7 @@ def read_result(folder: Path) -> CalibrationResult:
 
 
 def assess(job: Job) -> Mapping[str, Any]:
-    """Write chi^2 of each half, of integrations that were not fitted, and what stands out, to quality.json."""
+    """Write chi^2 of each half, chi^2 of integrations that were not fitted, and outliers to quality.json."""
     from calstudy.measured import quality as standing_out
 
     summary: dict[str, Any] = {}
@@ -101,7 +101,7 @@ def _without(values: Mapping[str, Any], name: str) -> dict[str, Any]:
 def _chi_squared(
     job: Job, parity: str, data: Mapping[str, Any], results: Mapping[str, CalibrationResult]
 ) -> dict[str, Any]:
-    """Return chi^2 of one half, as it was fitted and from the solutions of the other; nothing without autos."""
+    """Return chi^2 of one half, as fitted and with the solutions of the other half; empty without autocorrelations."""
     from calstudy.measured.goodness import chi_squared, held_out, predicted
 
     if not job.settings["autos"]:
@@ -128,7 +128,7 @@ def _chi_squared(
 
 
 def _unknowns(job: Job, parity: str, data: Any) -> float | None:
-    """Return the number of complex unknowns of all solves of one half; None for what is no fit by least squares."""
+    """Return the number of complex unknowns of all solves of one half; None for a calibration without least squares."""
     from calstudy.base.observation import Observation
     from calstudy.calibrate.interface import USABLE, Assumed
     from calstudy.calibrate.preparation import make_problem, prepare

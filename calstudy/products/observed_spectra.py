@@ -1,4 +1,4 @@
-"""Power spectra of measured data: wedge and spherical averages, with errors from the noise that the data have."""
+"""Power spectra of measured data: wedge and spherical averages, with errors from the measured noise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NOISE_SUMMARY = "noise.json"
 
 @once
 def observed_spectra(graph: ObservedGraph) -> Task:
-    """Return the task of the averaged spectra of all that is in `WHAT`, and of the noise."""
+    """Return the task of the averaged spectra of all data in `WHAT`, and of the noise."""
     inputs = {what: power_of(graph, what) for what in WHAT}
     sources = SOURCES if all(facts.autos for facts in graph.halves.facts.values()) else SOURCES[:1]
     for what in ("data", "residual"):
@@ -33,9 +33,9 @@ def observed_spectra(graph: ObservedGraph) -> Task:
 
 
 def average_spectra(job: Job) -> Mapping[str, Any]:
-    """Write wedge and spherical spectra with errors as HDF5 and CSV, and how strong the noise is to noise.json.
+    """Write wedge and spherical spectra with errors as HDF5 and CSV, and the level of the noise to noise.json.
 
-    The errors are of the noise alone, as the difference of the halves shows it on each baseline.
+    The errors are those of the noise alone, from the difference of the halves on each baseline.
     """
     import numpy as np
 
@@ -101,7 +101,7 @@ def _write_spherical(
 
 
 def _summary(difference: np.ndarray | None, autos: np.ndarray | None) -> dict[str, Any]:
-    """Return the mean P_N over baselines from each source, and how the two compare."""
+    """Return the mean P_N over baselines from each source, and the ratio of the two."""
     import numpy as np
 
     found: dict[str, Any] = {}

@@ -1,9 +1,9 @@
-"""One Adamax step as the paper's own code takes it.
+"""One Adamax step in the form of the paper's own code.
 
 All baselines share one basis tensor padded with zeros to the widest (Nvec, Nbls, 1, Nfreqs); the model is a broadcast
 product summed over the first axis; real and imaginary parts are separate; the optimizer is Keras' Adamax; single
-precision. Written from the paper's equations and description, as one TensorFlow graph. It takes as long as the loss
-function of the authors' code with the same optimizer (benchmarks/README.md).
+precision. The step is one TensorFlow graph, written from the paper's equations and description. It takes as long as the
+loss function of the authors' code with the same optimizer (benchmarks/README.md).
 """
 
 from __future__ import annotations
@@ -17,12 +17,9 @@ LEARNING_RATE = 0.01
 
 
 class PaperStep:
-    """The unknowns of one problem with a foreground model of every baseline, and the graph of a step.
+    """The unknowns of one problem with a foreground model for every baseline, and the graph of a step.
 
-    Parameters
-    ----------
-    problem
-        The start is at unity gains and at the foregrounds of an unweighted least-squares fit.
+    The start is at unity gains and at the foregrounds of an unweighted least-squares fit.
     """
 
     def __init__(self, problem: CalibrationProblem) -> None:
@@ -55,7 +52,7 @@ class PaperStep:
         return 4 * int(tf.size(self._basis))
 
     def _model_sum(self) -> tuple[tf.Tensor, ...]:
-        """Work out the sum over the basis alone, sum u A, and its gradient: what the paper says dominates a step."""
+        """Compute the sum over the basis alone, sum u A, and its gradient: the dominant part of a step in the paper."""
         with tf.GradientTape() as tape:
             parts = [tf.reduce_sum(u * self._basis, axis=0) for u in self.variables[2:]]
         return tuple(tape.gradient(parts, self.variables[2:], output_gradients=self._data))
@@ -69,7 +66,7 @@ class PaperStep:
         return loss
 
     def _loss(self) -> tf.Tensor:
-        """Paper Eq. LOGLIKELIHOOD with the prior on the summed model."""
+        """Compute the loss, paper Eq. LOGLIKELIHOOD with the prior on the summed model."""
         real, imaginary, u_real, u_imaginary = self.variables
         a_real, a_imaginary = tf.gather(real, self._first), tf.gather(imaginary, self._first)
         b_real, b_imaginary = tf.gather(real, self._second), tf.gather(imaginary, self._second)

@@ -1,4 +1,4 @@
-"""What the realizations of an experiment say together: the tables, and the verdicts."""
+"""The pooled realizations of an experiment: tables and verdicts."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _markdown(results: Mapping[str, RegionResults], verdicts: Sequence[Verdict],
 
 
 def _bands(found: PooledRegion) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the bands of k that have modes: name and bins, (Nk,) bool."""
+    """Yield the name and bins, (Nk,) bool, of each band of k that has modes."""
     known = np.isfinite(found.values["ratio"]).all(axis=0)
     for low, high in BANDS:
         bins = known & (found.k >= low) & (found.k < high)
@@ -136,7 +136,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> Table:
-    """Return T, its scatter by what is drawn, and that scatter over the quoted error."""
+    """Return T, its scatter for each block of draws, and the ratio of that scatter to the quoted error."""
     found = results.pooled
     names = [described(block["draw"]) for block in blocks]
     rows = []
@@ -148,7 +148,7 @@ def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> 
         ]
         total = found.total["transfer"]
         squares = np.array([ratio.value**2 for ratio in ratios])
-        # The scatters of blocks add up in squares, less what is in several; so do their parts of the ratio's error.
+        # Squared scatters of blocks add up, minus what is in several blocks; so do their parts of the ratio's error.
         counted = 1 - total.counted_twice
         ratio = float(np.sqrt(counted * squares.sum()))
         error = counted * float(np.sqrt(sum((item.value * item.uncertainty) ** 2 for item in ratios)) / ratio)
@@ -167,7 +167,7 @@ def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> 
 
 
 def _power_table(results: RegionResults) -> Table:
-    """Return P^R and P^R0 over P^S, the pulls, and what the bars of P^R cover."""
+    """Return P^R and P^R0 over P^S, the pulls, and the coverage of the bars of P^R."""
     found, rows = results.pooled, []
     for name, bins in _bands(found):
         means = {key: mean_over_bins(found.values[key][:, bins], found.design) for key in QUANTITIES}
@@ -212,7 +212,7 @@ def _corrected_table(results: RegionResults) -> Table:
 
 
 def _of_other_realizations(corrected: Corrected) -> str:
-    """Say in one sentence which realizations T is taken from."""
+    """Describe in one sentence the realizations that T is taken from."""
     shared = corrected.shared
     same = "; the others by T of realizations some of which share a part, the EoR where gains and noise are drawn"
     return (

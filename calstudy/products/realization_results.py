@@ -1,4 +1,4 @@
-"""The realizations of an experiment, pooled by region, and held against criteria on error bars and corrected power."""
+"""The realizations of an experiment, pooled by region, and criteria on error bars and corrected power."""
 
 from __future__ import annotations
 
@@ -83,28 +83,18 @@ COVERED = {
     "corrected-covers-eor": "corrected_eor",
     "corrected-covers-input": "corrected_input",
 }
-"""Which of `RegionResults.covered` the criteria on coverage are about."""
+"""Keys of `RegionResults.covered` for the criteria on coverage."""
 DRAWN_FOR = {"eor": "noise", "input": "eor"}
-"""What a block must draw for its bars to be independent trials of covering P^S, or the input."""
+"""Draw that a block needs so that its bars are independent trials of covering P^S (`eor`) or the input."""
 
 
 @dataclass(frozen=True)
 class RegionResults:
-    """Everything on one region.
+    """All results of one region.
 
-    Attributes
-    ----------
-    pooled
-        All quantities.
-    put_in
-        Input power of each realization, (K, Nk).
-    covered
-        Where the bars cover, 1 or 0 or NaN, (K, Nk), by what: ``eor`` and ``input`` for P^R as it is,
-        ``corrected_eor`` and ``corrected_input`` for P^R / T.
-    corrected
-        P^R / T, or None where T is not known.
-    eor
-        P^S of each realization, (K, Nk).
+    Powers of the input (`put_in`) and P^S (`eor`) are (K, Nk) for K realizations. `covered` is 1 or 0 where bars cover
+    or not, and NaN where this is not known, (K, Nk), with the keys ``eor`` and ``input`` for P^R, ``corrected_eor`` and
+    ``corrected_input`` for P^R / T. `corrected` is P^R / T, or None where T is not known.
     """
 
     pooled: PooledRegion
@@ -114,7 +104,7 @@ class RegionResults:
     eor: np.ndarray
 
     def coverage(self, kind: str, bins: np.ndarray) -> Finding | None:
-        """Return the coverage in some bins, over the block that draws what makes trials independent; None without."""
+        """Return the coverage in some bins over the block with independent trials; None without such a block."""
         place = self.pooled.design.block_of(DRAWN_FOR[kind.removeprefix("corrected_")])
         if place is None or kind not in self.covered:
             return None
@@ -123,7 +113,7 @@ class RegionResults:
     def corrected_over(self, power: np.ndarray, bins: np.ndarray, known_scale: bool = False) -> Finding | None:
         """Return the mean of P^R / T over another power, (K, Nk), in some bins; None where T is not known.
 
-        With `known_scale`, of P^R s^2 / (T s^2).
+        With `known_scale`, it is the mean for P^R s^2 / (T s^2).
         """
         if self.corrected is None:
             return None
@@ -132,15 +122,7 @@ class RegionResults:
 
 
 def read_results(settings: Mapping[str, Any], folders: Mapping[str, Path]) -> dict[str, RegionResults]:
-    """Read and pool all realizations, by region.
-
-    Parameters
-    ----------
-    settings
-        From `calstudy.products.realizations.settings`.
-    folders
-        Of the products of `calstudy.products.realizations.inputs`.
-    """
+    """Read and pool all realizations, by region; settings and folders as in `calstudy.products.realizations`."""
     design = Design(settings["draws"], [(block["draw"], block["members"]) for block in settings["blocks"]])
     return {
         region: results_of(realizations.read_samples(folders, len(settings["draws"]), region), design)
@@ -149,7 +131,7 @@ def read_results(settings: Mapping[str, Any], folders: Mapping[str, Path]) -> di
 
 
 def results_of(samples: Sequence[Sample], design: Design) -> RegionResults:
-    """Pool what all realizations measured in one region, and correct it where T is known."""
+    """Pool the samples of all realizations in one region, and correct P^R where T is known."""
     residual, eor = (np.stack([getattr(sample, name).power.real for sample in samples]) for name in ("residual", "eor"))
     put_in = np.stack([sample.put_in for sample in samples])
     covered = {
@@ -165,7 +147,7 @@ def results_of(samples: Sequence[Sample], design: Design) -> RegionResults:
 
 
 def judge(results: RegionResults) -> list[Verdict]:
-    """Hold the results outside the wedge against the criteria."""
+    """Compare the results outside the wedge with the criteria."""
     bins = results.pooled.k >= JUDGED_K
     verdicts = []
     for name, criterion in CRITERIA.items():

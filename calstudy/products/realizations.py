@@ -1,4 +1,4 @@
-"""The realizations of an experiment: what is measured on each of them, reduced to spectra in bins of k."""
+"""The realizations of an experiment, each reduced to spectra in bins of k."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RealizationGraph:
 def realization_graphs(graph: Graph) -> list[RealizationGraph]:
     """Return the graphs of all realizations of an experiment; the first is the experiment's own.
 
-    Visibilities of the others are removed from the store once they are reduced.
+    Visibilities of the others are removed from the store after their reduction.
     """
     first, *others = expand_realizations(graph.experiment)
     found = [RealizationGraph(first, Graph(first.experiment))]
@@ -45,7 +45,7 @@ def realization_graphs(graph: Graph) -> list[RealizationGraph]:
 
 
 def inputs(graph: Graph) -> dict[str, Task]:
-    """Return the tasks of all that is pooled: ``spectra:n`` and ``transfer:n`` of realization n, counted from 0."""
+    """Return the tasks of all inputs of pooling: ``spectra:n`` and ``transfer:n`` of realization n, counted from 0."""
     found = {}
     for number, item in enumerate(realization_graphs(graph)):
         found[f"spectra:{number}"] = _reduced(item.graph)
@@ -54,7 +54,7 @@ def inputs(graph: Graph) -> dict[str, Task]:
 
 
 def settings(graph: Graph) -> dict[str, Any]:
-    """Return what pooling must know besides: the draws of each realization, and the blocks."""
+    """Return the settings of pooling: the draws of each realization, and the blocks."""
     blocks = [
         {"draw": list(block.draw), "members": places}
         for block, places in zip(graph.experiment.realizations, members(graph.experiment), strict=True)
@@ -108,17 +108,7 @@ def reduce(job: Job) -> Mapping[str, Any]:
 
 
 def read_samples(folders: Mapping[str, Path], count: int, region: str) -> Sequence[Sample]:
-    """Read what all realizations measured in one region.
-
-    Parameters
-    ----------
-    folders
-        Of the products of `inputs`.
-    count
-        Number of realizations.
-    region
-        One of `REGIONS`.
-    """
+    """Read the samples of the first `count` realizations in one of `REGIONS` from the products of `inputs`."""
     import numpy as np
 
     from calstudy.power.realizations import Sample

@@ -1,4 +1,4 @@
-"""Run times of the solvers: measured for one array after the other, their table, and how they scale."""
+"""Run times of the solvers: measured for each array, their table, and their scaling."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PADDED_COPIES = 7
 EXCESSES = ("0.05", "0.01", "0.002")
 """Fractions above the minimum to which steps are counted."""
 QUANTILES = (0.025, 0.5, 0.975)
-"""The ends of the central 95 %, and the median."""
+"""The limits of the central 95 %, and the median."""
 COLUMNS = ("panel", "size", "device", "antennas", "baselines", "longest [m]", "vectors", "coefficients", "timed")
 
 
@@ -41,7 +41,7 @@ class TimedArray(Section):
 
 
 def time_steps(job: Job) -> Mapping[str, Any]:
-    """Time all solvers on one array, in a process of its own."""
+    """Time all solvers on one array, in a separate process."""
     import numpy as np
 
     from calstudy.products.step_times import Samples, time_steps_apart
@@ -55,7 +55,7 @@ def time_steps(job: Job) -> Mapping[str, Any]:
 
 
 def count_steps(job: Job) -> Mapping[str, Any]:
-    """Run the paper's solver for all its steps, and count how many it needs."""
+    """Run the paper's solver for `max_steps`, and count the steps to each of `EXCESSES`."""
     import numpy as np
 
     from calstudy.products.step_times import descend_apart
@@ -73,7 +73,7 @@ def count_steps(job: Job) -> Mapping[str, Any]:
 
 
 def summarize(job: Job) -> Mapping[str, Any]:
-    """Write runtime.json and runtime.csv: medians and the ends of the central 95 % of all that was timed."""
+    """Write medians and central 95 % intervals of all times to runtime.json and runtime.csv."""
     cases = [read_json(folder / CASE) for name, folder in sorted(job.inputs.items()) if name != "descent"]
     descent = read_json(job.inputs["descent"] / DESCENT)
     for case in cases:
@@ -103,7 +103,7 @@ def _write_csv(path: Path, cases: Sequence[Mapping[str, Any]]) -> None:
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """value = amplitude · size^exponent; the error is one standard deviation of the exponent."""
+    """A law value = amplitude · size^exponent; the error is one standard deviation of the exponent."""
 
     amplitude: float
     exponent: float
@@ -115,12 +115,9 @@ class PowerLaw:
 
 
 def fit_power_law(size: np.ndarray, value: np.ndarray) -> PowerLaw:
-    """Fit a straight line to the logarithms of positive values at three sizes or more, (Nsizes,).
+    """Fit a straight line to the logarithms of positive values at three or more sizes, (Nsizes,).
 
-    Raises
-    ------
-    ValueError
-        If there are fewer sizes, or a number is not positive.
+    Raises ValueError if there are fewer sizes, or a number is not positive.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""The scores of one experiment's calibrator: what all calibrators are compared by."""
+"""The scores of one experiment's calibrator, by which calibrators are compared."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 BINS, BANDS, SUMMARY = "score-bins.h5", "score-bands.h5", "score.json"
 MEASURED = 2
-"""Raised where T or the bias of the same residuals change: scores of different numbers are not ranked together."""
+"""Version of T and the bias; scores of different versions are not ranked together."""
 SAMPLES_AT_A_TIME = 14 * 630 * 384
-"""Visibilities of each data set that are in memory at a time."""
+"""Number of visibilities of each data set that are in memory together."""
 
 
 @once
@@ -98,7 +98,7 @@ def _in_bands(bands: Score, linear: np.ndarray | None) -> list[dict[str, Any]]:
 
 
 def _linear_transfer(job: Job, measured: CalibratedSpectra) -> np.ndarray | None:
-    """Return T of the linear response in bands, or None if it is not known or not of the same baselines."""
+    """Return T of the linear response in bands, or None if it is not known or of other baselines."""
     import numpy as np
 
     if "linear_response" not in job.inputs or np.any(measured.signal.n_pairs != 1):
@@ -108,7 +108,7 @@ def _linear_transfer(job: Job, measured: CalibratedSpectra) -> np.ndarray | None
 
 
 def _sky_model_error(job: Job) -> float | None:
-    """Return the rms of the sky model's error over that of the true foregrounds; zero if it is the truth."""
+    """Return the rms of the sky model's error over that of the true foregrounds; zero for a perfect sky model."""
     if "sky_model_error" not in job.inputs:
         return 0.0
     return read_json(job.inputs["sky_model_error"] / sky_model.ERROR)["relative_error"]
@@ -127,7 +127,7 @@ def _known_gains(job: Job, parity: str) -> tuple[Gains, np.ndarray]:
 
 
 def _gain_errors(job: Job) -> dict[str, float | None]:
-    """Return the median relative errors of the gains, free of what no fit can know and as they were fitted."""
+    """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
     import numpy as np
 
     from calstudy.calibrate.agreement import aligned_gains, gain_errors
@@ -146,8 +146,8 @@ def _gain_errors(job: Job) -> dict[str, float | None]:
 def _held_out_chi_squared(job: Job) -> float | None:
     """Return chi^2 per sample of the odd data under gains and model that were fitted to the even data.
 
-    The variance of the noise is half the mean square of the difference of the two. It is 1 for the true gains and
-    foregrounds, but for the power of the EoR.
+    The variance of the noise is half the mean square of the difference of the two. Apart from the power of the EoR,
+    chi^2 is 1 for the true gains and foregrounds.
     """
     import numpy as np
 
@@ -175,7 +175,7 @@ def _held_out_chi_squared(job: Job) -> float | None:
 
 
 def _solves(job: Job) -> dict[str, Any]:
-    """Return how all solves ended, of data with the EoR and without, and what they took, None if nobody knows."""
+    """Return the status and cost of all solves of data with the EoR and without; None where the cost is not known."""
     records = [
         record
         for kind in ("calibration", "calibration_without_eor")
@@ -194,18 +194,10 @@ def _solves(job: Job) -> dict[str, Any]:
 
 
 def cpu_seconds_per_integration(records: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the processor seconds that an integration takes, with all of its polarizations.
+    """Return the processor seconds per integration, with all of its polarizations, from summaries of `SolveRecord`.
 
-    The median over solves, for the first in a process compiles as well. Solves that were skipped do not count.
-
-    Parameters
-    ----------
-    records
-        As `calstudy.calibrate.records.SolveRecord.summary` returns them.
-
-    Returns
-    -------
-    None if some record does not tell, as those of earlier versions, or if nothing was solved.
+    It is the median over solves, because the first in a process also compiles, without skipped solves. It is None if a
+    record has no time, or if nothing was solved.
     """
     solved = [record for record in records if record["status"] != "skipped"]
     if not solved or any(record.get("cpu_seconds") is None for record in solved):

@@ -1,4 +1,4 @@
-"""Read from products the part that concerns single antennas and baselines; of several polarizations, the first."""
+"""Read single antennas and baselines from products; of several polarizations, the first."""
 
 from __future__ import annotations
 
@@ -21,16 +21,9 @@ from calstudy.products.files import GAINS
 class Gains:
     """Gains of all antennas.
 
-    Attributes
-    ----------
-    numbers
-        Antenna numbers, ascending, (Nants,).
-    frequency
-        Channel centres, Hz, (Nfreqs,).
-    values
-        Complex, (Ntimes, Nants, Nfreqs), or (1, Nants, Nfreqs) for gains that hold for the whole run.
-    flags
-        Where there is no solution, of the same shape.
+    Antenna numbers are ascending, (Nants,), channel centres in Hz, (Nfreqs,). Values are complex, (Ntimes, Nants,
+    Nfreqs), or (1, Nants, Nfreqs) for gains that are constant during the run; flags of the same shape mark missing
+    solutions.
     """
 
     numbers: np.ndarray
@@ -50,16 +43,10 @@ class Gains:
 
 @dataclass(frozen=True)
 class AlignedGains:
-    """True and fitted gains of one integration, all antennas, the fit as it is and brought closest to the truth.
+    """True and fitted gains of one integration for all antennas, and the fit aligned with the truth.
 
-    Attributes
-    ----------
-    numbers, frequency
-        Antenna numbers (Nants,) and channel centres (Nfreqs,), Hz.
-    true, fitted, aligned
-        Complex, (Nants, Nfreqs); zero where there is no solution.
-    scale
-        What the aligned gains were multiplied by; the fitted model is to be divided by its square.
+    Antenna numbers are (Nants,), channel centres (Nfreqs,) in Hz. Gains are complex, (Nants, Nfreqs), and zero where
+    there is no solution. The aligned gains were multiplied by `scale`; divide the fitted model by its square.
     """
 
     numbers: np.ndarray
@@ -70,7 +57,7 @@ class AlignedGains:
     scale: float
 
     def rows(self, numbers: Sequence[int]) -> np.ndarray:
-        """Return where antennas are in the gains."""
+        """Return the indices of antennas in the gains."""
         return np.searchsorted(self.numbers, numbers)
 
 
@@ -85,17 +72,7 @@ def read_gains(folder: Path) -> Gains:
 def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGains:
     """Read true and fitted gains, and align the fit with the truth.
 
-    Parameters
-    ----------
-    true, fitted
-        Folders of products of the stages `gains` and `calibrate`.
-    integration
-        Index of the integration.
-
-    Raises
-    ------
-    InputError
-        If this integration has no solution.
+    Raises InputError if this integration has no solution.
     """
     truth, fit = read_gains(true), read_gains(fitted)
     used = ~fit.flags[integration]
@@ -108,18 +85,9 @@ def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGai
 
 
 def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Read single baselines of a UVH5 product.
+    """Read baselines (a, b) of a UVH5 product in Jy, complex, (len(pairs), Ntimes, Nfreqs).
 
-    Parameters
-    ----------
-    path
-        The file.
-    pairs
-        Antenna numbers (a, b), in the order in which the product has them.
-
-    Returns
-    -------
-    Visibilities in Jy, complex, (len(pairs), Ntimes, Nfreqs).
+    The antenna numbers must have the order of the product.
     """
     uvd = UVData.from_file(path, file_type="uvh5", bls=list(pairs), run_check=False)
     found = [tuple(pair) for pair in antenna_pairs(uvd).tolist()]
@@ -128,7 +96,7 @@ def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def read_used(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Read which samples of single baselines are unflagged, bool, (len(pairs), Ntimes, Nfreqs); see `read_spectra`."""
+    """Read which samples of some baselines are unflagged, bool, (len(pairs), Ntimes, Nfreqs); see `read_spectra`."""
     uvd = UVData.from_file(path, file_type="uvh5", bls=list(pairs), run_check=False)
     found = [tuple(pair) for pair in antenna_pairs(uvd).tolist()]
     used = ~flag_cube(uvd)[..., 0]
@@ -136,22 +104,7 @@ def read_used(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def require_used(used: np.ndarray, numbers: Sequence[int], integration: int) -> None:
-    """Refuse to show what is flagged in all channels.
-
-    Parameters
-    ----------
-    used
-        Unflagged channels of an antenna or a baseline, bool, (Nfreqs,).
-    numbers
-        Its antenna numbers.
-    integration
-        Counted from 0.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
+    """Raise InputError if no channel, bool (Nfreqs,), of an antenna or a baseline is used in an integration."""
     if not used.any():
         named = " or ".join(map(str, numbers))
         raise InputError(
@@ -166,14 +119,14 @@ def layout_of(settings: section.Layout) -> Layout:
 
 
 def baseline(layout: Layout, places: Sequence[int]) -> tuple[tuple[int, int], float]:
-    """Return antenna numbers (a, b), as products have them, and length in m of the baseline between two places."""
+    """Return antenna numbers (a, b), in the order of products, and length in m of the baseline between two places."""
     first, second = sorted(places)
     length = float(np.linalg.norm(layout.enu[second] - layout.enu[first]))
     return (int(layout.numbers[first]), int(layout.numbers[second])), length
 
 
 def spread_in_length(layout: Layout, count: int) -> list[tuple[int, int]]:
-    """Return the places of the antennas of `count` baselines, from short to long, evenly among all lengths."""
+    """Return the antenna places of `count` baselines, at equal steps in the list sorted by length."""
     first, second = np.triu_indices(len(layout.numbers), 1)
     lengths = np.linalg.norm(layout.enu[second] - layout.enu[first], axis=1)
     order = np.argsort(lengths, kind="stable")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from calstudy.power.transfer import Injection
 
 REGIONS = {"outside-wedge": False, "inside-wedge": True}
-"""Names of the parts of Fourier space, and whether each is inside the wedge."""
+"""Parts of Fourier space; true for the part inside the wedge."""
 TRANSFER = "transfer"
 BAND = "transfer-bands"
 SCALE = "scale.json"
@@ -61,7 +61,7 @@ def transfer(graph: Graph) -> Task | None:
 def _flux_scale(graph: Graph) -> Task:
     """Return the task of the flux scale of the calibration of data with the EoR.
 
-    It is a product of its own, so that T can be made again without calibrating where calibrations are not kept.
+    It is a separate product, so that T can be made again without another calibration if calibrations are not kept.
     """
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
     inputs = {parity: calibration.calibration(graph, residual, parity) for parity in PARITIES}
@@ -80,7 +80,7 @@ def difference(job: Job) -> Mapping[str, Any]:
 
 
 def measure(job: Job) -> Mapping[str, Any]:
-    """Write T per k outside and inside the wedge and per (|b|, tau), and the residual's power corrected by it."""
+    """Write T per k outside and inside the wedge and per (|b|, tau), and the residual's power corrected by T."""
     from calstudy.power.spectra import SphericalSpectrum, of_common_units
     from calstudy.power.tables import load_spectrum
     from calstudy.power.transfer import Injection
@@ -101,20 +101,8 @@ def measure(job: Job) -> Mapping[str, Any]:
 def write_transfer(folder: Path, injection: Injection, settings: PowerSettings, scale: float) -> dict[str, Any]:
     """Write T per k outside and inside the wedge, in fine bins and in bands, and per (|b|, tau).
 
-    Parameters
-    ----------
-    folder
-        Where to.
-    injection
-        Spectra of the signal and of the response to it.
-    settings
-        Bins and buffer of the wedge.
-    scale
-        Flux scale of the calibration; NaN if it is not known.
-
-    Returns
-    -------
-    T in bands, as plain JSON types, by part of Fourier space.
+    The flux scale of the calibration is NaN if it is not known. Return T in bands, as plain JSON types, by part of
+    Fourier space.
     """
     from calstudy.power.spherical import make_bin_edges
     from calstudy.power.tables import save_spectrum, write_transfer_csv
@@ -160,14 +148,9 @@ def _json(value: float) -> float | None:
 
 
 def write_corrected(folder: Path, residual: SphericalSpectrum, signal: SphericalSpectrum) -> None:
-    """Write the power of the residual outside the wedge, and the same divided by the transfer function in a folder.
+    """Write the power of the residual (with errors) outside the wedge, and the same divided by T.
 
-    Parameters
-    ----------
-    folder
-        Where `write_transfer` wrote, and where to.
-    residual, signal
-        Spectra of the residual, with errors, and of the signal.
+    T is read from `folder`, as written by `write_transfer`.
     """
     from calstudy.power.tables import load_spectrum, write_columns
     from calstudy.power.transfer import TransferFunction, correct

@@ -42,19 +42,19 @@ if TYPE_CHECKING:
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
 TOLERATED = 1e-7
-"""Interpolation errors up to this go without a warning, however small the tolerance is: the beam's table has knots."""
+"""Largest interpolation error without a warning, however small the tolerance: the table of the beam has knots."""
 TYPICAL_ERROR = 30
-"""Relative error that a typical patch may have, over the tolerance: most have a small share in the visibilities."""
+"""Relative error allowed for a typical patch, over the tolerance: most contribute little to the visibilities."""
 
 SOURCES = 546_000
 DRAWN_SOURCE = 152
-"""Bytes that are kept of every source that was drawn."""
+"""Bytes kept for every drawn source."""
 TABLE_MEMORY = 1.3e6
 """Bytes of the table of a beam for one polarization and frequency."""
 TABLE_SECONDS = 0.03
-"""To make one."""
+"""Time to make one table, seconds."""
 DIPOLE_SECONDS, DIPOLE_MEMORY, WORKERS = 20.0, 0.6e9, 4
-"""For the fields of the single dipoles of a tile, which each of some workers makes for the first of its chunks."""
+"""Cost of the fields of the single dipoles of a tile, which each worker makes for its first chunk."""
 
 
 @once
@@ -66,14 +66,7 @@ def foregrounds(graph: Graph) -> Task | None:
 def foregrounds_of(graph: Graph, label: str, sky: SkySettings, instrument: InstrumentSettings) -> Task | None:
     """Return the task of the foregrounds of any sky through any instrument, or None if the sky has none.
 
-    Parameters
-    ----------
-    graph
-        Of the experiment whose section `simulation` is used.
-    label
-        What the product is.
-    sky, instrument
-        In place of the experiment's own.
+    The section `simulation` is that of the graph's experiment.
     """
     if not sky.has_foregrounds:
         return None
@@ -119,7 +112,7 @@ def _component(job: Job) -> Component:
 
 
 def simulate_chunk(job: Job) -> Mapping[str, Any]:
-    """Write a block of frequency nodes at all integrations to chunk.uvh5; a piece beyond the nodes stays empty."""
+    """Write a block of frequency nodes at all integrations to chunk.uvh5; a chunk beyond the last node stays empty."""
     from calstudy.base.visibilities import from_cube
     from calstudy.instrument.telescope import subset_template
     from calstudy.simulate.chunks import simulate_chunk as simulate
@@ -155,7 +148,7 @@ def assemble(job: Job) -> Mapping[str, Any]:
 
 
 def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
-    """Warn of an interpolation error far above the tolerance, as a beam much wider than `beam_extent` makes."""
+    """Warn of an interpolation error far above the tolerance, for example from a beam much wider than `beam_extent`."""
     check, allowed = quality["interpolation"], component.accuracy.tolerance
     if check is None or check["max_error"] <= max(allowed, TOLERATED):
         return []
@@ -167,7 +160,7 @@ def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
 
 
 def _coarse_pixels(settings: Mapping[str, Any]) -> list[str]:
-    """Warn of pixels of a map that are larger than half a fringe: as points, they are aliased by long baselines."""
+    """Warn of map pixels larger than half a fringe: as point sources, they are aliased by long baselines."""
     if "diffuse" not in settings:
         return []
     pixel = (4 * math.pi / (12 * settings["diffuse"].nside ** 2)) ** 0.5
@@ -182,7 +175,7 @@ def _coarse_pixels(settings: Mapping[str, Any]) -> list[str]:
 
 
 def _floors(data: UVData) -> dict[str, Any]:
-    """Measure the delay floor with both tapers, where the band leaves delays beyond the horizon for them."""
+    """Measure the delay floor with both tapers, where the band has delays beyond the horizon for them."""
     from calstudy.simulate.floor import delay_floor, floor_buffers
 
     return {
@@ -239,7 +232,7 @@ def _cost_of_chunk(task: Task) -> Cost:
 def _node_counts(
     instrument: InstrumentSettings, accuracy: Accuracy, length: float, error: float = 1.0
 ) -> tuple[int, int]:
-    """Estimate the nodes in time and frequency for a length of baselines (m) and an error over the tolerance."""
+    """Estimate the nodes in time and frequency for a baseline length (m) and an error relative to the tolerance."""
     times, channels, tolerance = instrument.times, instrument.channels, error * accuracy.tolerance
     if not tolerance:
         return times.count, channels.count
@@ -254,39 +247,39 @@ def _node_counts(
 
 
 def _is_regular(instrument: InstrumentSettings) -> bool:
-    """Return whether antennas are on a flat lattice."""
+    """Return true if the antennas are on a flat lattice."""
     return layout_of(instrument.layout).regular and not instrument.as_built.positions.scatter
 
 
 def _pieces(simulation: SimulationSettings, sky: Foregrounds | Eor, instrument: InstrumentSettings) -> int:
-    """Return how many chunks a component has at most."""
+    """Return the maximum number of chunks of a component."""
     eor = isinstance(sky, Eor)
     return min(simulation.pieces(eor), instrument.channels.count) if eor else simulation.pieces(eor)
 
 
 def _rotation(instrument: InstrumentSettings) -> float:
-    """Return by what angle the Earth turns from the first to the last integration, rad."""
+    """Return the rotation angle of the Earth from the first to the last integration, rad."""
     return EARTH_ROTATION_RATE * instrument.times.integration * (instrument.times.count - 1)
 
 
 def _crossing(instrument: InstrumentSettings) -> float:
-    """Estimate the integrations of sources that rise or set, for each source above the horizon."""
+    """Estimate the integrations of all sources that rise or set, divided by the number of sources above the horizon."""
     return instrument.times.count * min(1.0, _rotation(instrument) / np.pi)
 
 
 def _patch_radius(sources: float) -> float:
-    """Estimate the radius of the cells that are patches, rad."""
+    """Estimate the radius of a patch, rad."""
     nside = patch_nside(sources)
     return 0.7 / nside if nside else 1.0
 
 
 def _drawn(sky: Foregrounds) -> float:
-    """Estimate how many sources are drawn, of which the brightest are used."""
+    """Estimate the number of drawn sources, of which only the brightest are used."""
     return expected_sources(max(sky.flux_limit, FAINTEST)) if isinstance(sky, SyntheticSources) else 0.0
 
 
 def _sources(settings: Mapping[str, Any]) -> int:
-    """Estimate the components of the foregrounds: sources by their counts above the flux limit, pixels of a map."""
+    """Estimate the number of foreground components: sources from their counts above the flux limit, pixels of a map."""
     sky, found = settings["sky"], 12 * settings["diffuse"].nside ** 2 if "diffuse" in settings else 0
     if isinstance(sky, PointSources):
         expected = int(expected_sources(max(sky.flux_limit, FAINTEST)))

@@ -1,4 +1,4 @@
-"""The sky model that the calibrator is given: the true foregrounds, or what the experiment assumes in their place."""
+"""The sky model of the calibrator: the true foregrounds, or those that the experiment assumes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ ERROR = "sky-model.json"
 
 @once
 def sky_model(graph: Graph) -> Task | None:
-    """Return the task of the visibilities that the calibrator is given as sky model, or None if it is given none.
+    """Return the task of the visibilities of the calibrator's sky model, or None if there is none.
 
-    Where the experiment assumes nothing but the truth, it is that of the true foregrounds.
+    If the experiment assumes nothing else, it is the task of the true foregrounds.
     """
     changes = assumed_changes(graph.experiment.calibration.assumed)
     if SKY_MODEL in changes:
@@ -35,14 +35,14 @@ def sky_model(graph: Graph) -> Task | None:
 
 
 def is_perfect(graph: Graph) -> bool:
-    """Whether the sky model of the calibrator is the true foregrounds."""
+    """Return true if the sky model of the calibrator is the true foregrounds."""
     model = sky_model(graph)
     return model is not None and model is simulation.foregrounds(graph)
 
 
 @once
 def error(graph: Graph) -> Task | None:
-    """Return the task that measures how far the sky model is from the true foregrounds, or None if it is not."""
+    """Return the task that measures the error of the sky model, or None if it is perfect or there is no sky model."""
     model, true = sky_model(graph), simulation.foregrounds(graph)
     if model is None or true is None or is_perfect(graph):
         return None
@@ -50,7 +50,7 @@ def error(graph: Graph) -> Task | None:
 
 
 def differences(graph: Graph) -> list[tuple[str, str, str]]:
-    """Return what the calibrator assumes that is not true: field, true value and assumed value as texts."""
+    """Return the field, true value and assumed value, as texts, of every assumption that is not true."""
     experiment = graph.experiment
     changes = assumed_changes(experiment.calibration.assumed)
     if SKY_MODEL in changes:
@@ -62,12 +62,12 @@ def differences(graph: Graph) -> list[tuple[str, str, str]]:
 
 
 def _without_errors(world: dict[str, Any]) -> dict[str, Any]:
-    """Return a world without what makes its antennas differ from the nominal ones, which gets a row of its own."""
+    """Return a world without the deviations of its antennas from the nominal ones, which have a row of their own."""
     return {**world, "instrument": {key: value for key, value in world["instrument"].items() if key != "as_built"}}
 
 
 def _differences(true: Any, assumed: Any, path: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield the fields in which two nested plain values differ; a block of another kind as a whole."""
+    """Yield the fields in which two nested plain values differ; blocks of different kinds are yielded as a whole."""
     if isinstance(true, Mapping) and isinstance(assumed, Mapping) and true.get("kind") == assumed.get("kind"):
         for key in {**true, **assumed}:
             yield from _differences(true.get(key), assumed.get(key), f"{path}.{key}" if path else key)
@@ -76,14 +76,14 @@ def _differences(true: Any, assumed: Any, path: str = "") -> Iterator[tuple[str,
 
 
 def _differences_as_built(experiment: Experiment) -> list[tuple[str, str, str]]:
-    """Return the row of `differences` for the errors of the antennas, which the calibrator does not know by default."""
+    """Return the row of `differences` for the deviations of the antennas, which the calibrator ignores by default."""
     built = [found.as_built for found in (experiment.instrument, assumed_world(experiment).instrument)]
     true, assumed = ((found.note or "nominal").removeprefix("as built: ") for found in built)
     return [("instrument.as_built", true, assumed)] if built[0] != built[1] else []
 
 
 def described(graph: Graph) -> str:
-    """Return in a sentence what sky model the calibrator is given."""
+    """Describe the sky model of the calibrator in a sentence."""
     if sky_model(graph) is None:
         return "none: the calibrator is given no sky model"
     if is_perfect(graph):
@@ -126,7 +126,7 @@ def measure_error(job: Job) -> Mapping[str, Any]:
     }
     write_json(job.output / ERROR, found)
     if difference == 0:
-        # An error of the sky model was asked for, or there would be no such product.
+        # This product exists only if the experiment asks for an error of the sky model.
         return {**found, "warnings": ["the sky model that the calibrator assumes is equal to the true foregrounds"]}
     return found
 

@@ -23,28 +23,18 @@ if TYPE_CHECKING:
     from calstudy.power.average import Block
     from calstudy.power.spectra import DelaySpectra
 
-# Inputs of the spectra besides the variants, whose names cannot hold a colon.
+# Further inputs of the spectra; names of variants cannot contain a colon.
 EOR_REFERENCE, NOISE_REFERENCE = "reference:eor", "reference:noise"
 EXCISION = {"all-modes": False, "outside-wedge": True}
-"""Names of the spherical averages, and whether each leaves the wedge out."""
+"""Spherical averages; true for the one without the wedge."""
 NOT_OF_DELAY_SPECTRA = ("coherent_time", "bins", "wedge_buffer", "length_bin")
-"""Fields of the power section that apply before delay spectra are made, or later, when they are averaged."""
+"""Fields of the power section that act before or after the estimate of delay spectra."""
 DELAY_SPECTRA = "delay-spectra.h5"
 
 
 @once
 def average(graph: Graph, variant: Variant, parity: str) -> Task:
-    """Return the task of one realization of a variant, fringe-stopped and averaged over the run.
-
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    variant
-        Its components and effects, and whether it is calibrated.
-    parity
-        "even" or "odd".
-    """
+    """Return the task of one realization ("even" or "odd") of a variant, fringe-stopped and averaged over the run."""
     make = calibration.calibration if variant.calibrate else corruption.data
     source = make(graph, variant, parity)
     label = f"R of {source.label}" if variant.calibrate else source.label
@@ -62,32 +52,12 @@ def power(graph: Graph, name: str) -> Task:
 
 @once
 def variant_power(graph: Graph, label: str, variant: Variant) -> Task:
-    """Return the task of the delay power spectra of data that need not be among the experiment's variants.
-
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    label
-        What the data are, in a few words.
-    variant
-        Its components and effects, and whether it is calibrated.
-    """
+    """Return the task of the delay power spectra of a variant, which need not be one of the experiment's."""
     return crossed(graph, label, {parity: average(graph, variant, parity) for parity in PARITIES})
 
 
 def crossed(graph: Graph, label: str, averages: Mapping[str, Task]) -> Task:
-    """Return the task of the delay power spectra of two averaged data sets, "even" x "odd".
-
-    Parameters
-    ----------
-    graph
-        Of the experiment.
-    label
-        What the data are, in a few words.
-    averages
-        Tasks of the averaged data, by parity.
-    """
+    """Return the task of the delay power spectra of two averaged data sets, "even" x "odd"."""
     instrument = graph.experiment.instrument
     settings = {
         "beam": instrument.beam,
@@ -109,12 +79,12 @@ def spectra(graph: Graph) -> Task:
 
 
 def _reference(graph: Graph, component: Component) -> Task:
-    """Return the spectra of one component alone, which give the errors of all variants that contain it."""
+    """Return the spectra of one component alone, from which the errors of all variants that contain it come."""
     return variant_power(graph, component, Variant(components=(component,)))
 
 
 def make_average(job: Job) -> Mapping[str, Any]:
-    """Write the fringe-stopped average of a data set, or those of its blocks, to average.uvh5."""
+    """Write the fringe-stopped average of a data set, or of each of its blocks, to average.uvh5."""
     from calstudy.power.average import average_in_blocks
 
     data = read_visibilities(job.inputs["data"] / job.settings["file"])
@@ -125,7 +95,7 @@ def make_average(job: Job) -> Mapping[str, Any]:
 def blocks_of(job: Job, data: UVData) -> list[Block]:
     """Return the blocks in which the settings of a task divide a data set.
 
-    So many as `blocks` within `span`, of which `kept` are used; otherwise one, with the phase centre `centre`.
+    They are the `kept` ones of `blocks` blocks within `span`, or one block with the phase centre `centre`.
     """
     import numpy as np
 
@@ -139,9 +109,9 @@ def blocks_of(job: Job, data: UVData) -> list[Block]:
 
 
 def estimate(job: Job) -> Mapping[str, Any]:
-    """Write the delay spectra even x odd to delay-spectra.h5, and what the estimator itself exports.
+    """Write the delay spectra even x odd to delay-spectra.h5, and the files of the estimator itself.
 
-    Where all is flagged, because no solve gave gains, they are NaN.
+    Spectra are NaN if all data are flagged because no solve gave gains.
     """
     import numpy as np
 
@@ -203,7 +173,7 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
 
 
 def blocks_in(averages: Iterable[Task]) -> int:
-    """Return the number of blocks of averages, the largest of any."""
+    """Return the largest number of blocks of any of the averages."""
     return max(task.settings.get("blocks", 1) for task in averages)
 
 
@@ -214,10 +184,10 @@ def _cost_of_average(task: Task) -> Cost:
 
 
 def _cost_of_power(task: Task) -> Cost:
-    # Differences and noise are made of averages.
+    # Differences and noise are made from averages.
     behind = [average for source in task.inputs.values() for average in source.inputs.values()]
     size, blocks = size_of(task), blocks_in([*task.inputs.values(), *behind])
-    # Each block has a file of the estimator; spectra and what each unit owes to its antennas are of all.
+    # Each block has a file of the estimator; spectra and each unit's shares of its antennas are of all blocks.
     spectra = size.baselines * size.channels.count
     seconds = 2 + 1e-5 * spectra + (blocks - 1) * (0.9 + 0.005 * size.baselines)
     return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)

@@ -1,4 +1,4 @@
-"""Times of steps and solves of one array, measured in a process of its own: ``python -m calstudy.products.step_times``.
+"""Times of steps and solves of one array, in a separate process: ``python -m calstudy.products.step_times``.
 
 The process has one thread, and its memory is that of this work alone.
 """
@@ -48,26 +48,19 @@ ENVIRONMENT = {
 """One thread, no start-up messages, and huge pages for large temporary arrays where the system has them: the allocation
 of small pages can take longer than the measured work."""
 ROUNDS = 10
-"""The samples of all solvers are divided into this many rounds, so that other work on the machine affects all alike."""
+"""Number of rounds in which the samples of all solvers are taken, so that other load affects all of them equally."""
 FLOOR_TOLERANCE, FLOOR_STEPS = 1e-5, 200
 SETTLED = 0.5
-"""Seconds."""
+"""Duration of warm-up steps, seconds."""
 
 Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Number of samples.
+    """Numbers of samples: steps of the paper's solver, calls of our Adamax, and solves of the default solver.
 
-    Attributes
-    ----------
-    steps
-        Single steps of the paper's solver.
-    calls
-        Calls of our Adamax, of `STEPS_PER_CALL` steps each, whose mean is one sample.
-    solves
-        Complete cold solves of the default solver, each with noise of its own.
+    A sample of a call is the mean of its `STEPS_PER_CALL` steps. Each solve is complete and cold, with its own noise.
     """
 
     steps: int
@@ -81,8 +74,6 @@ class StepTimes:
 
     Attributes
     ----------
-    antennas, baselines
-        Their numbers.
     longest
         Longest baseline, m.
     vectors
@@ -110,40 +101,29 @@ class StepTimes:
 
 @dataclass(frozen=True)
 class Descent:
-    """Losses of the paper's solver on one problem: at the minimum, and before the first step and after each."""
+    """Losses of the paper's solver on one problem: before the first step and after each, and the minimum (`floor`)."""
 
     antennas: int
     floor: float
     losses: np.ndarray
 
     def steps_to(self, excess: float) -> int | None:
-        """Return after how many steps the loss is first within this fraction above the minimum, or None if never."""
+        """Return the number of steps until the loss is within this fraction of the minimum, or None if it never is."""
         reached = np.flatnonzero(self.losses <= (1 + excess) * self.floor)
         return int(reached[0]) if reached.size else None
 
 
 def time_steps_apart(array: Mapping[str, Any], samples: Samples, device: str) -> StepTimes:
-    """Time the solvers in a process of its own.
+    """Time the solvers in a separate process; raises InputError with the last line of its output if it fails.
 
-    Parameters
-    ----------
-    array
-        JSON-able sections `layout`, `channels` and `basis`; every baseline has a foreground model of its own.
-    samples
-        Number of samples.
-    device
-        ``cpu`` (one core) or ``gpu``.
-
-    Raises
-    ------
-    InputError
-        If the process fails, with the last line of its output.
+    The array has JSON-able sections `layout`, `channels` and `basis`, and every baseline its own foreground model. The
+    device is ``cpu`` (one core) or ``gpu``.
     """
     return StepTimes(**_run_apart({"array": dict(array), "samples": asdict(samples), "device": device}))
 
 
 def descend_apart(array: Mapping[str, Any], max_steps: int) -> Descent:
-    """Run `descend` in a process of its own; array and errors as for `time_steps_apart`."""
+    """Run `descend` in a separate process; array and errors as for `time_steps_apart`."""
     answer = _run_apart({"array": dict(array), "max_steps": max_steps})
     return Descent(**{**answer, "losses": np.array(answer["losses"])})
 
@@ -211,7 +191,7 @@ def _settle(call: Callable[[], object]) -> None:
 def _all_samples(
     simulation: Simulation, structure: FitStructure, paper: PaperStep, samples: Samples, clock: Clock
 ) -> Iterator[tuple[str, float]]:
-    """Yield samples by name, without compilation, in rounds that each have some of every kind."""
+    """Yield samples by name, without compilation, in rounds that contain all kinds."""
     problem = simulation.problem(0, structure)
     solver = GaussNewton()
     adamax = FirstOrder(Optimizer(max_steps=10**6), tolerance=0.0)
@@ -220,7 +200,7 @@ def _all_samples(
         call()
     for number in range(ROUNDS):
         for _ in range(_share(samples.steps, number)):
-            # The loss is read, because a GPU returns before it has finished.
+            # Reading the loss waits for a GPU, which returns before it has finished.
             yield "paper-step", _seconds(lambda: float(paper.step()), clock)
             yield "paper-sum", _seconds(lambda: [part.numpy() for part in paper.model_sum()], clock)
         for _ in range(_share(samples.calls, number)):
@@ -232,7 +212,7 @@ def _all_samples(
 
 
 def _share(total: int, number: int) -> int:
-    """Return how many of `total` samples belong to one of the rounds."""
+    """Return the number of the `total` samples that belong to one of the rounds."""
     return total * (number + 1) // ROUNDS - total * number // ROUNDS
 
 

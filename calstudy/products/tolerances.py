@@ -1,7 +1,7 @@
-"""Up to which severity of a fault a calibrator can be trusted, from worlds that differ in the severity alone.
+"""The severity of a fault up to which a calibrator's bias is tolerable, from worlds that differ only in the severity.
 
 Worlds with labels such as ``positions: 2 cm`` and ``positions: 5 cm`` are severities of one fault: the text before the
-colon names it, the number after it is the severity. A world without a colon is severity zero of all faults that have no
+colon is its name, the number after it the severity. A world without a colon is severity zero of all faults that have no
 world of severity zero themselves.
 """
 
@@ -18,36 +18,29 @@ from astropy import units
 from calstudy.base.errors import InputError
 
 LIMIT = 0.1
-"""Bias over the EoR that is tolerated."""
+"""Largest tolerated bias, over the EoR."""
 BAND = (0.2, 0.5)
-"""Band of k, h/Mpc, in which it is."""
+"""Band of k, h/Mpc, in which the bias is measured."""
 COUNTS = 1.0
 """A band of k counts if the upper limit of the bias is below this part of the EoR."""
 SIGMAS = 2.0
-"""A bias of fewer standard deviations may be none."""
+"""Number of standard deviations below which a bias is not significant."""
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 
 def upper_limit(bias: float, error: float) -> float:
     """Return the 95 % upper limit of the size of a bias, from its standard deviation: |bias| + 2 sigma.
 
-    What was measured counts in full: a bias of 1.9 standard deviations may as well be 3.9 as none.
+    The measured bias is not reduced by its error: a bias of 1.9 standard deviations may as well be 3.9 as zero.
     """
     return abs(bias) + SIGMAS * error
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Worlds that differ in how severe one fault is.
+    """Worlds that differ only in the severity of one fault.
 
-    Attributes
-    ----------
-    name, unit
-        What it is, and the text behind the numbers.
-    worlds
-        Labels, by ascending severity.
-    severities
-        Ascending; zero for worlds without the fault.
+    Labels of worlds and severities are ascending in severity, which is zero for worlds without the fault.
     """
 
     name: str
@@ -57,7 +50,7 @@ class Fault:
 
 
 def faults(worlds: Sequence[str]) -> list[Fault]:
-    """Return the faults that the labels of worlds name, in their order; each in the unit of its first label.
+    """Return the faults in the labels of worlds, in their order, each in the unit of its first label.
 
     Raises
     ------
@@ -109,16 +102,10 @@ class Tolerance:
 
 
 def tolerance(severities: Sequence[float], bias: np.ndarray, error: np.ndarray) -> Tolerance:
-    """Return where a bias that grows with the severity of a fault reaches `LIMIT`.
+    """Return the severity of a fault at which a bias that grows with it reaches `LIMIT`.
 
-    Between two severities it is a power law.
-
-    Parameters
-    ----------
-    severities
-        Ascending; zero may be the first.
-    bias, error
-        At these, and its standard deviations.
+    The bias is a power law between two severities. Severities are ascending, and the first may be zero; `error` is the
+    standard deviation of the bias.
     """
     used = [place for place, severity in enumerate(severities) if severity > 0 and np.isfinite(bias[place])]
     reached = [place for place in used if abs(bias[place]) >= LIMIT and abs(bias[place]) >= SIGMAS * error[place]]

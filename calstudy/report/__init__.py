@@ -1,1 +1,1 @@
-"""One page about a run: what was studied, how it went, what came out."""
+"""One page about a run: its setup, its progress and its results."""

@@ -1,4 +1,4 @@
-"""The arrays of figures as charts that a reader of the report can zoom and take values from."""
+"""The arrays of figures as interactive charts of the report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-# Series in the order of the legend: field, label, and colour by its name in page.css.
+# Series in the order of the legend: field, label, and name of the colour in page.css.
 SERIES = {
     "eor": ("EoR, P^S", "grey"),
     "uncorrupted": ("perfect gains, P^(S+F+N)", "black"),
@@ -28,12 +28,7 @@ POWER = "P [mK² h⁻³ Mpc³]"
 class Chart:
     """Curves over k, or maps over k_perp and k_parallel.
 
-    Attributes
-    ----------
-    title
-        What it shows.
-    data
-        What the page's script draws: `kind`, labels and series, ready for JSON.
+    `data` is the input of the page's script: `kind`, labels and series, ready for JSON.
     """
 
     title: str
@@ -41,13 +36,10 @@ class Chart:
 
 
 def read_charts(path: Path) -> list[Chart]:
-    """Return the charts of a figure's arrays; none if they are of neither kind.
+    """Return the charts of the arrays of a figure (``NAME.npz`` from `calstudy.plotting.save`); none for other arrays.
 
-    Parameters
-    ----------
-    path
-        ``NAME.npz``, as `calstudy.plotting.save` writes it. An entry ``GROUP.FIELD`` is a field of a spectrum: `power`
-        over `k`, a transfer function over `k`, or either over `k_perp` and `k_parallel`.
+    An entry ``GROUP.FIELD`` is a field of a spectrum: `power` over `k`, a transfer function over `k`, or either over
+    `k_perp` and `k_parallel`.
     """
     groups: dict[str, dict[str, np.ndarray]] = {}
     with np.load(path, allow_pickle=False) as arrays:
@@ -118,5 +110,5 @@ def _maps(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
 
 
 def _rounded(values: np.ndarray) -> list[float | None]:
-    """Return numbers with five digits; what is not finite becomes None, which JSON has."""
+    """Return numbers with five digits, None where they are not finite."""
     return [float(f"{value:.5g}") if np.isfinite(value) else None for value in np.asarray(values, float)]

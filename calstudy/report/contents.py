@@ -1,4 +1,4 @@
-"""What a run folder holds, as the tables of its report."""
+"""The contents of a run folder, as the tables of its report."""
 
 from __future__ import annotations
 
@@ -28,18 +28,8 @@ REGIONS = {"outside-wedge": "outside the wedge", "inside-wedge": "inside the wed
 class Table:
     """A table of the report.
 
-    Attributes
-    ----------
-    title
-        Heading.
-    columns
-        Names of the columns.
-    rows
-        Texts.
-    note
-        A sentence below the heading, may be empty.
-    verdicts
-        Indices of the columns whose texts are verdicts and are coloured.
+    The note, which may be empty, is a sentence below the title; `verdicts` are the indices of the columns with
+    verdicts, which are coloured.
     """
 
     title: str
@@ -50,25 +40,13 @@ class Table:
 
     @property
     def outcomes(self) -> list[str]:
-        """The verdicts that it has, once each."""
+        """The verdicts in the table, once each."""
         return sorted({row[place] for row in self.rows for place in self.verdicts} - {""})
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report.
-
-    Attributes
-    ----------
-    name, caption
-        What it is called, and what it shows.
-    path
-        The png.
-    files
-        Its other files, relative to the run folder.
-    charts
-        What can be drawn of its arrays.
-    """
+    """A figure of the report: the png, its other files relative to the run folder, and charts of its arrays."""
 
     name: str
     caption: str
@@ -79,26 +57,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Contents:
-    """All that a report shows.
+    """All contents of a report.
 
-    Attributes
-    ----------
-    title, description
-        Of the experiment, sweep or collection.
-    facts
-        Short statements by name: when, where, which versions.
-    stand_ins, warnings
-        Sentences.
-    pictures, tables
-        In the order of the page.
-    headline
-        The numbers on top of it.
-    files
-        Tables and records, relative to the run folder.
-    parts
-        Other run folders that this one consists of: name and relative path of their reports.
-    experiment
-        The resolved experiment file, or an empty text.
+    Facts are short statements by name, such as the time, the machine and versions. Pictures and tables are in the
+    order of the page, below the headline. Files, tables and records, are relative to the run folder. Parts are the
+    run folders of which this one consists: name and relative path of their reports. The experiment is the resolved
+    file, or empty.
     """
 
     title: str
@@ -115,18 +79,7 @@ class Contents:
 
 
 def read_contents(folder: Path) -> Contents:
-    """Read a run folder.
-
-    Parameters
-    ----------
-    folder
-        Of a finished run of an experiment, a sweep or a collection.
-
-    Raises
-    ------
-    InputError
-        If it is not the folder of a finished run.
-    """
+    """Read the folder of a finished run of an experiment, a sweep or a collection; raises InputError for others."""
     manifest = _manifest(folder)
     products = manifest.get("products", [])
     experiment = folder / EXPERIMENT
@@ -199,7 +152,7 @@ def _warnings(products: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
 
 
 def _pictures(folder: Path, manifest: Mapping[str, Any]) -> list[Picture]:
-    """Return the pictures in the order of the manifest, with the captions that it has; others follow by name."""
+    """Return the pictures of the manifest in its order and with its captions, then others by name."""
     found = {path.stem: path for path in sorted((folder / "figures").glob("*.png"))}
     drawn = [item for item in manifest.get("products", []) if item["stage"] == "figure"]
     captions = {item["label"]: item.get("notes", {}).get("caption", "") for item in drawn}
@@ -231,7 +184,7 @@ def _parts(folder: Path, manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None:
-    """Return what became of the papers' statements; without a role in any paper a sentence, without papers nothing."""
+    """Return the verdicts on the papers' statements, or a sentence without a role in any paper; None without papers."""
     path = folder / CLAIMS
     if not path.is_file():
         return None
@@ -314,7 +267,7 @@ def _summary(folder: Path) -> Table | None:
 
 
 def _comparison(folder: Path) -> Table | None:
-    """Return the scores of every calibrator in every world, a row each."""
+    """Return the scores of every calibrator in every world, one row each."""
     path = folder / "tables" / COMPARISON
     if not path.is_file():
         return None

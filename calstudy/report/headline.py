@@ -1,4 +1,4 @@
-"""The numbers that a reader wants first."""
+"""The headline of a report: its most important numbers."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ BAND = (0.2, 0.5)
 """Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""
 PLACE = f"outside the wedge, k of {BAND[0]:g} to {BAND[1]:g} h/Mpc"
 SIGNIFICANT = 5.0
-"""A bias of fewer standard deviations of the thermal noise may be noise."""
+"""Standard deviations of the thermal noise below which a bias may be noise."""
 TINY = 1e-9
 
 
 @dataclass(frozen=True)
 class Number:
-    """A name, the number as text, and a sentence that says what it is."""
+    """A name, the number as text, and a sentence that explains it."""
 
     name: str
     text: str
@@ -31,16 +31,11 @@ class Number:
 
 @dataclass(frozen=True)
 class Signal:
-    """What is left of the EoR and what is left besides it, outside the wedge, in the band of the headline.
+    """EoR and other power that is left outside the wedge, in the band of the headline.
 
-    Attributes
-    ----------
-    transfer, transfer_error
-        Part of the EoR's power that is left.
-    bias, bias_error
-        Power of the residual without EoR over that of the EoR, and its error by the thermal noise.
-    scale
-        Flux scale of the calibrated data, of which the others are free.
+    The transfer is the fraction of the EoR's power that is left; the bias is the power of the residual without EoR
+    over that of the EoR, with its error from the thermal noise. Both are free of the flux scale of the calibrated
+    data.
     """
 
     transfer: float
@@ -51,7 +46,7 @@ class Signal:
 
     @property
     def numbers(self) -> list[Number]:
-        """The same for people."""
+        """The same numbers as text."""
         left = f"part of the EoR's power that is left, {PLACE}"
         bias = (
             f"power of the residual without EoR over that of the EoR, {PLACE}; the error is that of the thermal noise"
@@ -64,7 +59,7 @@ class Signal:
 
     @property
     def excess(self) -> str | None:
-        """A sentence if more is left besides the EoR than of it, by more than the noise explains; else None."""
+        """A warning if the bias exceeds the EoR by more than the noise explains; else None."""
         if abs(self.bias) < 1 or abs(self.bias) < SIGNIFICANT * self.bias_error:
             return None
         return (
@@ -74,13 +69,7 @@ class Signal:
 
 
 def read_headline(folder: Path) -> list[Number]:
-    """Return the numbers of a run folder: T, bias and flux scale, and counts of the claims; as far as there are any.
-
-    Parameters
-    ----------
-    folder
-        Of a finished run.
-    """
+    """Return T, bias and flux scale of the folder of a finished run, and counts of its claims, if it has them."""
     signal = read_signal(folder)
     numbers = [] if signal is None else signal.numbers
     verdicts = _verdicts(folder / "claims.json")
@@ -88,19 +77,13 @@ def read_headline(folder: Path) -> list[Number]:
 
 
 def read_excess(folder: Path) -> list[str]:
-    """Return the warning of a run folder whose residual has more power besides the EoR than of it; as a rule none."""
+    """Return the warning of a run folder whose bias exceeds the EoR; usually none."""
     signal = read_signal(folder)
     return [] if signal is None or signal.excess is None else [signal.excess]
 
 
 def read_signal(folder: Path) -> Signal | None:
-    """Return T and bias of a run folder, or None if it has no such tables or no bins in the band.
-
-    Parameters
-    ----------
-    folder
-        Of a finished run.
-    """
+    """Return T and bias of a run folder, or None if it has no such tables or no bins in the band."""
     tables = folder / "tables"
     transfer = tables / "transfer-bands.outside-wedge.csv"
     paths = [tables / f"{name}.outside-wedge.csv" for name in ("eor", "residual_without_eor")]

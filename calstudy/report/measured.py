@@ -1,4 +1,4 @@
-"""How well measured data are fitted, and how strong their noise is, as tables of a report."""
+"""Tables of a report on measured data: chi^2 of the fits, and the level of the noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOISE_NOTE = (
 
 
 def tables(folder: Path) -> Iterator[tuple[str, Sequence[str], Sequence[Sequence[str]], str]]:
-    """Yield title, columns, rows and note of the tables that a run of measured data has; nothing for other runs."""
+    """Yield title, columns, rows and note of the tables of a run of measured data; nothing for other runs."""
     found = (
         (FIT_TITLE, FIT_COLUMNS, _fits(folder), FIT_NOTE),
         (NOISE_TITLE, NOISE_COLUMNS, _noise(folder), NOISE_NOTE),
@@ -33,7 +33,7 @@ def tables(folder: Path) -> Iterator[tuple[str, Sequence[str], Sequence[Sequence
 
 
 def _fits(folder: Path) -> list[tuple[str, ...]]:
-    """Return chi^2 of both halves of a run's measured data; nothing for other runs, and without autocorrelations."""
+    """Return chi^2 of both halves of measured data; empty for other runs, and without autocorrelations."""
     path = folder / "tables" / QUALITY
     if not path.is_file():
         return []
@@ -55,7 +55,7 @@ NOISE_COLUMNS = ("of", "from the difference", "from the autocorrelations", "rati
 
 
 def _noise(folder: Path) -> list[tuple[str, ...]]:
-    """Return the noise of a run's measured data; nothing for other runs."""
+    """Return the noise levels of measured data; empty for other runs."""
     path = folder / "tables" / NOISE
     if not path.is_file():
         return []

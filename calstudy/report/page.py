@@ -1,4 +1,4 @@
-"""The report of a run as one HTML page that needs nothing besides itself."""
+"""The report of a run as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REPORT = "report.html"
 
 
 def render(contents: Contents) -> str:
-    """Return the page; pictures, style and script are part of it."""
+    """Return the page with its pictures, style and script."""
     return _page("page.html", contents=contents, images=_images(contents))
 
 
@@ -43,23 +43,17 @@ def _images(contents: Contents) -> dict[str, str]:
 
 
 def write_report(folder: Path) -> Path:
-    """Write report.html into a run folder, whole or not at all, and return its path.
+    """Write report.html into the folder of a finished run, completely or not at all, and return its path.
 
-    Raises
-    ------
-    InputError
-        If it is not the folder of a finished run.
+    Raises InputError for other folders.
     """
     return _write(render(read_contents(folder)), folder / REPORT)
 
 
 def write_pair(first: Path, second: Path, output: Path, overwrite: bool = False) -> Path:
-    """Write the page of two runs, whole or not at all, and return its path.
+    """Write the page of two runs, completely or not at all, and return its path.
 
-    Raises
-    ------
-    InputError
-        If one of the folders is not that of a finished run, or the file is there and not to be overwritten.
+    Raises InputError if a folder is not that of a finished run, or the file exists and `overwrite` is false.
     """
     if output.exists() and not overwrite:
         raise InputError(f"{output}: exists; choose another --output, or --overwrite it")

@@ -13,27 +13,16 @@ import yaml
 from calstudy.report.contents import CLAIMS_TITLE, Contents, Picture, Table, read_contents
 
 ALWAYS_DIFFERENT = ("name", "description", "outputs")
-"""Sections of an experiment whose differences say nothing about its results."""
+"""Sections of an experiment whose differences do not concern its results."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two runs, and what is to be seen of both together.
+    """Two runs, and their common contents.
 
-    Attributes
-    ----------
-    first, second
-        The runs.
-    names
-        Of the runs, or of their folders if both runs have one name.
-    differences
-        Fields of the experiments that differ.
-    claims
-        The papers' statements with the verdicts on both; None if neither run has any.
-    pictures
-        Figures of the same name; None where one of the runs has none.
-    tables
-        Title, and the tables of both; None where one of the runs has none.
+    Names are those of the runs, or of their folders if both runs have one name. Differences are the fields of the
+    experiments that differ. Claims, the papers' statements with the verdicts on both, are None if neither run has
+    any. A picture or table is None where one of the runs lacks it.
     """
 
     first: Contents
@@ -46,13 +35,7 @@ class Pair:
 
 
 def read_pair(folders: tuple[Path, Path]) -> Pair:
-    """Read two run folders.
-
-    Raises
-    ------
-    InputError
-        If one of them is not the folder of a finished run.
-    """
+    """Read two run folders; raises InputError if one of them is not that of a finished run."""
     first, second = (read_contents(folder) for folder in folders)
     names = (first.title, second.title)
     if first.title == second.title:
@@ -96,7 +79,7 @@ def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -> Table | None:
-    """Return one row for each statement, with what was measured in both runs, and both verdicts."""
+    """Return one row for each statement, with the numbers and the verdicts of both runs."""
     rows: dict[tuple[str, ...], list[tuple[str, str] | None]] = {}
     for side, table in enumerate((first, second)):
         for row in table.rows if table is not None else ():

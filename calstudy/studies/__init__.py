@@ -1,1 +1,1 @@
-"""What a file can ask for: an experiment, a sweep, realizations, a collection, a run-time study."""
+"""The kinds of study: an experiment, a sweep, realizations, a collection, a comparison, run times, measured data."""

@@ -1,4 +1,4 @@
-"""Blind challenges: a recipe whose seeds nobody can guess, and the commitment to it that is published first."""
+"""Blind challenges: a recipe with secret seeds, and the commitment to it that is published first."""
 
 from __future__ import annotations
 
@@ -17,26 +17,20 @@ from calstudy.studies.comparison import Comparison
 
 SEEDS = ("seed", "seeds", "seeds_without_eor")
 DRAWN = ("sky.foregrounds", "sky.eor", "sky.diffuse", "corruption.noise")
-"""Blocks that are drawn in any case; of others, those that differ from their defaults."""
+"""Blocks that always get new seeds; of others, those that differ from their defaults."""
 BITS = 128
 
 
 def write_recipe(worlds: Comparison, path: Path) -> str:
     """Write a comparison with secret seeds and a secret salt, for its owner alone; return the SHA-256 of the file.
 
-    Data with the EoR and without get noise of their own.
-
-    Parameters
-    ----------
-    worlds
-        What is to be blind: only its seeds are replaced.
-    path
-        A new file (YAML), which `export` and `score` take in place of the comparison.
+    Data with the EoR and without have separate noise. Only the seeds of the comparison are replaced; `export` and
+    `score` accept the new YAML file in its place.
 
     Raises
     ------
     InputError
-        If the file is there already, or cannot be written.
+        If the file exists already, or cannot be written.
     """
     experiments = {case.world: case.experiment for case in worlds.cases}
     drawn = {
@@ -57,7 +51,7 @@ def write_recipe(worlds: Comparison, path: Path) -> str:
 
 
 def _drawn(experiment: Experiment) -> dict[str, Any]:
-    """Return new seeds of all that an experiment draws, by dotted path."""
+    """Return new seeds of all random draws of an experiment, by dotted path."""
     full = experiment.model_dump(mode="json", include={"instrument", "sky", "corruption"})
     other = experiment.model_dump(mode="json", include=set(full), exclude_defaults=True)
     changed = {block for block, _ in _walk(other, "")}

@@ -1,4 +1,4 @@
-"""Fit a run to the machine: how many workers, and how finely the simulations are cut, for the memory there is."""
+"""Fit a run to the machine: the number of workers and of chunks of the simulations for the available memory."""
 
 from __future__ import annotations
 
@@ -21,40 +21,26 @@ from calstudy.run.task import Stage, Task
 from calstudy.studies.study import Budget
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
-"""More workers than cores wait for each other; more than this is a slip."""
+"""Limits of the number of workers, of which more than cores wait for each other."""
 ABSURD = 10
-"""Data of so many times the memory are refused at once; a finished run of somewhat large ones may still be drawn."""
+"""Data larger than this many times the memory are refused; a finished run of smaller ones may still be drawn."""
 Targets = Callable[[Experiment], Sequence[Task]]
-"""Which products of an experiment are wanted."""
+"""Function that returns the wanted products of an experiment."""
 
 
 def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Experiment, int]:
-    """Choose the number of workers, and cut simulations finely enough for them, within the memory.
+    """Choose the number of workers, and cut simulations into enough chunks for them, within the memory.
 
-    How many chunks a simulation is cut into changes its visibilities by less than the tolerance of their
-    interpolation, and not the key under which they are stored.
-
-    Parameters
-    ----------
-    experiment
-        Validated.
-    budget
-        Workers and memory.
-    targets
-        Which products are to be made.
-
-    Returns
-    -------
-    experiment
-        The same, perhaps with more `simulation.chunks` and a calibrator that needs less memory.
-    workers
-        Not more than the memory holds; those that were asked for, if no memory was given.
+    The number of chunks of a simulation changes its visibilities by less than the tolerance of their interpolation,
+    and does not change their key in the store. The result is the experiment, perhaps with more `simulation.chunks`
+    and a calibrator that needs less memory, and the number of workers that fit into the memory, or the requested
+    number if no memory was given.
 
     Raises
     ------
     InputError
-        If a single task is estimated to need more than there is, `max_memory` is not an amount of memory, or MPI ranks
-        cannot help; before anything has started.
+        If a single task is estimated to need more memory than there is, `max_memory` is not an amount of memory, or
+        MPI ranks cannot help; before any work starts.
     """
     workers, scheduler = budget.workers, budget.scheduler
     _require_sane(budget)
@@ -63,7 +49,7 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     if scheduler is not None:
         return experiment, workers or 1
     memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    # The parent process holds the libraries, too.
+    # The parent process has the libraries in memory, too.
     memory -= LIBRARIES_MEMORY
     hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
     lean = _stream(_cut(_Work(experiment, targets), memory / hoped), memory / hoped)
@@ -81,9 +67,9 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
 
 
 def require_data_fit(experiment: Experiment, budget: Budget) -> None:
-    """Raise InputError if the data of an experiment alone exceed the memory by far; quick, however large they are.
+    """Raise InputError if the data of an experiment alone exceed the memory by far.
 
-    `fit` and the foreground bases, which take long for absurd sizes, come after it.
+    This check is fast for any size. It precedes `fit` and the foreground bases, which take long for absurd sizes.
     """
     if budget.scheduler is not None:
         return
@@ -98,22 +84,7 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
 
 
 def workers_for(targets: Sequence[Task], store: Path, budget: Budget) -> int:
-    """Return the number of workers for products that cannot be cut further.
-
-    Parameters
-    ----------
-    targets
-        What is to be made.
-    store
-        Folder of products.
-    budget
-        Workers and memory.
-
-    Raises
-    ------
-    InputError
-        As `fit`.
-    """
+    """Return the number of workers for products that cannot be cut further; errors as for `fit`."""
     _require_sane(budget)
     if ranks.count() > 1:
         raise InputError("mpiexec: measured data are not shared between MPI ranks; use --workers")
@@ -133,7 +104,7 @@ def workers_for(targets: Sequence[Task], store: Path, budget: Budget) -> int:
 
 
 def _require_sane(budget: Budget) -> None:
-    """Raise InputError if more workers are asked for than can be meant."""
+    """Raise InputError if the number of workers exceeds the limit for this machine."""
     most = max(LEAST_LIMIT, WORKERS_PER_CORE * cores())
     if budget.scheduler is None and budget.workers is not None and budget.workers > most:
         raise InputError(
@@ -167,7 +138,7 @@ def _require_sharing(experiment: Experiment, workers: int | None, scheduler: str
 
 @dataclass(frozen=True)
 class _Work:
-    """An experiment, and what a run would have to make for it."""
+    """An experiment, and the tasks that a run would have to make for it."""
 
     experiment: Experiment
     targets: Targets
@@ -177,7 +148,7 @@ class _Work:
         return _missing(self.targets(self.experiment), self.experiment.outputs.store)
 
     def largest(self, stage: Stage) -> float:
-        """Return the memory that the largest product of a stage needs; zero if there is none to make."""
+        """Return the memory of the largest missing product of a stage; zero if none is missing."""
         return max((task.cost.memory for task in self.missing if task.stage is stage), default=0.0)
 
     def changed(self, **sections: Any) -> _Work:
@@ -185,7 +156,7 @@ class _Work:
 
 
 def _cut(work: _Work, share: float) -> _Work:
-    """Double the number of simulation chunks until each takes no more than its share, or they are single channels."""
+    """Double the number of simulation chunks until each needs no more than its share, or they are single channels."""
     while (largest := work.largest(SIMULATE_CHUNK)) > share:
         simulation, channels = work.experiment.simulation, work.experiment.instrument.channels.count
         if simulation.chunks >= channels:
@@ -193,13 +164,13 @@ def _cut(work: _Work, share: float) -> _Work:
         chunks = min(2 * simulation.chunks, channels)
         finer = work.changed(simulation=simulation.model_copy(update={"chunks": chunks}))
         if finer.largest(SIMULATE_CHUNK) > 0.95 * largest:
-            break  # What is left is the sky itself.
+            break  # The sky itself takes the rest.
         work = finer
     return work
 
 
 def _stream(work: _Work, share: float) -> _Work:
-    """Let the calibrator use less memory until a solve takes no more than its share."""
+    """Let the calibrator use less memory until a solve needs no more than its share."""
     while work.largest(CALIBRATE_CHUNK) > share:
         calibration = work.experiment.calibration
         with guarded(calibration):
@@ -211,7 +182,7 @@ def _stream(work: _Work, share: float) -> _Work:
 
 
 def _missing(targets: Sequence[Task], folder: Path) -> Sequence[Task]:
-    """Return the tasks whose products a run would have to make, by a quick look into the store."""
+    """Return the tasks whose products are missing in the store, from a quick look."""
     store, found = Store(folder), {}
 
     def visit(task: Task) -> None:

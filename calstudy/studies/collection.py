@@ -1,4 +1,4 @@
-"""Collections: several experiments that are run together, share products, and are compared, as a study."""
+"""Collections: several experiments that are run together, share products, and are compared."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from calstudy.studies.realizations import Realizations
 from calstudy.studies.study import Budget, Made, Study, fitted_parts
 
 KEY = "experiments"
-"""The key that makes a file a collection."""
+"""Key that marks a file as a collection."""
 
 
 class Member(Section):
-    """One experiment of the collection; its file name alone stands for it."""
+    """One experiment of the collection; a file name alone is allowed in place of the block."""
 
     file: Path = Field(strict=False, description="The experiment file; a relative path starts at the collection file.")
     name: StudyName | None = Field(None, description="Replaces the experiment's own name.")
@@ -69,19 +69,10 @@ class CollectionFile(Section):
 class Collection(Study):
     """Several experiments, and the figures and claims that compare them.
 
-    Products that several members need have one key, and are one product.
-
-    Parameters
-    ----------
-    file
-        What the file says.
-    members
-        The experiments by name, in the order of the file; all with the same store and folder of runs.
-    roles
-        Names of members by the role that they play in their papers.
-    finished
-        Run folders of members that were run before, by name, whose tables are in the store. The collection does not run
-        these, and needs nothing else of them.
+    Products that several members need have one key, and are made once. `members` are in the order of the file, all
+    with the same store and folder of runs; `roles` has the member by the role that it plays in its papers.
+    `finished` has the run folders of members that were run before and whose tables are in the store: the collection
+    does not run them, and needs nothing else of them.
     """
 
     def __init__(
@@ -131,7 +122,7 @@ class Collection(Study):
 
     @property
     def folder(self) -> Path:
-        """The run folder: the name, and a digest of what the collection and its members say."""
+        """The run folder: the name, and a digest of the content of the collection and its members."""
         content = {
             "members": {name: study.folder.name for name, study in self.studies.items()},
             "roles": self.roles,
@@ -141,7 +132,7 @@ class Collection(Study):
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
-        """What any member uses in place of the papers' own ingredients."""
+        """Substitutions of any member for the papers' own ingredients."""
         return unique_notes(note for study in self.studies.values() for note in study.stand_ins)
 
     @cached_property
@@ -157,13 +148,13 @@ class Collection(Study):
 
     @cached_property
     def claims(self) -> Task | None:
-        """The statements of the members' papers, each evaluated on the members whose roles it is about, or None."""
+        """The statements of the members' papers, each evaluated on the members that play its roles, or None."""
         graphs = {name: study.graph for name, study in self.studies.items()}
         papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
         return combined_claims(self.name, graphs, papers, self.roles, self.stand_ins)
 
     def _place(self, name: str) -> str:
-        """Return where the folder of a member is, from the folder of runs."""
+        """Return the path of a member's folder, relative to the folder of runs."""
         if name in self.finished:
             return os.path.relpath(self.finished[name].resolve(), self.folder.parent)
         return self.studies[name].folder.name
@@ -279,7 +270,7 @@ def _load_member(member: Member, path: Path, scale: str | None, overrides: Seque
 
 
 def _roles(file: CollectionFile, members: Mapping[str, Experiment]) -> dict[str, str]:
-    """Return who plays which role; raises ExperimentError if a member is named that is not there or cannot play it."""
+    """Return the member for each role; raises ExperimentError if one is missing or cannot play its role."""
     papers = distinct_papers(paper for experiment in members.values() for paper in experiment.papers)
     shown = [role for figure in _comparisons(file) for role in figure.titles]
     known = list(dict.fromkeys([*(role for paper in papers for role in paper.roles), *shown]))

@@ -1,4 +1,4 @@
-"""Comparisons: several calibrators in several worlds, on one yardstick, as a study."""
+"""Comparisons: several calibrators in several worlds, with the same scores."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from calstudy.studies.preflight import refusal_of_calibrator, require_possible
 from calstudy.studies.study import Budget, Made, Study
 
 KEY = "calibrators"
-"""The key that makes a file a comparison."""
+"""Key that marks a file as a comparison."""
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 """Keys of the experiment that the cases do not take from it."""
@@ -113,14 +113,7 @@ class ComparisonFile(Section):
 class Case:
     """One calibrator in one world.
 
-    Attributes
-    ----------
-    calibrator, world
-        Their labels.
-    experiment
-        Validated.
-    refusal
-        Why the calibrator cannot work there; empty if it can.
+    The refusal is the reason why the calibrator cannot work there; it is empty if it can.
     """
 
     calibrator: str
@@ -130,18 +123,10 @@ class Case:
 
 
 class Comparison(Study):
-    """Calibrators in worlds. A calibrator that cannot work in a world is left out there, and the table says why.
+    """Calibrators in worlds, without those that cannot work in a world, for which the table has the reason.
 
-    Products that several cases need have one key, and are one product.
-
-    Parameters
-    ----------
-    file
-        What the file says.
-    cases
-        World by world, all calibrators each, in the order of the file.
-    resolved
-        The file with its experiment in it, and all changes applied.
+    Products that several cases need have one key, and are made once. Cases are ordered by world and then by
+    calibrator, as in the file; `resolved` is the file with its experiment in it, and with all changes applied.
     """
 
     def __init__(self, file: ComparisonFile, cases: Sequence[Case], resolved: Mapping[str, Any]) -> None:
@@ -155,7 +140,7 @@ class Comparison(Study):
 
     @property
     def folder(self) -> Path:
-        """The run folder: the name, and a digest of what the file and its cases say."""
+        """The run folder: the name, and a digest of the content of the file and its cases."""
         content = {
             "cases": [(case.world, case.calibrator, identity(_what_is_made(case.experiment))) for case in self.cases],
             "figures": identity(self.file.figures),
@@ -182,7 +167,7 @@ class Comparison(Study):
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
-        """What all cases use in place of the papers' own ingredients; what some do besides, their world says."""
+        """Substitutions of all cases for the papers' own ingredients; their worlds give those of single cases."""
         first, *others = [stand_ins(case.experiment) for case in self.cases]
         return tuple(note for note in first if all(note in found for found in others))
 
@@ -198,7 +183,7 @@ class Comparison(Study):
 
     @property
     def _labels(self) -> dict[str, Any]:
-        """Labels of calibrators and worlds, and why some cases are not there: world, calibrator and sentence."""
+        """Labels of calibrators and worlds, and refusals: world, calibrator and reason."""
         return {
             "calibrators": list(self.file.calibrators),
             "worlds": list(self.file.worlds),
@@ -213,7 +198,7 @@ class Comparison(Study):
 
     @cached_property
     def figures(self) -> list[Task]:
-        """The figures asked for."""
+        """The requested figures."""
         return [cases_task(figure, self.graphs, self._labels, self.stand_ins) for figure in _shown(self.file)]
 
     @property
@@ -244,14 +229,14 @@ class Comparison(Study):
 
 
 def _what_is_made(experiment: Experiment) -> Experiment:
-    """Return an experiment without what only its own run makes."""
+    """Return an experiment without the settings of products that only its own run makes."""
     return experiment.model_copy(update={"outputs": experiment.outputs.reset("store", "runs", "figures")}).reset(
         "scales", "name", "description", "papers"
     )
 
 
 def _graph(experiment: Experiment) -> Graph:
-    """Return the graph of a case; there are too many of them to keep what each calibrates."""
+    """Return the graph of a case, which does not keep calibrated visibilities because there are many cases."""
     return Graph(experiment, keep_visibilities=False)
 
 
@@ -274,8 +259,6 @@ def load_comparison(
 
     Parameters
     ----------
-    path, data
-        The file, and what it holds.
     scale
         Name of a set of changes in the `scales` of the file, of the experiment, or of both.
     overrides
@@ -289,7 +272,7 @@ def load_comparison(
     InputError
         If a file cannot be read, or a scale or override cannot be applied.
     ExperimentError
-        If fields are unknown, missing, or hold values that are not allowed.
+        If fields are unknown, missing, or have values that are not allowed.
     """
     own = scale if scale in (data.get("scales") or {}) else None
     data = apply_scale(data, own)
@@ -322,9 +305,9 @@ def load_comparison(
 
 
 def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
-    """Return a comparison's content with one of its own keys changed: as a whole, an entry by its label, or its field.
+    """Return a comparison's content with one of its own keys, an entry by its label, or a field of it changed.
 
-    Labels may have dots. Fields of a world are dotted paths themselves.
+    Labels may contain dots. Fields of a world are dotted paths themselves.
     """
     key, _, rest = path.partition(".")
     if not rest:
@@ -342,22 +325,15 @@ def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
 
 
 def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return an experiment with its defaults and absolute paths, which is the same wherever it is read."""
+    """Return an experiment with its defaults and absolute paths, so that it does not depend on its folder."""
     content = validate(base, folder).model_dump(mode="json")
     return {key: value for key, value in content.items() if key not in NOT_SHARED}
 
 
 def _base(file: ComparisonFile, folder: Path, scale: str | None, optional: bool) -> tuple[dict[str, Any], Path]:
-    """Return the content of the experiment that all cases start from, and the folder of its relative paths.
+    """Return the experiment from which all cases are made, and the folder of its relative paths.
 
-    Parameters
-    ----------
-    file, folder
-        The comparison, and where it lies.
-    scale
-        Name of a set of changes in the experiment's `scales`; None for none.
-    optional
-        Whether the experiment may lack it, for the comparison has it.
+    If `optional`, the experiment may lack the scale, because the comparison has it.
     """
     if isinstance(file.experiment, dict):
         base: dict[str, Any] = file.experiment

@@ -34,22 +34,10 @@ def make_component(
     console: Console,
     budget: Budget | None = None,
 ) -> Product:
-    """Return a simulated component from the experiment's store, making it if it is not there yet.
+    """Return a simulated component from the experiment's store, and make it if it is missing.
 
-    It has the key that a run gives it, so that either finds what the other made, whole or in part.
-
-    Parameters
-    ----------
-    experiment
-        Validated; its `outputs.store` is used.
-    component
-        `foregrounds` or `eor`.
-    log
-        File that workers and the simulation log to.
-    console
-        Where progress is printed.
-    budget
-        Workers and memory.
+    It has the same key as in a run, so that both find finished chunks of each other. Workers and the simulation
+    write to the `log` file.
 
     Raises
     ------

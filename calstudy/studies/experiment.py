@@ -34,15 +34,7 @@ AS_BUILT_TABLE = "as-built.csv"
 
 
 class ExperimentStudy(Study):
-    """One experiment.
-
-    Parameters
-    ----------
-    experiment
-        Validated, without a sweep.
-    folder
-        Its run folder, if it is a part of another study that has it elsewhere.
-    """
+    """One validated experiment without a sweep; `folder` is its run folder if another study decides it."""
 
     def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
         self.experiment = experiment
@@ -69,22 +61,22 @@ class ExperimentStudy(Study):
         return fitted, count
 
     def _targets_of(self, experiment: Experiment) -> list[Task]:
-        """Return the products of the experiment, changed or not; the keys of those of the study are known."""
+        """Return the products of an experiment, without computing those of the study's own again."""
         return self.targets if experiment is self.experiment else targets_of(experiment)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """What a plan says of settings that are allowed, and hardly meant."""
+        """Notes of a plan on settings that are allowed, but probably a mistake."""
         return notes_of(self.experiment)
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
-        """What is used in place of the papers' own ingredients."""
+        """Substitutions for the papers' own ingredients."""
         return stand_ins(self.experiment)
 
     @cached_property
     def figures(self) -> list[Task]:
-        """The figures asked for."""
+        """The requested figures."""
         return [figure_task(self.graph, figure, self.stand_ins) for figure in figures_of(self.experiment)]
 
     @cached_property
@@ -96,7 +88,7 @@ class ExperimentStudy(Study):
 
     @cached_property
     def calibrates(self) -> bool:
-        """Whether any variant is calibrated."""
+        """True if any variant is calibrated."""
         return any(variant.calibrate for variant in self.experiment.variants.values())
 
     @property
@@ -135,7 +127,7 @@ class ExperimentStudy(Study):
         write_manifest(folder, self.name, fields)
 
     def _as_built_table(self) -> str:
-        """Return as CSV what differs from the nominal instrument, antenna by antenna."""
+        """Return as CSV the deviations of each antenna from the nominal instrument."""
         instrument = self.experiment.instrument
         numbers = make_layout(instrument.layout).numbers
         table = io.StringIO()
@@ -146,7 +138,7 @@ class ExperimentStudy(Study):
         return table.getvalue()
 
     def _sky_model_table(self) -> str:
-        """Return as CSV what the calibrator assumes that is not true, below a line that says it in a sentence."""
+        """Return as CSV the false assumptions of the calibrator, after a line that describes its sky model."""
         table = io.StringIO()
         table.write(f"# sky model: {sky_model.described(self.graph)}\n")
         rows = csv.writer(table, lineterminator="\n")
@@ -155,12 +147,12 @@ class ExperimentStudy(Study):
 
 
 def targets_of(experiment: Experiment) -> list[Task]:
-    """Return the products that a run of an experiment is for."""
+    """Return the products that a run of an experiment makes for its user."""
     return ExperimentStudy(experiment).targets
 
 
 def experiment_folder(experiment: Experiment) -> Path:
-    """Return the run folder of an experiment: its name, and a digest of what it says but for where results go."""
+    """Return the run folder of an experiment: its name, and a digest of its content without output paths."""
     outputs = experiment.outputs.reset("store", "runs")
     content = identity(experiment.model_copy(update={"outputs": outputs}).reset("scales"))
     return run_folder(experiment.outputs.runs, experiment.name, content)

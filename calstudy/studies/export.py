@@ -1,4 +1,4 @@
-"""Export: what a calibrator may know of an experiment, in files for other programs, and nothing of the truth."""
+"""Export: the data and assumptions of an experiment in files for other programs, without the truth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FORMATS = ("uvh5", "uvfits", "ms")
 README, LOG = "README.md", "export.log"
 SKY_MODEL = "sky-model"
 CARRIER = {"none": "none"}
-"""The calibrator of worlds that are exported: data and what is assumed do not depend on it."""
+"""Calibrator of exported worlds, on which data and assumptions do not depend."""
 TEXT = """\
 # Data to be calibrated
 
@@ -82,20 +82,10 @@ other is not calibration.
 
 @dataclass(frozen=True)
 class Contents:
-    """The tasks of what is exported of one experiment.
+    """The tasks of the exported products of one experiment, which calibrates data with the EoR and without.
 
-    Attributes
-    ----------
-    experiment
-        Validated; it calibrates data with the EoR and without.
-    data
-        The data sets, in the order of their digests, which says nothing of them.
-    sky_model
-        None if nothing is assumed of the sky.
-    levels
-        For the level of the noise; None if there is none.
-    salt
-        Of a blind challenge; empty for none.
+    Data sets are in the order of their digests, which does not reveal their content. The sky model is None if the
+    calibrator has none, and so are the levels without noise; the salt of a blind challenge may be empty.
     """
 
     experiment: Experiment
@@ -106,7 +96,7 @@ class Contents:
 
     @classmethod
     def of(cls, experiment: Experiment, salt: str = "") -> Contents:
-        """Return what is exported of an experiment."""
+        """Return the exported products of an experiment."""
         graph = Graph(experiment)
         variants = [experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS[:2]]
         data = {
@@ -124,42 +114,34 @@ class Contents:
 
     @property
     def digest(self) -> str:
-        """Of all data sets and the sky model."""
+        """Digest of all data sets and the sky model."""
         whole = digest_json([*sorted(task.key for task in self.data), self.sky_model and self.sky_model.key])
         return salted(whole, self.salt)
 
     @property
     def tasks(self) -> list[Task]:
-        """All of them."""
+        """All tasks."""
         return [*self.data, *(task for task in (self.sky_model, self.levels) if task is not None)]
 
 
 def export(
     worlds: Comparison, folder: Path, file_format: str, overwrite: bool, budget: Budget, console: Console
 ) -> list[Path]:
-    """Write the data of every world, making what is not in the store.
+    """Write the data of every world, make products that are missing in the store, and return the folders.
 
     Parameters
     ----------
     worlds
         From `calstudy.studies.worlds.load_worlds`, with the calibrator `CARRIER`.
     folder
-        Of the one world there is; several get a folder each in it, ``world-1`` and so on.
+        That of a single world; several worlds have subfolders ``world-1`` and so on.
     file_format
         One of `FORMATS`.
-    overwrite
-        Whether files may be replaced.
-    budget, console
-        As for `calstudy.studies.study.run_study`.
-
-    Returns
-    -------
-    The folders.
 
     Raises
     ------
     InputError
-        If files would be replaced, or the data cannot be made or written.
+        If files would be replaced without `overwrite`, or the data cannot be made or written.
     """
     if file_format not in FORMATS:
         raise InputError(f"--format {file_format}: not a format of visibilities (allowed: {', '.join(FORMATS)})")
@@ -220,7 +202,7 @@ def _write_world(content: Contents, products: Mapping[str, Product], folder: Pat
 
 
 def _at(template: UVData, uvd: UVData) -> UVData:
-    """Return visibilities and flags with the metadata of the template, and with nothing else."""
+    """Return visibilities and flags with the metadata of the template only."""
     from calstudy.base.visibilities import flag_cube, from_cube, to_cube
 
     found = from_cube(template, to_cube(uvd))
@@ -229,7 +211,7 @@ def _at(template: UVData, uvd: UVData) -> UVData:
 
 
 def _write(uvd: UVData, path: Path, single: bool) -> None:
-    """Write visibilities in the format that the path ends with; `single` stores complex64, as uvfits and ms always."""
+    """Write visibilities in the format of the path's suffix; `single` stores complex64, as uvfits and ms always do."""
     if path.is_dir():
         shutil.rmtree(path)
     path.unlink(missing_ok=True)

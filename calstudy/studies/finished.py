@@ -1,4 +1,4 @@
-"""Members of a collection that were run before, here or elsewhere: their tables come from their run folders."""
+"""Members of a collection that were run before, whose tables come from their run folders."""
 
 from __future__ import annotations
 
@@ -25,16 +25,10 @@ TABLES = "tables"
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The folder of a finished run, or a reference that keeps its tables.
+    """A finished run, or a reference with its tables.
 
-    Attributes
-    ----------
-    folder
-        Has ``manifest.json`` and ``tables/``.
-    manifest
-        Its content.
-    tables
-        Entries of the products whose files are its tables, by key.
+    The folder has ``manifest.json``, whose content is `manifest`, and ``tables/``. `tables` are the manifest's
+    entries, by key, of the products that these are made of.
     """
 
     folder: Path
@@ -43,11 +37,11 @@ class FinishedRun:
 
     @property
     def described(self) -> str:
-        """The folder, and when the run finished."""
+        """The folder, and the time when the run finished."""
         return f"{self.folder} (finished {self.manifest.get('finished', 'at an unknown time')})"
 
     def refusal(self, study: ExperimentStudy) -> str | None:
-        """Return why a study cannot be taken from this run, or None: its tables must be there, as they were written."""
+        """Return why a study cannot be taken from this run, or None if its tables are present and unchanged."""
         if not self.tables:
             return (
                 "its manifest does not list the files of its tables: it is of an older version, or not of an experiment"
@@ -63,12 +57,12 @@ class FinishedRun:
 
 
 def find_finished(folders: Sequence[Path]) -> list[FinishedRun]:
-    """Return the finished runs among these folders and directly below them; those that cannot be read are left out.
+    """Return the readable finished runs among these folders and directly below them.
 
     Raises
     ------
     InputError
-        If a folder neither is one nor holds any.
+        If a folder neither is one nor contains any.
     """
     found = []
     for folder in folders:
@@ -92,26 +86,17 @@ def _read(folder: Path) -> FinishedRun | None:
 
 
 def with_finished(collection: Study, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Collection:
-    """Return a collection whose members are taken from finished runs, as far as these are of the same study.
+    """Return a collection whose members are taken from finished runs of the same studies.
 
-    The tables of such a member are put into the store, and the member itself is not run again.
-
-    Parameters
-    ----------
-    collection
-        Its store gets the tables.
-    folders
-        Run folders or references, or folders that hold some.
-    console
-        Is told where each member comes from, and why a run of its name is left out.
-    planned
-        The store is only compared: nothing is put into it.
+    The tables of such a member are put into the store of the collection, and it is not run again. The console shows
+    the run of each member, and the reason why a run of its name is not used. With `planned`, the store does not
+    change.
 
     Raises
     ------
     InputError
-        If the study is not a collection, no member is found, the store has other results of a member, or it cannot be
-        written.
+        If the study is not a collection, no member is found, the store has other results of a member, or it cannot
+        be written.
     """
     if not isinstance(collection, Collection):
         raise InputError("--finished: only a collection (a file with the key 'experiments') takes members from runs")
@@ -139,7 +124,7 @@ def with_finished(collection: Study, folders: Sequence[Path], console: Console, 
 
 
 def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], console: Console) -> FinishedRun | None:
-    """Return the run that a member is taken from, or None; the console is told which, or why none."""
+    """Return the run that a member is taken from, or None; print the choice, or the reasons against it."""
     refusals = {run.folder: run.refusal(study) for run in runs}
     for run in runs:
         if refusals[run.folder] is None:
@@ -153,7 +138,7 @@ def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], cons
 
 
 def _needs_more(collection: Collection, name: str, study: Study) -> str | None:
-    """Return why tables are not all that a collection needs of a member, or None."""
+    """Return the reason why a collection needs more of a member than its tables, or None."""
     if not isinstance(study, ExperimentStudy):
         return "it has realizations; such members are always run"
     tables = {task.key for task in study.tables}
@@ -166,7 +151,7 @@ def _needs_more(collection: Collection, name: str, study: Study) -> str | None:
 
 
 def _put(task: Task, run: FinishedRun, store: Store) -> None:
-    """Put a table of a run into a store, under the key of the product that its files are."""
+    """Put a table of a run into a store, under the key of its product."""
     entry, stage = run.tables[task.key], task.stage.name
     store.prepare()
     with store.lock(stage, task.key), store.building(stage, task.key) as folder:
@@ -182,7 +167,7 @@ def _put(task: Task, run: FinishedRun, store: Store) -> None:
 
 
 def _require_same(there: Product, files: Mapping[str, str], run: FinishedRun, store: Store) -> None:
-    """Raise InputError if a table of the store is not the one of a run: two runs of a study differ by rounding."""
+    """Raise InputError if a table of the store differs from that of a run: two runs of a study differ by rounding."""
     found = {name: file["sha256"] for name, file in there.record["files"].items()}
     other = next((name for name in {**files, **found} if files.get(name) != found.get(name)), None)
     if other is not None:

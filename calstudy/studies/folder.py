@@ -1,4 +1,4 @@
-"""Run folders: what a run leaves for people, written whole or not at all, never in a folder that holds other files."""
+"""Run folders: each file is written completely or not at all, never into a folder with files of other origin."""
 
 from __future__ import annotations
 
@@ -28,24 +28,15 @@ POINTS, CASES = "points", "cases"
 
 
 def run_folder(runs: Path, name: str, content: Any) -> Path:
-    """Return the folder of a study's runs: its name and a digest of all that it says.
+    """Return the folder of a study's runs: its name and a digest of its JSON-able content.
 
-    The same study has the same folder; a changed one never overwrites it.
-
-    Parameters
-    ----------
-    runs
-        Folder of run folders.
-    name
-        Of the study.
-    content
-        JSON-able: what decides its results.
+    The same study has the same folder; a changed study never overwrites it.
     """
     return runs.expanduser().resolve() / f"{name}-{digest_json(content)[:8]}"
 
 
 def open_folder(folder: Path) -> None:
-    """Make a run folder, or refuse one that holds what no run wrote; raises InputError."""
+    """Make a run folder; raises InputError if it contains files that are not from a run."""
     results = {"report.html", "figures", "tables", POINTS, CASES, "regression.json"}
     known = results | {MANIFEST, EXPERIMENT, LOG, *CLAIMS_FILES}
     try:
@@ -62,15 +53,15 @@ def open_folder(folder: Path) -> None:
 
 
 class _LogFile(logging.FileHandler):
-    """A log whose disk may be full: the run says so itself, and not with a traceback for each line."""
+    """A log file whose write errors print no traceback for each line: a full disk is reported by the run itself."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Leave the line out."""
+        """Omit the line."""
 
 
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """Append what calstudy logs, and warnings, to a file; and at the end how the block ended, with the exit status."""
+    """Append the log of calstudy, warnings, and finally the outcome of the block with its exit status, to a file."""
     handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root, package = logging.getLogger(), logging.getLogger("calstudy")
@@ -96,21 +87,21 @@ def log_to(path: Path) -> Iterator[None]:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove files that a killed run was writing; those of the last minute may be those of another run."""
+    """Remove partial files of a killed run, except those of the last minute, which may belong to another run."""
     for path in folder.rglob(".*"):
         if LEFTOVER.fullmatch(path.name) and time.time() - path.stat().st_mtime > 60:
             path.unlink(missing_ok=True)
 
 
 def write(path: Path, text: str) -> None:
-    """Write a text file so that it is there whole or not at all."""
+    """Write a text file completely or not at all."""
     partial = path.with_name(f".{path.name}-{uuid4().hex}")
     partial.write_text(text, encoding="utf-8")
     partial.replace(path)
 
 
 def publish(products: list[Product], folder: Path) -> None:
-    """Copy the files of products into a folder of the run, each whole or not at all."""
+    """Copy the files of products into a folder of the run, each completely or not at all."""
     folder.mkdir(exist_ok=True)
     for product in products:
         for name in product.record["files"]:
@@ -122,14 +113,7 @@ def publish(products: list[Product], folder: Path) -> None:
 def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
     """Write manifest.json: the fields of a study, with time, commit, versions and machine.
 
-    Parameters
-    ----------
-    folder
-        Run folder.
-    name
-        Of the study.
-    fields
-        What the study says itself; it may replace the machine.
+    The fields may replace the machine.
     """
     manifest = {
         "name": name,
@@ -156,26 +140,17 @@ def _as_json(manifest: Mapping[str, Any]) -> str:
 RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_bytes", "started", "inputs", "lineage")
 """Fields of a product's record that a manifest repeats."""
 MADE_WITH = ("made_with", "git_commit", "processor", "libraries")
-"""The same for products of other code."""
+"""Further fields for products of other code."""
 
 
 def product_entries(
     tasks: Sequence[Task], products: Mapping[str, Product], made: Sequence[Task], tables: Sequence[Task] = ()
 ) -> list[dict[str, Any]]:
-    """Return what a manifest says of every product: what it was made from, what it took, and by which run.
+    """Return the manifest's entry of every product: its inputs, its cost, and the run that made it.
 
-    A product that is of other code or other versions of packages than the run has what it was made with.
-
-    Parameters
-    ----------
-    tasks
-        Whose products.
-    products
-        By key; tasks without one are left out.
-    made
-        The tasks whose products this run made.
-    tables
-        The tasks whose files are the tables of the run folder. Their entries have the SHA-256 of each file.
+    Products of other code or other package versions than the run's also have these versions. Tasks without a product
+    are omitted; `made` are the tasks whose products this run made. The entries of `tables`, whose files are the
+    tables of the run folder, have the SHA-256 of each file.
     """
     keys, published = {task.key for task in made}, {task.key for task in tables}
     other = of_other_code(tasks, {task.key: products[task.key] for task in tasks if task.key in products})

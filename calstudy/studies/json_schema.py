@@ -23,7 +23,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 def experiment_schema() -> str:
     """Return the JSON schema of experiments, collections, comparisons, run-time studies and measured data as text.
 
-    Quantities are strings there; units and what depends on several fields are checked by ``calstudy plan`` alone.
+    It has strings for quantities; only ``calstudy plan`` checks units and conditions on several fields.
     """
     kinds: dict[type[BaseModel], str] = {
         CollectionFile: collection.KEY,
@@ -42,7 +42,7 @@ def experiment_schema() -> str:
 
 
 def _plain(block: Any) -> Any:
-    """Return a schema without the titles that pydantic makes of names, and without defaults of whole blocks."""
+    """Return a schema without the titles that pydantic derives from names, and without defaults of whole blocks."""
     if isinstance(block, list):
         return [_plain(item) for item in block]
     if not isinstance(block, dict):

@@ -16,26 +16,26 @@ from calstudy.studies.sweep import expand
 
 
 def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Study:
-    """Read an experiment, a sweep, a collection, a comparison, a run-time study or measured data, as the file says.
+    """Read an experiment, a sweep, a collection, a comparison, a run-time study or measured data.
 
     Parameters
     ----------
     path
-        The YAML file, or the name of a published one, such as ``quickstart``. One with the key `experiments` is a
-        collection, one with `calibrators` a comparison, one with `runtime` a run-time study, one with `observed` is
-        about measured data, an experiment with the key `sweep` is the family of its points, and one with `realizations`
-        all its realizations.
+        The YAML file, or the name of a published one, such as ``quickstart``. A file with the key `experiments` is a
+        collection, with `calibrators` a comparison, with `runtime` a run-time study, with `observed` one of measured
+        data. An experiment with the key `sweep` is the family of its points, with `realizations` all its
+        realizations.
     scale
         Name of a set of overrides in the file's `scales`.
     overrides
-        ``path=value`` texts, applied after the scale; those of a collection go to every member.
+        ``path=value`` texts, applied after the scale; those of a collection are applied to every member.
 
     Raises
     ------
     InputError
         If a file cannot be read, or a scale or override cannot be applied.
     ExperimentError
-        If fields are unknown, missing, or hold values that are not allowed.
+        If fields are unknown, missing, or have values that are not allowed.
     """
     path = find_experiment(path)
     data = read_mapping(path)

@@ -1,4 +1,4 @@
-"""Measured data as a study: calibration, power spectra of data and residual, and what an injected signal loses."""
+"""Measured data as a study: calibration, power spectra of data and residual, and signal loss of an injected EoR."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_fo
 from calstudy.studies.study import Budget, Made, Study
 
 KEY = "observed"
-"""The key that makes a file one about measured data."""
+"""Key that marks a file of measured data."""
 DEFAULT_FIGURES = ("observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)
 
 
 class ObservedOutputs(Section):
-    """What is drawn, and where products and run folders go."""
+    """Figures, and the folders of products and runs."""
 
     figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] | None = (
         Field(None, description="Figures of measured data; null: all.")
@@ -54,7 +54,7 @@ class ObservedOutputs(Section):
 
 
 class ObservedFile(Section):
-    """Measured data: what is calibrated and how, and what is measured of it."""
+    """Measured data: their selection, calibration and power spectra, and an injected signal."""
 
     name: StudyName
     description: str = ""
@@ -81,15 +81,7 @@ class ObservedFile(Section):
 
 
 class ObservedStudy(Study):
-    """Measured data.
-
-    Parameters
-    ----------
-    file
-        What the file says.
-    halves
-        What is known of the data from their metadata.
-    """
+    """A study of measured data, from its file and the metadata of the two halves."""
 
     def __init__(self, file: ObservedFile, halves: Halves) -> None:
         self.file, self.halves = file, halves
@@ -103,7 +95,7 @@ class ObservedStudy(Study):
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
-        """What the units of the power spectra rest on."""
+        """Assumptions about the units of the power spectra."""
         scale = self.file.observed.flux_scale
         if scale is None or scale.kind == "factor":
             return ()
@@ -111,7 +103,7 @@ class ObservedStudy(Study):
 
     @property
     def folder(self) -> Path:
-        """The run folder: the name, and a digest of what the file says but for where results go."""
+        """The run folder: the name, and a digest of the content of the file without output paths."""
         outputs = self.file.outputs.reset("store", "runs")
         return run_folder(
             self.outputs.runs, self.name, identity(self.file.model_copy(update={"outputs": outputs}).reset("scales"))
@@ -120,8 +112,8 @@ class ObservedStudy(Study):
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the study itself and the number of workers.
 
-        Raises InputError if the beam or the memory do not do, the calibrator refuses the data, or they are too few for
-        a search for interference.
+        Raises InputError if a beam cannot be made, the memory is too small, the calibrator refuses the data, or they
+        are too few for a search for interference.
         """
         section = self.file.observed
         if section.flag_interference is not None:
@@ -138,7 +130,7 @@ class ObservedStudy(Study):
 
     @cached_property
     def shown(self) -> list[ObservedFigure]:
-        """The figures asked for."""
+        """The requested figures."""
         figures = self.file.outputs.figures
         if figures is None:
             names = DEFAULT_FIGURES + (INJECTION_FIGURES if self.file.injection else ())
@@ -147,7 +139,7 @@ class ObservedStudy(Study):
 
     @cached_property
     def figures(self) -> list[Task]:
-        """Their tasks."""
+        """Tasks of the figures."""
         return [observed_task(figure, self.graph, self.stand_ins) for figure in self.shown]
 
     @cached_property
@@ -179,7 +171,7 @@ class ObservedStudy(Study):
 def load_observed(
     path: Path, data: Mapping[str, Any], scale: str | None = None, overrides: Sequence[str] = ()
 ) -> ObservedStudy:
-    """Validate the content of a file about measured data, and read the metadata of these.
+    """Validate the content of a file of measured data, and read their metadata.
 
     Parameters and errors are as for `calstudy.studies.load.load_study`.
     """
@@ -202,7 +194,7 @@ def load_observed(
 
 
 def _halves(file: ObservedFile) -> Halves:
-    """Return what the metadata tell of the halves; raises InputError if they cannot be calibrated or crossed."""
+    """Return the halves of the data from their metadata; raises InputError if they cannot be calibrated or crossed."""
     section = file.observed
     selection = section.select.selection
     try:

@@ -1,4 +1,4 @@
-"""Checks that need more than the settings: positions of antennas, beam files; made before anything heavy starts."""
+"""Checks that need antenna positions or beam files, before any long computation starts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def require_beams(instrument: InstrumentSettings) -> None:
 
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
-    """Return sentences on settings that are allowed, and hardly meant."""
+    """Return sentences on settings that are allowed, but probably a mistake."""
     return tuple(note for note in (_needless_limit(experiment), _long_average(experiment)) if note)
 
 
@@ -72,10 +72,10 @@ def _long_average(experiment: Experiment) -> str:
 
 
 def _catalogue_depth(foregrounds: Foregrounds) -> int | None:
-    """Return how many of the brightest sources are kept if their number decides, not the flux limit; else None."""
+    """Return the number of kept sources if it is limited by their count, not by the flux limit; else None."""
     if not isinstance(foregrounds, SyntheticSources) or foregrounds.count is None:
         return None
-    # Several standard deviations of what is drawn, and of the cosmic scatter of the bright ones.
+    # Several standard deviations of the number drawn, and of the cosmic scatter of bright sources.
     surely = 0.8 * expected_sources(foregrounds.flux_limit) - 100
     return foregrounds.count if surely > foregrounds.count else None
 
@@ -92,9 +92,9 @@ def require_calibration(experiment: Experiment) -> None:
 
 
 def refusal_of_calibrator(experiment: Experiment) -> str:
-    """Return why the calibrator cannot work on the antennas, baselines and channels of an experiment, or nothing.
+    """Return the reason why the calibrator cannot work on the data of an experiment, or an empty text.
 
-    Raises InputError for an array that cannot be made: that is no refusal of a calibrator.
+    Raises InputError for an array that cannot be made, because the calibrator does not refuse it.
     """
     make_array(experiment.instrument)
     try:
@@ -105,7 +105,7 @@ def refusal_of_calibrator(experiment: Experiment) -> str:
 
 
 def _require_calibrators(experiment: Experiment) -> None:
-    """Raise InputError if the calibrator of a data set refuses it; as a rule all data sets have the same."""
+    """Raise InputError if the calibrator of any data set refuses it; usually all data sets have the same calibrator."""
     graph = Graph(experiment)
     asked: list[Calibrator] = []
     for variant in experiment.variants.values():
@@ -141,7 +141,7 @@ def _require_same_antennas(true: Layout, assumed: Layout) -> None:
 
 
 def frame_of(instrument: InstrumentSettings) -> Frame:
-    """Return antennas, baselines and channels of an instrument's data, which have no autocorrelations."""
+    """Return antennas, baselines and channels of an instrument's data, without autocorrelations."""
     layout, channels = make_layout(instrument.layout), instrument.channels
     order = np.argsort(layout.numbers)
     places = np.argsort(order)

@@ -1,4 +1,4 @@
-"""Realizations: one experiment with several draws of the EoR, the gains or the noise, pooled, as a study."""
+"""Realizations: one experiment with several draws of the EoR, the gains or the noise, pooled."""
 
 from __future__ import annotations
 
@@ -28,13 +28,8 @@ from calstudy.studies.study import Budget, Made, Study
 class Realizations(Study):
     """An experiment whose EoR, gains or noise are drawn several times.
 
-    Products that several realizations need have one key, and are one product; the first realization is the experiment
+    Products that several realizations need have one key, and are made once. The first realization is the experiment
     itself, and shares its products with the experiment's own run.
-
-    Parameters
-    ----------
-    experiment
-        Validated, with `realizations`.
 
     Raises
     ------
@@ -66,12 +61,12 @@ class Realizations(Study):
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """What a plan says of settings that are allowed, and hardly meant."""
+        """Notes of a plan on settings that are allowed, but probably a mistake."""
         return notes_of(self.experiment)
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
-        """What is used in place of the papers' own ingredients."""
+        """Substitutions for the papers' own ingredients."""
         return stand_ins(self.experiment)
 
     @cached_property
@@ -86,7 +81,7 @@ class Realizations(Study):
 
     @cached_property
     def claims(self) -> Task | None:
-        """The statements of the papers that the experiment names, where realizations measure them, or None."""
+        """The statements of the experiment's papers that realizations measure, or None."""
         return claims(self.graph, self.stand_ins)
 
     @property

@@ -1,4 +1,4 @@
-"""The reference of all fields of an experiment file, written from the schema itself."""
+"""The reference of all fields of an experiment file, generated from the schema."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ def _blocks(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _registry(info: FieldInfo) -> Registry[Any] | None:
-    """Return the registry of the things that a field holds, one or a list of them; None for other fields."""
+    """Return the registry of the plug-ins in a field, one or a list of them; None for other fields."""
     items = [data for item in get_args(info.annotation) for data in getattr(item, "__metadata__", ())]
     return next((data.registry for data in [*info.metadata, *items] if isinstance(data, PluginField)), None)
 
 
 def _unit(info: FieldInfo) -> str | None:
-    """Return the unit of a physical quantity, also where it may be null instead; None for other fields."""
+    """Return the unit of a physical quantity, even if the field may be null; None for other fields."""
     fields = [info, *(data for item in get_args(info.annotation) for data in getattr(item, "__metadata__", ()))]
     extras = [field.json_schema_extra for field in fields if isinstance(field, FieldInfo)]
     return next((str(extra["unit"]) for extra in extras if isinstance(extra, dict) and "unit" in extra), None)
 
 
 def _kind(info: FieldInfo) -> str:
-    """Write what a field takes: its choices, its unit, or its type."""
+    """Describe the values of a field: its choices, its unit, or its type."""
     if (unit := _unit(info)) is not None:
         return f"quantity in {unit}"
     words = []
@@ -98,14 +98,14 @@ def _plain_section(model: type[BaseModel]) -> Iterator[str]:
 
 
 def _section(model: type[BaseModel], path: str, listed: dict[str, str]) -> Iterator[str]:
-    """Write a block and all blocks in it; `listed` has the path under which each kind of thing was listed before."""
+    """Write a block and all blocks in it; `listed` has the path under which each kind of plug-in was listed before."""
     yield from _plain_section(model)
     for name, info in model.model_fields.items():
         yield from _blocks_of(info, f"{path}.{name}" if path else name, listed)
 
 
 def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[str]:
-    """Write the block or blocks that a field takes; nothing for a field that takes none."""
+    """Write the blocks that a field accepts; nothing for other fields."""
     blocks = _blocks(info.annotation)
     if (registry := _registry(info)) is not None:
         yield from (f"## `{path}`: {'one' if blocks else 'a list, each'} of", "")
@@ -125,7 +125,7 @@ def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[s
 
 
 def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iterator[str]:
-    """Write all things of a kind, those of installed packages included; blocks that several share are written once."""
+    """Write all plug-ins of a kind, with those of installed packages; blocks that several share are written once."""
     if registry.noun in listed:
         yield from (f"See `{listed[registry.noun]}`.", "")
         return
@@ -152,12 +152,12 @@ def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iter
 
 
 def plugin_reference(path: Path) -> str:
-    """Return the reference, as Markdown, of the calibrators, figures and the like that a Python file holds.
+    """Return the Markdown reference of the plug-ins (calibrators, figures and others) in a Python file.
 
     Raises
     ------
     InputError
-        If the file cannot be run, or holds none.
+        If the file cannot be run, or contains none.
     """
     module = load_file(path)
     found = [
@@ -178,7 +178,7 @@ def plugin_reference(path: Path) -> str:
 
 
 def field_reference() -> str:
-    """Return the reference as Markdown: every section, field, unit, default and what it means."""
+    """Return the reference as Markdown: every section, field, unit, default and meaning."""
     listed: dict[str, str] = {}
     lines = [
         "# Experiment files",

@@ -1,4 +1,4 @@
-"""Run-time studies: arrays of growing size on which the solvers' steps are timed, one after the other."""
+"""Run-time studies: the solvers' steps are timed on arrays of growing size, one after the other."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_fo
 from calstudy.studies.study import Budget, Made, Study
 
 KEY = "runtime"
-"""The key that makes a file a run-time study."""
+"""Key that marks a file as a run-time study."""
 
 
 def _require_increasing(sizes: Sequence[float]) -> None:
@@ -83,7 +83,7 @@ class Line(Section):
 
 
 class SampleCounts(Section):
-    """How often each thing is timed, for every array."""
+    """Number of samples of each measurement, for every array."""
 
     steps: int = Field(200, ge=10, description="Single steps of the paper's solver.")
     calls: int = Field(20, ge=3, description="Calls of our Adamax, of 50 compiled steps each; their means are samples.")
@@ -128,7 +128,7 @@ class RuntimeSettings(Section):
 
 
 class RuntimeOutputs(Section):
-    """Where products and run folders go."""
+    """Folders of products and runs."""
 
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
@@ -156,13 +156,7 @@ TIMED_WITH = ("tensorflow", "numpy", "scipy")
 
 
 class RuntimeStudy(Study):
-    """Run times of solvers on this machine.
-
-    Parameters
-    ----------
-    file
-        What the file says.
-    """
+    """Run times of solvers on this machine."""
 
     def __init__(self, file: RuntimeFile) -> None:
         self.file = file
@@ -170,7 +164,7 @@ class RuntimeStudy(Study):
 
     @cached_property
     def timed_on(self) -> Mapping[str, Any]:
-        """What the measurements belong to: part of their keys, so that those of another machine are not taken for them.
+        """The machine and versions of packages, part of the keys, so that other machines' measurements are not reused.
 
         Raises InputError if TensorFlow is not installed, or the file wants a GPU and this machine has none.
         """
@@ -186,17 +180,17 @@ class RuntimeStudy(Study):
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
-        """Nothing: run times need no sky."""
+        """No substitutions: run times need no sky."""
         return ()
 
     @property
     def folder(self) -> Path:
-        """The run folder: the name, and a digest of what the file says and of the machine."""
+        """The run folder: the name, and a digest of the file's content and of the machine."""
         content = {**self.file.model_dump(mode="json", exclude={"outputs", "scales"}), "machine": self.timed_on}
         return run_folder(self.outputs.runs, self.name, content)
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
-        """Return the study itself and one worker; raises InputError for what would spoil or exceed the machine."""
+        """Return the study and one worker; raises InputError for other workers, or too little memory."""
         if budget.scheduler is not None or budget.workers not in (None, 1):
             raise InputError(
                 "--workers and --scheduler: run times are measured on this machine, one after the other; leave both out"
@@ -228,7 +222,7 @@ class RuntimeStudy(Study):
 
     @cached_property
     def arrays(self) -> dict[str, tuple[str, float, TimedArray]]:
-        """What is timed: panel, size, and the array, by a name that sorts."""
+        """Panel, size and array of every measurement, by a name that sorts."""
         settings = self.file.runtime
         rows = {f"rows-{count:05d}": ("rows", float(count), self._rows(count)) for count in settings.rows.antennas}
         line = {f"line-{length:09.3f}": ("line", float(length), self._line(length)) for length in settings.line.lengths}
@@ -256,7 +250,7 @@ class RuntimeStudy(Study):
 
     @cached_property
     def descent(self) -> Task:
-        """How the paper's solver approaches the minimum."""
+        """The task of the descent of the paper's solver to the minimum."""
         descent = self.file.runtime.descent
         settings = {
             "array": self._rows(descent.antennas),

@@ -1,4 +1,4 @@
-"""Scores of calibrators as files, and the page that ranks them."""
+"""Files of scores of calibrators, and the page that ranks them."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from calstudy.verdicts.tables import Table, one_line, plain_text
 
 LOG = "score.log"
 VERIFIED = "verified.txt"
-"""Lines of a SHA-256 of a file of scores, and who scored its gains or program again; kept by who keeps the page."""
+"""File of the page's maintainer: lines of the SHA-256 of a file of scores, and who repeated its scoring."""
 Label = Annotated[str, StringConstraints(pattern=r"^[\w(][\w.,:;()+\-−±%=°'² ]*$", max_length=80)]
-"""Letters, digits, spaces and common signs in one line, which mean nothing in Markdown or HTML."""
+"""One line of letters, digits, spaces and common signs without a meaning in Markdown or HTML."""
 Measured = Annotated[float, Field(ge=-1e30, le=1e30)] | None
 Positive = Annotated[float, Field(ge=0, le=1e30)] | None
 
 
 class _Band(Section):
-    """Scores in a band of k, h/Mpc; None where they are not known. What else a file says of it is left out."""
+    """Scores in a band of k, h/Mpc, None if not known; other content of a file is ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -90,16 +90,8 @@ class _Summary(Section):
 class Row(Section):
     """The scores of one calibrator in one world.
 
-    Attributes
-    ----------
-    world, calibrator
-        Their labels.
-    digest
-        Of the data and the sky model of the world, as in the manifest of an export.
-    scoring
-        Digest of how spectra and scores are measured (`scoring_of`).
-    scores
-        As in score.json.
+    `digest` is that of the data and the sky model of the world, as in the manifest of an export; `scoring` that of
+    the definition of spectra and scores (`scoring_of`).
     """
 
     world: Label
@@ -123,18 +115,10 @@ class Row(Section):
 
 
 class Scores(Section):
-    """What a file of scores holds.
+    """Content of a file of scores.
 
-    Attributes
-    ----------
-    calstudy
-        Version that measured them.
-    name
-        Of the experiment or comparison.
-    rows
-        World by world.
-    refusals
-        World, calibrator, and why it cannot work there.
+    `calstudy` is the version that measured them. Rows are ordered by world; a refusal has world, calibrator and
+    reason.
     """
 
     calstudy: str
@@ -144,19 +128,14 @@ class Scores(Section):
 
 
 def scoring_of(experiment: Experiment) -> str:
-    """Return a digest of how T and bias are measured: settings of the power spectra, and a version."""
+    """Return a digest of the definition of T and bias: settings of the power spectra, and a version."""
     return digest_json([identity(experiment.power), MEASURED])
 
 
 def measure_scores(study: Comparison, budget: Budget, console: Console) -> Scores:
-    """Return the scores of all cases of a comparison, making what is not in the store.
+    """Return the scores of all cases of a comparison, and make products that are missing in the store.
 
-    Parameters
-    ----------
-    study
-        From `calstudy.studies.worlds.load_worlds`.
-    budget, console
-        As for `calstudy.studies.study.run_study`.
+    The study comes from `calstudy.studies.worlds.load_worlds`.
     """
     for label in {study.name, *(label for case in study.cases for label in (case.world, case.calibrator))}:
         _require_label(label)
@@ -192,7 +171,7 @@ def _require_label(label: str) -> None:
 
 
 def tables(scores: Scores) -> dict[str, Table]:
-    """Return a table for each world, as the comparison of calibrators has it."""
+    """Return a table for each world, as in the comparison of calibrators."""
     worlds = dict.fromkeys(row.world for row in scores.rows)
     return {
         world: score_table({row.calibrator: row.scores for row in scores.rows if row.world == world})
@@ -201,7 +180,7 @@ def tables(scores: Scores) -> dict[str, Table]:
 
 
 def read_scores(path: Path) -> Scores:
-    """Read a file of scores; raises InputError if it is none."""
+    """Read a file of scores; raises InputError if it is not one."""
     try:
         return Scores.model_validate_json(path.read_bytes())
     except OSError as error:
@@ -217,7 +196,7 @@ def _first(error: ValidationError) -> str:
 
 @dataclass(frozen=True)
 class _Standing:
-    """How a row is ranked: how many bands count, and the mean T in them; or the bias, if none does."""
+    """The rank of a row: the number of bands that count, and the mean T in them, or the bias if none counts."""
 
     clean: int
     bands: int
@@ -231,7 +210,7 @@ class _Standing:
             known = None not in (band["bias"], band["bias_error"], band["transfer"], band["transfer_error"])
             limit = upper_limit(band["bias"], band["bias_error"]) if known else float("inf")
             limits.append(limit)
-            # No calibration leaves more than all of the signal, or less than none.
+            # No calibration can leave more than the whole signal, or less than nothing.
             if limit < COUNTS and -band["transfer_error"] <= band["transfer"] <= 1 + band["transfer_error"]:
                 kept.append(band["transfer"])
         return cls(len(kept), len(limits), sum(kept) / len(kept) if kept else 0.0, min(limits))
@@ -246,12 +225,7 @@ class _Standing:
 
 
 def leaderboard(folder: Path) -> str:
-    """Return a page (Markdown) that ranks all scores of a folder.
-
-    Parameters
-    ----------
-    folder
-        Of files from `calstudy score --output`.
+    """Return a page (Markdown) that ranks all files of `calstudy score --output` in a folder.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Show what a run would do, and what it did, as tables."""
+"""Tables of the work that a run would do, and of its results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from calstudy.studies.study import Budget, Run, Study, said_of_other_code
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
 
 NAMED = 8
-"""A plan of more run folders counts those beyond."""
+"""Number of run folders that a plan names; it counts the others."""
 
 
 def _by_stage(tasks: Sequence[Task]) -> dict[str, list[Task]]:
@@ -38,16 +38,7 @@ def _gigabytes(count: float) -> str:
 
 
 def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[str, Any]:
-    """Return what a run would make and take, as plain JSON types; seconds on one core, and bytes.
-
-    Parameters
-    ----------
-    study
-        What is planned.
-    budget
-        Workers and memory.
-    strict
-        As for `calstudy.studies.study.run_study`.
+    """Return the products and the cost of a run as plain JSON types; seconds on one core, and bytes.
 
     Raises
     ------
@@ -131,7 +122,7 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
 
 
 def sites(tasks: Sequence[Task]) -> list[str]:
-    """Return in words where the arrays of simulations are, once each."""
+    """Name the sites of the arrays of simulations, once each."""
     from calstudy.instrument.sites import describe
 
     instruments = [task.settings["instrument"] for task in tasks if "instrument" in task.settings]
@@ -150,7 +141,7 @@ def _show_total(plan: Mapping[str, Any], console: Console) -> None:
 
 
 def show_run(run: Run, console: Console) -> None:
-    """Print what a run and its parts made, what they warn of, where the results are, and what became of the claims."""
+    """Print products, warnings and folders of a run and its parts, and the counts of the claims."""
     for name, part in run.parts.items():
         console.print(f"\n{name}", markup=False)
         _show_products(part, console)
@@ -194,7 +185,7 @@ def _show_products(run: Run, console: Console) -> None:
 
 
 def _show_signal(folder: Path, console: Console) -> None:
-    """Print T and bias of a run, and a warning if more than the EoR is left besides it; nothing for other runs."""
+    """Print T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
     signal = read_signal(folder)
     if signal is None:
         return
@@ -205,7 +196,7 @@ def _show_signal(folder: Path, console: Console) -> None:
 
 
 def _show_criteria(folder: Path, console: Console) -> None:
-    """Print which criteria on the realizations of an experiment hold; nothing for other runs."""
+    """Print the verdicts on the criteria for the realizations of an experiment; nothing for other runs."""
     path = folder / "tables" / VERDICTS
     if path.is_file():
         verdicts = from_json(path.read_text(encoding="utf-8"))
@@ -216,7 +207,7 @@ def _show_criteria(folder: Path, console: Console) -> None:
 
 
 def _show_claims(folder: Path, console: Console) -> None:
-    """Print the counts of claims of a run, which are contradicted, and where all are; nothing without claims."""
+    """Print the counts of claims of a run, the contradicted ones, and the file of all; nothing without claims."""
     path = folder / CLAIMS_JSON
     verdicts = from_json(path.read_text(encoding="utf-8")) if path.is_file() else []
     for verdict in verdicts:

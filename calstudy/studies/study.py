@@ -1,4 +1,4 @@
-"""What a file can ask for, and the one way in which all of it is run: make its products, then fill its folders."""
+"""The interface of studies, and the one way in which all are run: make the products, then fill the folders."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Budget:
-    """What a run may take.
+    """Resources of a run.
 
     Attributes
     ----------
     workers
-        Wanted number of worker processes, or None for one per core as far as the memory goes.
+        Number of worker processes, or None for one per core within the memory.
     max_memory
-        What all workers together may take, such as "6 GB", or None for what is free now.
+        Memory of all workers together, such as "6 GB", or None for all free memory.
     scheduler
-        Address of a running dask scheduler, whose memory is not looked at, or None.
+        Address of a running dask scheduler, whose memory is not checked, or None.
     """
 
     workers: int | None = None
@@ -46,21 +46,17 @@ class Budget:
 
 @dataclass(frozen=True)
 class Made:
-    """What making the products of a study gave.
+    """Products of a study.
 
-    Attributes
-    ----------
-    products
-        By key: those that were made or looked at, and all others behind them that are still in the store.
-    tasks
-        The tasks whose products were made; the others were in the store.
+    `products`, by key, are those that were made or looked up, and all others behind them that are still in the
+    store. `tasks` are those whose products were made; the others were in the store.
     """
 
     products: Mapping[str, Product]
     tasks: tuple[Task, ...]
 
     def of(self, tasks: Sequence[Task]) -> Made:
-        """Return the part that belongs to some tasks."""
+        """Return the products of some tasks."""
         keys = {task.key for task in tasks}
         products = {key: product for key, product in self.products.items() if key in keys}
         return Made(products, tuple(task for task in self.tasks if task.key in keys))
@@ -73,13 +69,13 @@ class Run:
     Attributes
     ----------
     folder
-        Holds the resolved file, the manifest, the log, figures and tables.
+        Contains the resolved file, the manifest, the log, figures and tables.
     made
         Its products.
     tasks
-        All tasks whose products the run made or looked at.
+        All tasks whose products the run made or looked up.
     parts
-        Runs that it consists of, with folders of their own, by name.
+        Runs of its parts, with their own folders, by name.
     """
 
     folder: Path
@@ -89,7 +85,7 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """What the stages warn of, with the product that it is about."""
+        """Warnings of the stages, with the product concerned."""
         records = [product.record for product in self.made.products.values()]
         return [
             f"{record['stage']} ({record['label']}): {text}"
@@ -99,7 +95,7 @@ class Run:
 
 
 class Folders(Protocol):
-    """Where a study puts what it makes."""
+    """Folders of the products and of the runs of a study."""
 
     @property
     def store(self) -> Path:
@@ -111,7 +107,7 @@ class Folders(Protocol):
 
 
 class Study(ABC):
-    """What a file asks for: an experiment, a sweep, realizations, a collection, a run-time study.
+    """The content of a file: an experiment, a sweep, realizations, a collection, a run-time study and others.
 
     A new kind is a subclass, with the key of its files in `calstudy.studies.load`.
     """
@@ -131,12 +127,12 @@ class Study(ABC):
     @property
     @abstractmethod
     def targets(self) -> Sequence[Task]:
-        """The products that a run is for; the others are made on the way."""
+        """Products that a run makes for its user; the others are made on the way."""
 
     @property
     @abstractmethod
     def stand_ins(self) -> tuple[str, ...]:
-        """What is used in place of the papers' own ingredients; printed with the results."""
+        """Substitutions for the papers' own ingredients, printed with the results."""
 
     @property
     @abstractmethod
@@ -145,26 +141,26 @@ class Study(ABC):
 
     @property
     def parts(self) -> Mapping[str, Study]:
-        """Studies that it consists of, which get run folders of their own, by name."""
+        """Studies of which this one consists, with their own run folders, by name."""
         return {}
 
     @abstractmethod
     def fill(self, made: Made) -> None:
-        """Put what was asked for into the run folder: figures, tables, claims, manifest, the file itself."""
+        """Write figures, tables, claims, the manifest and the file itself to the run folder."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a plan says of settings that are allowed, and hardly meant; of the study and of its parts, once each."""
+        """Notes of a plan on settings that are probably a mistake, of the study and its parts, once each."""
         return tuple(dict.fromkeys(note for part in self.parts.values() for note in part.notes))
 
     @cached_property
     def tasks(self) -> list[Task]:
-        """All tasks, once each, every one after what it needs."""
+        """All tasks, once each, every one after its inputs."""
         return unique(self.targets)
 
     @property
     def given(self) -> frozenset[str]:
-        """Keys of products that are not made by a run of this study, though it needs them."""
+        """Keys of products that a run of this study needs but does not make."""
         return frozenset()
 
     @property
@@ -188,22 +184,10 @@ def fitted_parts(parts: Mapping[str, S], budget: Budget) -> dict[str, tuple[S, i
 
 
 def make(targets: Sequence[Task], store: Store, workers: Workers, console: Console, strict: bool = False) -> Made:
-    """Make products and all that they need, as far as it is not in the store, and report the progress.
+    """Make the products that are missing in the store with all their inputs, and report the progress.
 
-    A store that can only be read serves if it holds everything.
-
-    Parameters
-    ----------
-    targets
-        What is wanted.
-    store
-        Where products are.
-    workers
-        Who makes them.
-    console
-        Where the progress is written.
-    strict
-        Whether products of other code or other versions of packages are made again, and not used.
+    A read-only store is sufficient if nothing is missing. With `strict`, products of other code or other package
+    versions are made again.
 
     Raises
     ------
@@ -248,7 +232,7 @@ def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) ->
 
 
 def run_study(study: Study, budget: Budget | None = None, console: Console | None = None, strict: bool = False) -> Run:
-    """Make what a study asks for, reusing every product that is in the store.
+    """Make all products of a study that are missing in the store, and fill its run folder.
 
     Parameters
     ----------
@@ -257,9 +241,9 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
     budget
         Workers and memory.
     console
-        Where progress is written; nowhere if None.
+        Console for the progress; None for no output.
     strict
-        Whether products of other code or other versions of packages are made again, and not used.
+        If true, products of other code or other versions of packages are made again.
 
     Raises
     ------

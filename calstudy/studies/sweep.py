@@ -1,4 +1,4 @@
-"""Sweeps: the family of experiments that one file makes by varying some of its fields, as a study."""
+"""Sweeps: a family of experiments made from one file by varying some of its fields."""
 
 from __future__ import annotations
 
@@ -31,16 +31,10 @@ MOST_POINTS = 250
 
 @dataclass(frozen=True)
 class Point:
-    """One experiment of a family.
+    """One experiment of a family, validated and without the sweep.
 
-    Attributes
-    ----------
-    label
-        Names its folder: its number, and what was changed.
-    changes
-        The varied fields (dotted path) and their values as text, as written in the file.
-    experiment
-        Validated, without the sweep.
+    The label, which names its folder, has its number and the changes: the varied fields (dotted path) and their
+    values as text, as written in the file.
     """
 
     label: str
@@ -51,14 +45,8 @@ class Point:
 class Sweep(Study):
     """A family of experiments.
 
-    Products that several points need have one key, and are one product.
-
-    Parameters
-    ----------
-    base
-        The experiment whose fields are varied.
-    blocks
-        The points of each block of the file's `sweep`: all combinations of its values, the last field fastest.
+    Products that several points need have one key, and are made once. A block of the file's `sweep` has all
+    combinations of its values as points, with the last field varying fastest.
     """
 
     def __init__(self, base: Experiment, blocks: Sequence[Sequence[Point]]) -> None:
@@ -97,7 +85,7 @@ class Sweep(Study):
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
-        """What the experiment whose fields are varied uses in place of the papers' own ingredients."""
+        """Substitutions of the varied experiment for the papers' own ingredients."""
         return stand_ins(self.base)
 
     @cached_property
@@ -191,7 +179,7 @@ def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str
 
 
 def _point(plain: Mapping[str, Any], changes: Mapping[str, Any], label: str) -> Point | list[str]:
-    """Return one point, or what is wrong with it."""
+    """Return one point, or its faults."""
     texts = {path: text_of(value) for path, value in changes.items()}
     words = ", ".join(f"{path} = {text}" for path, text in texts.items())
     try:
@@ -208,14 +196,14 @@ def _point(plain: Mapping[str, Any], changes: Mapping[str, Any], label: str) -> 
 
 
 def text_of(value: Any) -> str:
-    """Write a value of a sweep for a person: text as it is, blocks as ``key value``."""
+    """Write a value of a sweep for people: text unchanged, blocks as ``key value``."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {text_of(item)}" for key, item in value.items())
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def varied_fields(block: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Return the fields of a block that take several values; the first if none does."""
+    """Return the fields of a block that have several values; the first if none has."""
     return [path for path, values in block.items() if len(values) > 1] or list(block)[:1]
 
 

@@ -1,4 +1,4 @@
-"""The worlds of a file, an experiment each: those of a comparison, or the one of an experiment."""
+"""The worlds of a file, one experiment each: those of a comparison, or the one of an experiment."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ def load_worlds(
 
     Parameters
     ----------
-    path, scale, overrides
-        As for `calstudy.studies.load.load_study`.
     calibrators
-        Blocks `calibration` by label, in place of those of the file. What an experiment assumes, they assume as well.
-        None for the file's own; that of an experiment has its own name as label.
+        Blocks `calibration` by label, in place of those of the file, with the assumptions of the experiment. None
+        for the file's own; that of an experiment has its own name as label.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Numbers held against criteria: thresholds, verdicts, statements of a paper, and the tables that list them."""
+"""Criteria for numbers: thresholds, verdicts, statements of a paper, and tables of them."""

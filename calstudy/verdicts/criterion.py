@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 Outcome = Literal["PASS", "FAIL", "supported", "contradicted", "undecided", "not evaluated"]
-"""PASS and FAIL are for limits of our own; the three after them for what others state."""
+"""PASS and FAIL are for limits of our own; the next three are for statements of others."""
 Kind = Literal["error", "scatter", "at least", "at most"]
 
 
@@ -23,7 +23,7 @@ class Finding(NamedTuple):
         One standard deviation, or the scatter that the quantity names.
     kind
         "error" if `uncertainty` is the standard deviation of the number; "scatter" if it is that of the values whose
-        median the number is; "at least" or "at most" if the number is a bound of what was to be measured.
+        median the number is; "at least" or "at most" if the number is a bound of the measured quantity.
     """
 
     value: float
@@ -32,22 +32,22 @@ class Finding(NamedTuple):
 
 
 class Threshold(Protocol):
-    """The condition on a measured number, from `low` to `high`, by `sigmas`; `str` puts it into words."""
+    """Interface of conditions on a measured number, from `low` to `high`, by `sigmas`; `str` gives the words."""
 
     @property
     def low(self) -> float:
-        """The least number that meets it."""
+        """Smallest number that meets it."""
 
     @property
     def high(self) -> float:
-        """The largest number that meets it."""
+        """Largest number that meets it."""
 
     @property
     def sigmas(self) -> float:
-        """How many uncertainties a number is to be within it, or, of a single value, may be off."""
+        """Number of uncertainties by which a number must be within it or, for a single value, may deviate."""
 
     def holds(self, finding: Finding) -> bool:
-        """Return whether the number meets it."""
+        """Return true if the number meets it."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Within:
     sigmas: ClassVar[float] = 0.0
 
     def holds(self, finding: Finding) -> bool:
-        """Return whether the value is in the interval."""
+        """Return true if the value is in the interval."""
         return self.low <= finding.value <= self.high
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ class AtLeast:
         return self.bound
 
     def holds(self, finding: Finding) -> bool:
-        """Return whether the value is that far above the bound."""
+        """Return true if the value is that far above the bound."""
         return finding.value - self.sigmas * finding.uncertainty >= self.bound
 
     def __str__(self) -> str:
@@ -101,7 +101,7 @@ class AtMost:
         return self.bound
 
     def holds(self, finding: Finding) -> bool:
-        """Return whether the value is that far below the bound."""
+        """Return true if the value is that far below the bound."""
         return finding.value + self.sigmas * finding.uncertainty <= self.bound
 
     def __str__(self) -> str:
@@ -126,7 +126,7 @@ class Equal:
         return self.target
 
     def holds(self, finding: Finding) -> bool:
-        """Return whether the value is that close to the target."""
+        """Return true if the value is that close to the target."""
         return abs(finding.value - self.target) <= self.sigmas * finding.uncertainty
 
     def __str__(self) -> str:
@@ -142,27 +142,25 @@ class Verdict:
     name
         Short and unique.
     section, sentence
-        Where the sentence stands that is tested, and the sentence.
+        The tested sentence, and its section.
     quantity
-        What is measured, in words.
+        The measured quantity, in words.
     measured, uncertainty
         The number and its uncertainty; None if there is none.
     threshold, why
-        The condition that the number must meet, and why that condition.
-    verdict
-        Whether it meets it.
+        The condition for the number, and the reason for it.
     runs
         Names of the runs that it was measured on.
     reason
         Why there is no number, or empty.
     kind
-        What number and uncertainty are, as in `Finding`.
+        Meaning of number and uncertainty, as in `Finding`.
     smallest_effect
-        Of an undecided statement: how far from what it says the number would have to be for the data to show it.
+        Of an undecided statement: the smallest distance of the number from it that the data could show.
     sentence_id
-        Of the paper's sentence to which a statement belongs, maybe with others; empty for criteria of our own.
+        Id of the paper's sentence, which may have several statements; empty for criteria of our own.
     tests_simulation
-        Whether no calibration is in the number, so that it tests the simulated data alone.
+        True if the number does not depend on a calibration, so that it tests the simulated data alone.
     """
 
     name: str
@@ -194,7 +192,7 @@ class Criterion:
     why: str
 
     def judge(self, finding: Finding, runs: Sequence[str] = ()) -> Verdict:
-        """Return the verdict on a measured number; one that is not finite is not evaluated."""
+        """Return the verdict on a measured number, which is "not evaluated" if the number is not finite."""
         if not (math.isfinite(finding.value) and math.isfinite(finding.uncertainty)):
             return self.unevaluated("the measured number is not finite", runs)
         return self._verdict(finding, self.outcome(finding), runs, "")

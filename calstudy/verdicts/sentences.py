@@ -1,4 +1,4 @@
-"""The sentences of papers: what the verdicts on the statements that belong to each say together, and their counts."""
+"""Outcomes of the sentences of papers from the verdicts on their statements, and their counts."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Iterable, Sequence
 from calstudy.verdicts.criterion import Verdict
 
 OUTCOMES = ("supported", "contradicted", "mixed", "undecided", "not evaluated")
-"""Of a sentence; a statement is never mixed."""
+"""Outcomes of a sentence; a statement is never mixed."""
 
 
 def outcomes_of_sentences(verdicts: Iterable[Verdict]) -> dict[str, str]:
-    """Return the outcome of each sentence by its id, statements on the simulation alone left out.
+    """Return the outcome of each sentence by its id, without statements on the simulation alone.
 
-    It is that of its statements that were evaluated, and "mixed" where these differ.
+    It is that of its evaluated statements, and "mixed" if these differ.
     """
     found: dict[str, set[str]] = {}
     for verdict in verdicts:
@@ -29,13 +29,13 @@ def _together(outcomes: set[str]) -> str:
 
 
 def counts(outcomes: Iterable[str]) -> str:
-    """Count outcomes in words, those that there are: ``3 supported, 1 mixed``."""
+    """Count the outcomes that occur, in words: ``3 supported, 1 mixed``."""
     found = Counter(outcomes)
     return ", ".join(f"{found[outcome]} {outcome}" for outcome in OUTCOMES if found[outcome])
 
 
 def tally_of_sentences(verdicts: Sequence[Verdict]) -> str:
-    """Count sentences and statements in one line, and apart those statements that test the simulation alone."""
+    """Count sentences and statements in one line, and separately the statements that test the simulation alone."""
     sentences = outcomes_of_sentences(verdicts)
     parts = []
     for simulated, about in ((False, ""), (True, " on the simulation alone")):

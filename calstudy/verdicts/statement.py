@@ -12,7 +12,7 @@ from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, 
 SIGMAS = 2.0
 """Half the width of a 95 % interval, in standard deviations."""
 LAST_DIGIT = 1e-9
-"""Of that half width: less is rounding."""
+"""Fraction of that half width below which a difference is rounding."""
 
 
 class Unevaluated(Exception):
@@ -29,11 +29,11 @@ class Sentence:
 
 @dataclass(frozen=True)
 class Statement(Criterion):
-    """A sentence of a paper, and how to measure it.
+    """A sentence of a paper, and the function that measures it.
 
-    It is supported where the 95 % interval of the number lies within the threshold, contradicted where it lies outside,
-    and undecided where it has parts of both. A bound is an interval that is open to one side. The scatter of values is
-    no error of their median, and widens the interval only by the sigmas of the threshold.
+    It is supported if the 95 % interval of the number lies within the threshold, contradicted if it lies outside,
+    and undecided if it has parts of both. A bound is an interval that is open to one side. The scatter of values is
+    not an error of their median, and widens the interval only by the sigmas of the threshold.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Statement(Criterion):
     sentence_id, tests_simulation
         As in `Verdict`.
     pooled
-        Measures the number on runs that pool realizations, or None if it is one of single runs alone.
+        Measures the number on runs that pool realizations, or None if it exists only for single runs.
     """
 
     roles: tuple[str, ...]
@@ -62,14 +62,14 @@ class Statement(Criterion):
             high = math.inf
         elif finding.kind == "at most":
             low = -math.inf
-        # An interval that ends at a limit does so whatever the last digit.
+        # An interval that ends at a limit does not depend on rounding.
         least, most, digit = self.threshold.low, self.threshold.high, LAST_DIGIT * self._margin(finding)
         if least <= low + digit and high - digit <= most:
             return "supported"
         return "contradicted" if high < least - digit or low > most + digit else "undecided"
 
     def _margin(self, finding: Finding) -> float:
-        """Return how far the interval reaches on either side of the number."""
+        """Return the half width of the interval around the number."""
         sigmas = self.threshold.sigmas
         return finding.uncertainty * (sigmas if finding.kind == "scatter" else max(sigmas, SIGMAS))
 
@@ -84,14 +84,9 @@ class Statement(Criterion):
         )
 
     def evaluate(self, runs: Mapping[str, Any], roles: Mapping[str, str]) -> Verdict:
-        """Measure it, or say why it cannot be.
+        """Return the verdict on runs, which have a `name`, by the roles that they play.
 
-        Parameters
-        ----------
-        runs
-            The runs by the roles that they play; each has a `name`.
-        roles
-            Which run can play each role, in words.
+        It is "not evaluated" if a role is not played; the reason contains the description of the role in `roles`.
         """
         missing = [roles[role] for role in self.roles if role not in runs]
         if missing:
@@ -105,16 +100,9 @@ class Statement(Criterion):
 
 @dataclass(frozen=True)
 class Source:
-    """The section of a paper that statements stand in, and what they are about.
+    """The section of a paper with some statements, and the roles of their runs.
 
-    Attributes
-    ----------
-    section
-        Of the paper.
-    roles
-        Of the runs.
-    tests_simulation
-        As in `Verdict`.
+    `tests_simulation` is as in `Verdict`.
     """
 
     section: str
@@ -135,15 +123,15 @@ class Source:
         Parameters
         ----------
         sentence
-            Of the paper, as it stands there; a `Sentence` if other statements belong to it, too.
+            The sentence of the paper; a `Sentence` if it has several statements.
         quantity
-            What is measured, in words.
+            The measured quantity, in words.
         threshold
-            What it must be.
+            The condition for it.
         why
-            Why this threshold.
+            The reason for this threshold.
         roles
-            Of the runs that the function takes; by default those of the source.
+            Roles of the runs that the function takes; by default those of the source.
         pooled
             As in `Statement`.
         """

@@ -29,26 +29,19 @@ COLOURS = {
     "moved": "yellow",
     "beyond": "bold red",
 }
-"""Of verdicts, and of comparisons with a reference, on the terminal."""
+"""Terminal colours of verdicts, and of comparisons with a reference."""
 CLAIMS_JSON, CLAIMS_MARKDOWN = "claims.json", "claims.md"
 BY_SOLVER_JSON, BY_SOLVER_MARKDOWN = "claims-by-solver.json", "claims-by-solver.md"
 CLAIMS_FILES = (CLAIMS_JSON, CLAIMS_MARKDOWN, BY_SOLVER_JSON, BY_SOLVER_MARKDOWN)
 LARGE = 1e5
-"""Numbers beyond this have an exponent."""
+"""Numbers above this are written with an exponent."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts.
+    """A table of texts; each row has as many cells as there are headings.
 
-    Attributes
-    ----------
-    headings
-        Of the columns.
-    rows
-        As many cells each.
-    title
-        Printed above it on the terminal.
+    The title is printed above it on the terminal only.
     """
 
     headings: Sequence[str]
@@ -56,7 +49,7 @@ class Table:
     title: str = ""
 
     def show(self, console: Console, numbers: bool = True) -> None:
-        """Print it; with `numbers`, all columns but the first are aligned to the right. Outcomes have their colours."""
+        """Print it with coloured outcomes; with `numbers`, all columns but the first are aligned to the right."""
         table = TerminalTable(title=escape(self.title), title_justify="left")
         for index, heading in enumerate(self.headings):
             table.add_column(heading, justify="right" if index and numbers else "left", overflow="fold")
@@ -72,13 +65,13 @@ class Table:
 
 
 def plain_text(text: str) -> str:
-    """Return a text in one line, without tags and entities of HTML; its Markdown is left."""
+    """Return a text in one line, without tags and entities of HTML but with its Markdown."""
     text = "".join(letter if letter.isprintable() else " " for letter in text)
     return re.sub(r"&(?=#?\w+;)", "&amp;", re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text))
 
 
 def one_line(text: str) -> str:
-    """Return a text of others for a page: one line, at most 1000 characters, nothing that Markdown or HTML reads."""
+    """Return a text of others as one line of at most 1000 characters, without HTML and with Markdown escaped."""
     return re.sub(r"([\\`*_\[\]|!#~]|:(?=//))", r"\\\1", plain_text(text[:1000])).strip()
 
 
@@ -88,7 +81,7 @@ def coloured(text: str) -> str:
 
 
 def number(value: float, uncertainty: float | None = None) -> str:
-    """Write a number with three digits, or with its uncertainty and as many digits as that leaves meaning to."""
+    """Write a number with three digits, or with its uncertainty and the digits that are significant for it."""
     if not uncertainty:
         return f"{value:.3g}"
     places = min(15, max(0, 1 - math.floor(math.log10(uncertainty))))
@@ -98,7 +91,7 @@ def number(value: float, uncertainty: float | None = None) -> str:
 
 
 def measured(verdict: Verdict) -> str:
-    """Write the measured number and its uncertainty, or why there is none; and what would have been seen."""
+    """Write the number and its uncertainty with the smallest visible effect, or the reason why there is no number."""
     if verdict.measured is None:
         return verdict.reason
     text = number(verdict.measured, verdict.uncertainty)
@@ -108,7 +101,7 @@ def measured(verdict: Verdict) -> str:
 
 
 def visible(smallest_effect: float) -> str:
-    """Write the smallest effect that would have been seen."""
+    """Write the smallest effect that the data could have shown."""
     return f"smallest effect seen {smallest_effect:.2g}"
 
 
@@ -118,7 +111,7 @@ def count(words: Sequence[str], kinds: Iterable[str]) -> str:
 
 
 def tally(verdicts: Sequence[Verdict]) -> str:
-    """Count outcomes in one line: of statements by the sentences of their papers, of limits of our own one by one."""
+    """Count outcomes in one line: statements by the sentences of their papers, limits of our own one by one."""
     if any(verdict.sentence_id for verdict in verdicts):
         return tally_of_sentences(verdicts)
     return count([verdict.verdict for verdict in verdicts], LIMIT_OUTCOMES)
@@ -152,18 +145,8 @@ def to_markdown(
 ) -> str:
     """Return verdicts as a Markdown document, one table per section.
 
-    Parameters
-    ----------
-    verdicts
-        In order; those of one section together.
-    title
-        Of the document.
-    headings
-        What the first two columns hold, names and sentences.
-    summary
-        The line below the title; the tally by default.
-    notes
-        What stands in for the paper's own ingredients.
+    Verdicts of one section must be consecutive. The headings are those of names and sentences, the summary (by
+    default the tally) is the line below the title, and the notes are substitutions for the paper's own ingredients.
     """
     lines = [f"# {title}", "", summary or tally(verdicts), ""]
     lines += [f"Stand-in: {note}." for note in notes] + ([""] if notes else [])
@@ -198,16 +181,9 @@ def show_verdicts(
     heading: str = "claim",
     summary: str | None = None,
 ) -> None:
-    """Print verdicts as a table, and after it those that were not evaluated, by what they lack.
+    """Print verdicts as a table, and then those that were not evaluated, by their missing inputs.
 
-    Parameters
-    ----------
-    verdicts, title, summary
-        As for `to_markdown`.
-    console
-        Where it is written.
-    heading
-        What the first column holds.
+    The heading is that of the first column; the summary is as for `to_markdown`.
     """
     heading_line = escape(f"{title}: {summary or tally(verdicts)}")
     table = TerminalTable(title=heading_line, title_justify="left", show_lines=True, expand=True)
@@ -234,20 +210,10 @@ def write_claims(
     notes: Sequence[str] = (),
     without_role: Sequence[str] = (),
 ) -> None:
-    """Write the verdicts on a paper's statements to claims.json and claims.md in a folder.
+    """Write the verdicts on a paper's statements to claims.json and claims.md in an existing folder.
 
-    Parameters
-    ----------
-    verdicts
-        On the statements.
-    folder
-        Must exist.
-    title
-        Name of the run.
-    notes
-        What stands in for the paper's own ingredients.
-    without_role
-        Sentences on why there are no verdicts on a paper, written below the table.
+    The notes are substitutions for the paper's own ingredients; the sentences of `without_role`, reasons why papers
+    have no verdicts, are written below the table.
     """
     (folder / CLAIMS_JSON).write_text(to_json(verdicts) + "\n", encoding="utf-8")
     summary = None if verdicts else "No claims."
@@ -262,20 +228,10 @@ RESULT = ("measured", "uncertainty", "kind", "smallest_effect", "verdict", "runs
 def write_claims_by_solver(
     columns: Mapping[str, Sequence[Verdict]], folder: Path, title: str, notes: Sequence[str] = ()
 ) -> None:
-    """Write the verdicts on the same statements with several solvers side by side.
+    """Write the verdicts on the same statements with several solvers to claims-by-solver.json and claims-by-solver.md.
 
-    A statement that could be evaluated with none of them is left out.
-
-    Parameters
-    ----------
-    columns
-        Verdicts by solver, on the same statements in the same order.
-    folder
-        Must exist; gets claims-by-solver.json and claims-by-solver.md.
-    title
-        Name of the study.
-    notes
-        What stands in for the paper's own ingredients.
+    The verdicts of each solver are on the same statements in the same order. A statement that could not be evaluated
+    with any solver is left out.
     """
     rows = [row for row in zip(*columns.values(), strict=True) if any(item.measured is not None for item in row)]
     found = []
@@ -297,7 +253,7 @@ def write_claims_by_solver(
 
 
 def _differing(rows: Iterable[Sequence[Verdict]]) -> list[str]:
-    """Return the names of the statements that were evaluated with every solver and do not have the same verdict."""
+    """Return the names of the statements that were evaluated with every solver and have different verdicts."""
     evaluated = (row for row in rows if all(item.measured is not None for item in row))
     return [row[0].name for row in evaluated if len({item.verdict for item in row}) > 1]
 

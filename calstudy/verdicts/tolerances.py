@@ -1,8 +1,8 @@
-"""How far the arrays of a figure may be from the reference: tolerances by figure and array, each with its reason.
+"""Tolerances of the arrays of a figure against a reference, by figure and array, each with its reason.
 
-A result that is made again with the same seeds and the same code is the same to rounding. It moves when a library
-draws other random numbers, a solver stops elsewhere, or a model changes. What depends on draws or on where a solver
-stops may move by its error bars, as another draw would; all else may not move at all.
+A result made again with the same seeds and the same code is equal to rounding. It changes when a library draws other
+random numbers, a solver stops elsewhere, or a model changes. Arrays that depend on draws or on the end of a solver
+may change by their error bars, as another draw would; all others may not change at all.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 
 Arrays = Mapping[str, np.ndarray]
 ROUNDING = 1e-6
-"""Part of an array's largest magnitude that counts as rounding: products are stored in single precision."""
+"""Fraction of an array's largest magnitude that counts as rounding: products are stored in single precision."""
 
 
 @dataclass(frozen=True)
 class Fixed:
-    """The same in every run: numbers and texts that count or name exactly, all others to rounding."""
+    """Equal in every run: integers and texts exactly, all other values to rounding."""
 
     why: str
 
@@ -30,22 +30,22 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Another draw may stand in its place: compared in units of the error of a difference of two draws, √2 σ.
+    """May change to another draw: compared in units of the error of a difference of two draws, √2 σ.
 
     Attributes
     ----------
     error
-        From the reference arrays and the array's name to the standard deviation σ of each of its elements (of the real
-        part, if they are complex), in a shape that broadcasts.
+        Function of the reference arrays and the array's name that returns the standard deviation σ of each element
+        (of the real part, if they are complex), in a shape that broadcasts.
     why
-        What the error bar is.
+        Description of the error bar.
     largest
-        The element that is farthest may be so many σ off.
+        Largest deviation of an element, σ.
     rms
-        The root mean square of the deviations may be so many σ.
+        Largest root mean square of the deviations, σ.
     shift
-        Their mean may be so many of its own standard errors, as if the elements were independent; what moves all of
-        an array the same way shows here first.
+        Largest mean deviation in its own standard errors, as if the elements were independent; a common shift of the
+        whole array shows here first.
     """
 
     error: Callable[[Arrays, str], np.ndarray]
@@ -60,7 +60,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Measured:
-    """Depends on the machine: changes are reported, and none is a failure."""
+    """Depends on the machine: changes are reported, but are never a failure."""
 
     why: str
 
@@ -70,7 +70,7 @@ class Measured:
 
 Tolerance = Fixed | Drawn | Measured
 Rules = tuple[tuple[str, Tolerance], ...]
-"""Patterns of array names with their tolerance; the first that matches counts."""
+"""Patterns of array names with their tolerance; the first that matches is used."""
 
 
 def _parent(name: str) -> str:
@@ -84,7 +84,7 @@ def _root_mean_square(values: np.ndarray) -> np.ndarray:
 
 
 def rms_of(sibling: str) -> Callable[[Arrays, str], np.ndarray]:
-    """Return an error: the rms of the array beside this one that is in the same domain, such as ``noise.values``."""
+    """Return an error function: the rms of another array in the same domain, such as ``noise.values``."""
 
     def error(arrays: Arrays, name: str) -> np.ndarray:
         return _root_mean_square(arrays[f"{sibling}.{name.rpartition('.')[2]}"])
@@ -99,12 +99,12 @@ def departure_from_mean(arrays: Arrays, name: str) -> np.ndarray:
 
 
 def scatter_of_noise(arrays: Arrays, name: str) -> np.ndarray:
-    """Return the error of an rms over time of delay transforms: that of the noise, whose true one is flat in delay."""
+    """Return the error of an rms over time of delay transforms, that of noise with a flat expectation in delay."""
     return np.asarray(np.std(arrays[f"{_parent(name)}.noise"]))
 
 
 def spherical_error(arrays: Arrays, name: str) -> np.ndarray:
-    """Return σ_N + σ_S, and the noise's cross power with whatever else is in the spectrum."""
+    """Return σ_N + σ_S plus the error from the noise's cross power with all other components of the spectrum."""
     series = _parent(name)
     noise, sample = arrays[f"{series}.noise_error"], arrays[f"{series}.sample_error"]
     modes = arrays[f"{series}.noise_modes"]
@@ -124,19 +124,19 @@ def cylindrical_error(arrays: Arrays, name: str) -> np.ndarray:
 
 
 def own_error(arrays: Arrays, name: str) -> np.ndarray:
-    """Return the array that is named as the error of this one."""
+    """Return the error array that belongs to this array by its name."""
     return arrays[f"{name}_error"]
 
 
 def spread_of_scale(arrays: Arrays, name: str) -> np.ndarray:
-    """Return by how much the flux scale of one sky and array differs between noise realizations, 0.3 %."""
+    """Return the scatter of the flux scale of one sky and array between noise realizations, 0.3 %."""
     return np.full(np.shape(arrays[name]), 3e-3)
 
 
 def typical_error(arrays: Arrays, name: str) -> np.ndarray:
     """Return the error bars of a map, or their median over delays where that is larger.
 
-    Those of a bin with a single baseline come from two samples, and are often far too small by chance.
+    The error bars of a bin with a single baseline come from two samples, and are often far too small by chance.
     """
     errors = arrays[f"{name.removesuffix('_error')}_error"]
     counted = np.where(np.isfinite(errors), errors, np.nan)
@@ -159,7 +159,7 @@ SPHERICAL_RULES: Rules = (
     (r".*\.power", Drawn(spherical_error, "noise + sample variance, and noise x foregrounds")),
     (r".*\.(noise|sample)_error", ERROR_OF_ERROR),
 )
-"""For figures of spherical power spectra."""
+"""Tolerances for figures of spherical power spectra."""
 COORDINATES = re.compile(
     r"(.*\.)?(delay|frequency|k|k_perp|k_parallel|bin_edges|baseline_length|horizon_delay|antennas|numbers|enu|highlight)"
 )
@@ -169,17 +169,7 @@ MACHINE = Measured("times depend on the machine")
 
 
 def tolerance(rules: Rules, name: str, reference: Arrays) -> Tolerance:
-    """Return how far an array of a figure may be from its reference.
-
-    Parameters
-    ----------
-    rules
-        Of the figure.
-    name
-        Of the array.
-    reference
-        All reference arrays of the figure.
-    """
+    """Return the tolerance of an array of a figure, by the figure's rules and all its reference arrays."""
     if any(rule is MACHINE for _, rule in rules):
         return MACHINE
     if COORDINATES.fullmatch(name):

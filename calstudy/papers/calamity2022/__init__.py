@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from calstudy.verdicts.statement import Statement
 
 REDUNDANT_FROM = 0.5
-"""An array is redundant if this part of its baselines has a redundant partner."""
+"""Fraction of baselines with a redundant partner from which an array is redundant."""
 PAPER_WIDTH = 80e3
-"""Of a channel, Hz."""
+"""Width of a channel, Hz."""
 EOR_LEVEL = -40.0
-"""Of the foregrounds, dB of brightness."""
+"""Level of the EoR relative to the foregrounds, dB of brightness."""
 NOISE_FACTORS = {"times-eor": 10.0, "times-foregrounds": 0.1}
 SAME_NOISE = 0.1
-"""A run of fewer integrations has the paper's noise if, averaged over all of them, it is that close to the paper's."""
+"""Largest relative difference of the noise, averaged over all integrations, from the paper's in a run of fewer ones."""
 PAPER_RATE, PAPER_STEPS = 0.01, 10_000
 LEAST_STEPS = 1000
-"""First-order steps below which foregrounds are hardly fitted: the paper's solver takes thousands."""
+"""First-order steps below which foregrounds are not fitted: the paper's solver takes thousands."""
 NOT_THE_METHOD = ("calibrator", "solver", "weights", "chunks", "models_at_once")
 """Fields of a calibrator whose defaults are not the paper's, or need not be."""
 
@@ -86,10 +86,10 @@ class Calamity2022(Paper):
         return [item for module in modules for item in vars(module).values() if isinstance(item, Statement)]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return which setting of an experiment is not that of the role, or None if all are.
+        """Return in words an unsuitable setting of an experiment for a role, or None.
 
-        Defaults of experiments are the paper's values, but for the weights. Antennas, channels, integrations and
-        sources may be fewer, and what replaces the sky and the beam is written with the results.
+        Defaults of experiments are the paper's values, except for the weights. Antennas, channels, integrations and
+        sources may be fewer, and substitutions for the sky and the beam are written with the results.
         """
         if role == "run_time":
             return "an experiment measures no run times"
@@ -107,7 +107,7 @@ class Calamity2022(Paper):
         return _other_solver(experiment) if found is None and role != study else found
 
     def refusal_of_run(self, role: str, results: RunResults | PooledResults) -> str | None:
-        """Return which setting of a run, or which property of its array, is not that of the role, or None."""
+        """Return in words an unsuitable setting of a run, or property of its array, for a role, or None."""
         refusal, study = self.refusal(role, results.experiment), _study(role)
         if refusal is not None or study == "low_snr":
             return refusal
@@ -131,7 +131,7 @@ def _study(role: str) -> str:
 
 
 def _changed(section: BaseModel, path: str, free: tuple[str, ...] = ()) -> str | None:
-    """Return in words which field of a section is not the paper's, that is its default; None if all others are."""
+    """Return in words a field of a section that is not the paper's, which is its default; None if all others are."""
     written = section.model_dump(mode="json")
     for name, field in type(section).model_fields.items():
         value, papers = getattr(section, name), field.get_default(call_default_factory=True)
@@ -211,7 +211,7 @@ def _too_few_steps(role: str, experiment: Experiment) -> str | None:
 
 
 def _other_solver(experiment: Experiment) -> str | None:
-    """Return what is not as in the authors' code: fixed rate, last gains, and its steps or its rule to stop."""
+    """Return a refusal of a solver unlike the authors' code: fixed rate, last gains, steps or rule to stop."""
     solver = _solver(experiment)
     papers = ("adamax", PAPER_RATE, "constant")
     if not isinstance(solver, FirstOrderSettings) or (solver.name, solver.learning_rate, solver.schedule) != papers:

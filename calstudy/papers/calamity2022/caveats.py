@@ -1,4 +1,4 @@
-"""Claims on what limits the method (paper §Caveats and Limitations)."""
+"""Claims on the limits of the method (paper §Caveats and Limitations)."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ QUARTER = 0.25
 QUADRATIC, LINEAR, CONSTANT = (Within(power - QUARTER, power + QUARTER) for power in (2, 1, 0))
 QUARTER_WHY = "the exponent, to a quarter"
 HUNDREDS = 300
-"""Antennas that stand for hundreds, as the text has it."""
+"""Number of antennas for the text's "hundreds"."""
 MINUTES = AtMost(600)
 MINUTES_WHY = "ten minutes are still minutes"
 THOUSANDS_OF_ANTENNAS = 3000
@@ -25,7 +25,7 @@ HALF_ORDER = 10**0.5
 
 
 def _paper_solve(run: RunTimes, antennas: int) -> Finding:
-    """Return the seconds that the paper's solver takes on the GPU for so many antennas; a bound if its steps are."""
+    """Return the seconds of the paper's solver on the GPU for so many antennas; a bound if its steps are."""
     law, steps = run.scaling("rows", "paper-step", device="gpu"), run.steps_to("0.01")
     return steps._replace(value=steps.value * float(law.at(antennas)))
 

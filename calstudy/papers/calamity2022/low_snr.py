@@ -17,13 +17,13 @@ from calstudy.verdicts.statement import Sentence, Source, Unevaluated
 LOW_SNR = Source("The Low Signal-to-Noise regime", ("low_snr",))
 SIMULATED = replace(LOW_SNR, tests_simulation=True)
 WIDTH = 2
-"""The reflection is looked for within this many standard deviations of its mean delay."""
+"""Half-width of the range of the reflection, in standard deviations of its delay."""
 TENFOLD = Within(10**0.5, 10**1.5)
 TENFOLD_WHY = "≈ 10, to half an order of magnitude"
 
 
 def reflection_bins(run: RunResults, spectrum: SphericalSpectrum) -> np.ndarray:
-    """Return the bins of k, (Nk,) bool, that the delays of the reflections fall into; raises Unevaluated if none."""
+    """Return the bins of k, (Nk,) bool, of the delays of the reflections; raises Unevaluated if there are none."""
     gains = run.experiment.corruption.gains
     if not isinstance(gains, ReflectionGains):
         raise Unevaluated("the gains have no reflections")
@@ -32,7 +32,7 @@ def reflection_bins(run: RunResults, spectrum: SphericalSpectrum) -> np.ndarray:
 
 
 def _artefact(run: RunResults) -> float:
-    """Return the artefact over the noise of the average of all integrations."""
+    """Return the ratio of the artefact to the noise in the average of all integrations."""
     spectrum = run.spherical("uncalibrated", "outside-wedge")
     chosen = reflection_bins(run, spectrum)
     return float(np.max(spectrum.power.real[chosen] / spectrum.noise_error[chosen]))
@@ -65,9 +65,9 @@ def artefact_tenfold_above_noise_bars(run: RunResults) -> Finding:
 
 
 def _of_one_integration(run: RunResults) -> float:
-    """Return what the power of the noise is divided by in the coherent averages of blocks, and in that of their powers.
+    """Return the factor by which the coherent averages of blocks, and the average of their powers, reduce noise power.
 
-    The reflections are in phase in all integrations that are averaged, and their power stays.
+    The reflections are in phase in all averaged integrations, so that their power does not change.
     """
     times = run.experiment.instrument.times
     blocks = run.experiment.power.n_blocks(times.count * times.integration, times.integration)

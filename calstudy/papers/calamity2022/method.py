@@ -1,4 +1,4 @@
-"""Claims on the method itself: its basis, its degeneracies, its loss, and the data it is tested on."""
+"""Claims on the method itself: its basis, its degeneracies, its loss function, and its test data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FAR = 0.5
 """h/Mpc, far from the wedge of all baselines of the paper's arrays."""
 K_WINDOW = 0.2
 HUNDREDTH = 0.01
-"""Of the EoR: less is not counted as loss."""
+"""Fraction of the EoR below which a difference is not counted as loss."""
 
 VECTORS = Sentence(
     "number-of-vectors",

@@ -1,4 +1,4 @@
-"""Claims on the positive bias of the residual without EoR: at which k, and how large (paper §Simulation Results)."""
+"""Claims on the positive bias of the residual without EoR: its range of k, and its size (paper §Simulation Results)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SLIGHT = "a slight bias is lower than the EoR; so is none"
 
 
 def _above(k: float) -> float:
-    """Return the lowest wavenumber above this one: a bin belongs to one band only."""
+    """Return the lowest wavenumber above this one, because a bin belongs to one band only."""
     return float(np.nextafter(k, np.inf))
 
 

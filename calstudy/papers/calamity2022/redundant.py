@@ -30,7 +30,7 @@ REDUNDANT = Source("Performance on a Redundant Array", ("minimally_redundant", "
 SIMULATED = replace(REDUNDANT, tests_simulation=True)
 K_MIN = 0.2
 K_LOSS = 0.3
-"""Up to this wavenumber the paper sees more loss for the redundant array, h/Mpc."""
+"""Wavenumber up to which the paper sees more loss for the redundant array, h/Mpc."""
 NO_EFFECT = 0.05
 
 
@@ -169,7 +169,7 @@ def less_of_the_eor_below_0p3(minimal: RunResults, redundant: RunResults) -> Fin
 
 
 def _part_above(difference: np.ndarray, error: np.ndarray) -> Finding:
-    """Return which part of the differences is above zero beyond its 95 % error, with the binomial error."""
+    """Return the fraction of differences above zero beyond their 95 % errors, with the binomial error."""
     part = float(np.mean(difference > SIGMAS_95 * error))
     return Finding(part, float(np.sqrt(part * (1 - part) / difference.size)))
 

@@ -1,4 +1,4 @@
-"""What an experiment uses in place of the paper's own ingredients; printed wherever its results are shown."""
+"""Substitutions of an experiment for the paper's own ingredients, printed with all of its results."""
 
 from __future__ import annotations
 
@@ -51,5 +51,5 @@ def _scale(experiment: Experiment) -> str | None:
 
 
 def substitutions(experiment: Experiment) -> tuple[str, ...]:
-    """Return one short sentence per stand-in of the experiment, empty if all is as in the paper."""
+    """Return one short sentence per substitution of the experiment, empty if all ingredients are the paper's."""
     return tuple(note for note in (_sky(experiment), _beam(experiment), _scale(experiment)) if note)

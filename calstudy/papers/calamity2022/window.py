@@ -22,10 +22,10 @@ from calstudy.verdicts.criterion import AtLeast, AtMost, Equal, Finding, Within
 from calstudy.verdicts.statement import Sentence, Unevaluated
 
 K_AGREEMENT = 0.2
-"""The paper's P^R agrees with P^S beyond this, h/Mpc."""
+"""Wavenumber beyond which the paper's P^R agrees with P^S, h/Mpc."""
 K_BIAS = 0.25
 K_SMALL = 0.5
-"""The paper's 'small k values', h/Mpc: where the signal is and the noise is not all."""
+"""The paper's 'small k values', h/Mpc, where there is signal and not only noise."""
 MAIN_LOBE = 4
 """Half-width of the Blackman-Harris main lobe in units of 1 / bandwidth."""
 
@@ -337,7 +337,7 @@ def _better_than_taper(run: RunResults, modes: str) -> Finding:
     tapered, residual, signal = (run.spherical(name, modes) for name in ("uncorrupted", "residual", "eor"))
     used = used_bins(tapered, residual, signal, k_max=K_BIAS)
     errors = [np.sqrt(np.mean((item.power - signal.power).real[used] ** 2)) for item in (tapered, residual)]
-    # Of few bins a ratio is uncertain by a factor: in dB the errors are symmetric.
+    # The ratio of few bins is uncertain by a factor, so that errors are symmetric in dB.
     return Finding(float(10 * np.log10(errors[0] / errors[1])), float(10 / np.log(10) / np.sqrt(used.sum())))
 
 
