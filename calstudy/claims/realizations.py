@@ -37,7 +37,7 @@ class PooledResults:
     @classmethod
     def of(cls, experiment: Experiment, folder: Path) -> PooledResults:
         """Read the arrays from the folder of the figure."""
-        with np.load(folder / ARRAYS) as arrays:
+        with np.load(folder / ARRAYS, allow_pickle=False) as arrays:
             return cls(experiment, dict(arrays))
 
     @property

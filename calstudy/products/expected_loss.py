@@ -45,12 +45,14 @@ def linear_response(graph: Graph) -> Task | None:
     Calibrators must fit each integration by least squares and use the gains without smoothing. Spectra must be of each
     baseline with itself, because a fit responds differently on different baselines of a group.
     """
-    settings = graph.experiment.calibration
-    fits = isinstance(settings, GainFit) and settings.integrations_per_solve == 1 and settings.smooth_gains is None
+    fit = graph.experiment.calibration
+    fits = isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None
     if not fits or graph.experiment.power.pairs == "redundant-group":
         return None
     inputs = _inputs(graph) | {"signal": corruption.data(graph, Variant(components=("eor",)), "even")}
-    return Task(LINEAR_RESPONSE, "linear response to the EoR", _settings(graph), inputs)
+    settings = _settings(graph)
+    settings["power"] = settings["power"].reset("bins", "length_bin")
+    return Task(LINEAR_RESPONSE, "linear response to the EoR", settings, inputs)
 
 
 def _inputs(graph: Graph) -> dict[str, Task]:

@@ -132,8 +132,11 @@ def to_json(verdicts: Sequence[Verdict]) -> str:
 
 
 def from_json(text: str) -> list[Verdict]:
-    """Return the verdicts that `to_json` wrote."""
-    return [Verdict(**{**item, "runs": tuple(item["runs"])}) for item in json.loads(text)]
+    """Return the verdicts that `to_json` wrote; raises TypeError, KeyError or ValueError for other texts."""
+    items = json.loads(text)
+    if not isinstance(items, list):
+        raise TypeError(f"expected a list of verdicts, not {type(items).__name__}")
+    return [Verdict(**{**item, "runs": tuple(item["runs"])}) for item in items]
 
 
 def to_markdown(

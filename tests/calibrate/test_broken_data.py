@@ -251,7 +251,7 @@ REFUSALS: dict[str, tuple[Callable[[UVData], UVData], str]] = {
 SKIPPED: dict[str, tuple[Callable[[UVData], UVData], str]] = {
     "all flagged": (all_flagged, "every sample is flagged"),
     "all nan": (all_nan, "every sample is flagged"),
-    "zero": (zero, "the data are zero"),
+    "zero": (zero, "are exactly zero"),
 }
 HARMLESS = {
     "some nan": some_nan,

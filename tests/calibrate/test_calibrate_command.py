@@ -40,7 +40,7 @@ def command(monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(sys, "argv", ["calstudy", "calibrate", *map(str, arguments)])
         monkeypatch.chdir(tmp_path)
         with pytest.raises(SystemExit) as end:
-            cli.main()
+            cli.main(leave=sys.exit)
         return end.value.code, capsys.readouterr().err
 
     return run

@@ -89,7 +89,7 @@ def test_fields_lists_it(reference, tmp_path, capsys, monkeypatch):
     from calstudy.cli.main import main
 
     with pytest.raises(SystemExit):
-        main()
+        main(leave=sys.exit)
     listed = capsys.readouterr().out
     assert "KnownGains" in listed if reference.endswith(".py") else "{calibrator: known-gains}" in listed
     assert "| `max_length` | quantity in m | `1e+06 m` | Longer baselines are refused. |" in listed

@@ -60,4 +60,5 @@ def test_an_example_is_short_and_runs(title, tmp_path, shared_store):
     run = run_study(load_study(path), Budget(workers=1))
     assert (run.folder / "report.html").is_file()
     # Seven antennas determine their gains so badly that single precision may not reach the minimum; solves say so.
-    assert [warning for warning in run.warnings if "did not converge" not in warning] == []
+    said = ("did not converge", "where solves stall")
+    assert [warning for warning in run.warnings if not any(text in warning for text in said)] == []

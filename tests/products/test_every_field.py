@@ -41,6 +41,9 @@ OTHER: dict[str, list[Any]] = {
     "RadiometerNoise.seeds": [[5, 6]],
     "NoiseRelativeToEor.seeds": [[5, 6]],
     "NoiseRelativeToForegrounds.seeds": [[5, 6]],
+    "RadiometerNoise.seeds_without_eor": [[7, 8]],
+    "NoiseRelativeToEor.seeds_without_eor": [[7, 8]],
+    "NoiseRelativeToForegrounds.seeds_without_eor": [[7, 8]],
     "RadiometerNoise.effective_area": ["100 m2"],
     "Calibrator.assumed": [{"sky": {"foregrounds": {"count": 5}}}],
     "GainFit.gain_delay": ["500 ns"],
@@ -84,8 +87,8 @@ NOT_TRIED = {
     "must be null where foregrounds are fitted": "tried with other calibrators",
 }
 """Blocks that are not tried, by what they are refused with, and why."""
-UNKEYED = {("SimulationSettings", "chunks"), ("GainFit", "models_at_once")}
-"""How results are made; `chunks` is in the keys of the pieces."""
+UNKEYED = {("SimulationSettings", "chunks"), ("GainFit", "models_at_once"), ("ByFile", "salt")}
+"""How results are made; `chunks` is in the keys of the pieces, and a salt finds files that count by their content."""
 
 
 def keys(data: dict[str, Any]) -> set[str]:

@@ -44,6 +44,7 @@ DOWNSTREAM = {
     "difference",
     "agreement",
     "flux-scale",
+    "linear-response",
 } | AVERAGED
 
 
@@ -54,9 +55,13 @@ DOWNSTREAM = {
         ("description", "words", set()),
         ("outputs.store", "elsewhere", set()),
         ("outputs.figures", ["layout"], set()),
-        ("power.wedge_buffer", "200 ns", {"spectra", "figure", "agreement", "claims", "transfer", "score"}),
+        (
+            "power.wedge_buffer",
+            "200 ns",
+            {"spectra", "figure", "agreement", "claims", "transfer", "linear-response", "score"},
+        ),
         ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure", "claims", "transfer", "score"}),
-        ("power.taper", "hann", AVERAGED | {"flux-scale"}),
+        ("power.taper", "hann", AVERAGED | {"flux-scale", "linear-response"}),
         ("calibration.basis.buffer", "80 ns", DOWNSTREAM - {"levels", "corrupt"}),
         ("corruption.effects.0.seed", 99, {"effect", "gains"} | DOWNSTREAM - {"levels"}),
         ("corruption.effects.0.drift", {"kind": "jumps"}, {"effect", "gains"} | DOWNSTREAM - {"levels"}),
