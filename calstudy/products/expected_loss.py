@@ -30,6 +30,9 @@ EXPECTED, RESPONSE = "expected-loss.h5", "linear-response.json"
 # Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
 # further within a bin.
 PROBES = 16
+LARGEST = 4.0
+"""Visibilities of an integration, over those of the paper's, up to which scores have the linear response: the tangent
+space takes 1.5 GB for the paper's."""
 
 
 @once
@@ -43,11 +46,13 @@ def linear_response(graph: Graph) -> Task | None:
     """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T.
 
     Calibrators must fit each integration by least squares and use the gains without smoothing. Spectra must be of each
-    baseline with itself, because a fit responds differently on different baselines of a group.
+    baseline with itself, because a fit responds differently on different baselines of a group. Large arrays have none.
     """
     fit = graph.experiment.calibration
     fits = isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None
-    if not fits or graph.experiment.power.pairs == "redundant-group":
+    size = graph.size
+    large = size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES
+    if not fits or large or graph.experiment.power.pairs == "redundant-group":
         return None
     inputs = _inputs(graph) | {"signal": corruption.data(graph, Variant(components=("eor",)), "even")}
     settings = _settings(graph)

@@ -124,6 +124,6 @@ def test_plans_name_the_site(tmp_path: Path):
     with pytest.raises(ExperimentError) as caught:
         experiment(tmp_path, layout=layout)
     assert str(caught.value).splitlines()[-1].strip(" -") == (
-        "instrument.location: is required where instrument.layout is a CSV file: the name of a site (mwa, hera, paper, "
-        "ovro-lwa), or coordinates (latitude and longitude)"
+        "instrument.location: is required for instrument.layout 'csv', which is at no site: the name of a site (mwa, "
+        "hera, paper, ovro-lwa), or coordinates (latitude and longitude)"
     )
