@@ -74,11 +74,11 @@ class MwaFile:
         InputError
             If there is neither.
         """
-        places = [default_directory() / self.name]
         with suppress(InputError):
-            places.insert(0, self.packaged.path)
-        found = next((place for place in places if place.is_file()), None)
-        if found is None:
+            if (packaged := self.packaged.path).is_file():
+                return packaged
+        found = default_directory() / self.name
+        if not found.is_file():
             raise InputError(
                 f"{self.content} is missing: the package mwa_pb, which has it, is not installed or is without it; "
                 f"download it with 'calstudy data fetch {self.fetched_as}', install mwa_pb 1.1, or {self.instead}"
