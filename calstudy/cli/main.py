@@ -222,12 +222,19 @@ def report(
 
 @app.command()
 def fields(
-    file: Annotated[Path | None, typer.Argument(help="A Python file: print the settings of what it defines.")] = None,
+    section: Annotated[
+        str | None,
+        typer.Argument(help="A section, such as calibration.basis, or a Python file: the settings of what it defines."),
+    ] = None,
 ) -> None:
-    """Print the reference of all fields of an experiment file (Markdown)."""
-    from calstudy.studies.reference import field_reference, plugin_reference
+    """Print the reference of all fields of an experiment file, or of one section (Markdown)."""
+    from calstudy.studies.reference import field_reference, plugin_reference, section_reference
 
-    typer.echo(field_reference() if file is None else plugin_reference(file), nl=False)
+    if section is None:
+        typer.echo(field_reference(), nl=False)
+    else:
+        is_file = section.endswith(".py")
+        typer.echo(plugin_reference(Path(section)) if is_file else section_reference(section), nl=False)
 
 
 @data_app.command()
