@@ -14,7 +14,7 @@ from calstudy.figures.comparison_spectra import look
 from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import BINS, score
+from calstudy.products.score import score
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, Rules
 
@@ -36,10 +36,9 @@ class MemberBias:
 
 def read_member(folder: Path) -> MemberBias:
     """Read the bias of a member from its scores."""
-    from calstudy.power.score import Score
-    from calstudy.power.tables import load_spectrum
+    from calstudy.results.reader import Tables
 
-    bins = load_spectrum(folder / BINS, Score)
+    bins = Tables((folder,)).score
     return MemberBias(bins.k, bins.bias, bins.bias_error)
 
 

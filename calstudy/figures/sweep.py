@@ -17,7 +17,6 @@ from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
 from calstudy.plotting import style
 from calstudy.products import signal_loss
-from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
 
@@ -164,10 +163,9 @@ class Sweep(StudyFigure):
 
 
 def _bands(folder: Path, region: str) -> TransferFunction:
-    from calstudy.power.tables import load_spectrum
-    from calstudy.power.transfer import TransferFunction
+    from calstudy.results.reader import Tables
 
-    return load_spectrum(folder / spectrum_file(signal_loss.BAND, region), TransferFunction)
+    return Tables((folder,)).transfer_in_bands(region)
 
 
 def _write_summary(path: Path, points: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> None:

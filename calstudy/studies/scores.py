@@ -17,6 +17,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.base.identity import digest_json, identity
 from calstudy.base.schema import Section
+from calstudy.base.table import Table, one_line, plain_text
 from calstudy.calibrate.interface import Status
 from calstudy.experiment.model import Experiment
 from calstudy.power.score import BANDS
@@ -32,7 +33,6 @@ from calstudy.studies.export import Contents
 from calstudy.studies.folder import log_to
 from calstudy.studies.kinds.comparison import Comparison
 from calstudy.studies.study import Budget, make
-from calstudy.verdicts.tables import Table, one_line, plain_text
 
 LOG = "score.log"
 VERIFIED = "verified.txt"

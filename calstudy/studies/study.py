@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -258,10 +259,12 @@ class Study(ABC):
         for name, text in self.texts.items():
             (self.folder / name).parent.mkdir(exist_ok=True)
             write(self.folder / name, text)
+        places = {name: os.path.relpath(part.folder, self.folder) for name, part in self.parts.items()}
         entries = {
             "description": self.description,
             "stand_ins": list(self.stand_ins),
             "captions": {task.label: task.settings["figure"].caption for task in self.figures},
+            **({"parts": places} if places else {}),
             **self.entries,
             "products": product_entries(self.recorded, made.products, made.tasks, self.kept_tables),
         }

@@ -22,6 +22,7 @@ from calstudy.instrument.telescope import make_template
 from calstudy.products import calibration, simulation, sky_model
 from calstudy.products.graph import Graph
 from calstudy.report.contents import read_contents
+from calstudy.results.folder import RunFolder
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.run.task import Task
@@ -204,7 +205,7 @@ def finished(folder) -> Run:
 def test_a_run_says_what_was_assumed(finished):
     told = "assumed: sky.foregrounds.count = 60, where 100 is true"
     assert json.loads((finished.folder / "manifest.json").read_text())["sky_model"] == told
-    contents = read_contents(finished.folder)
+    contents = read_contents(RunFolder(finished.folder))
     assert contents.facts["sky model of the calibrator"] == told
     assert told in next(table for table in contents.tables if table.title == "Solver convergence").note
     lines = (finished.folder / "tables" / "sky-model.csv").read_text().splitlines()
@@ -215,7 +216,7 @@ def test_a_run_says_what_was_assumed(finished):
 def test_a_run_says_that_its_sky_model_is_perfect(folder):
     study = ExperimentStudy(validate(sky_based(folder), folder))
     run = run_study(study, Budget(workers=1), Console(file=io.StringIO()))
-    assert read_contents(run.folder).facts["sky model of the calibrator"].startswith("perfect: ")
+    assert read_contents(RunFolder(run.folder)).facts["sky model of the calibrator"].startswith("perfect: ")
     assert "perfect" in (run.folder / "tables" / "sky-model.csv").read_text()
 
 
