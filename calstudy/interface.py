@@ -29,7 +29,7 @@ from calstudy.results.folder import EXPERIMENT, RunFolder
 from calstudy.results.reader import Tables
 from calstudy.run.store import Store
 from calstudy.run.task import Job, Task
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Budget, Study, run_study
@@ -282,9 +282,7 @@ class OpenRun:
     @property
     def parts(self) -> dict[str, OpenRun]:
         """The members of a collection, or the points of a sweep, by name."""
-        points = {item["folder"]: RunFolder(self.folder / item["folder"]) for item in self._manifest.get("points", [])}
-        named = {name.rpartition("/")[2]: folder for name, folder in points.items()}
-        return {name: OpenRun(folder) for name, folder in (*self._folder.members.items(), *named.items())}
+        return {name: OpenRun(folder) for name, folder in self._folder.parts.items()}
 
     def gains(self, variant: str = "residual", half: Half = "even") -> UVCal:
         """Return the gains of the calibration of a variant; "true" in place of a variant returns the true gains.

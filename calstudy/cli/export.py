@@ -52,8 +52,8 @@ def export(
     from calstudy.studies.blind import write_recipe
     from calstudy.studies.export import CARRIER
     from calstudy.studies.export import export as write
+    from calstudy.studies.kinds.comparison import load_worlds
     from calstudy.studies.study import Budget
-    from calstudy.studies.worlds import load_worlds
 
     console = Console(soft_wrap=True, highlight=False)
     if blind is not None:
@@ -106,9 +106,9 @@ def score(
     """
     from calstudy.base.errors import InputError
     from calstudy.products.files import quiet_libraries
+    from calstudy.studies.kinds.comparison import load_worlds
     from calstudy.studies.scores import measure_scores, tables
     from calstudy.studies.study import Budget
-    from calstudy.studies.worlds import load_worlds
 
     if output is not None and output.exists() and not overwrite:
         raise InputError(f"--output {output}: is there already; use --overwrite or another name")

@@ -637,5 +637,5 @@ def test_folders_that_cannot_be_evaluated_are_told(make_study, tmp_path):
     with pytest.raises(InputError, match="'calamity' is not a paper"):
         evaluate_folder(folder, ["calamity"])
     (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "points": []}))
-    with pytest.raises(InputError, match="is the folder of a sweep; give that of one of its points"):
+    with pytest.raises(InputError, match="is the folder of several runs; give that of one of them"):
         evaluate_folder(folder)
