@@ -44,6 +44,11 @@ def test_changes_are_fields_and_faults_are_reported_together(file):
     assert len(raised.value.faults) == 2
 
 
+def test_a_dictionary_is_the_content_of_a_file(file):
+    study = calstudy.load(yaml.safe_load(file.read_text()))
+    assert study.folder == calstudy.load(file).folder
+
+
 def test_a_plan_is_a_table_and_a_mapping(file):
     plan = calstudy.load(file).plan(workers=1)
     assert "plan for 1 worker(s)" in repr(plan)
