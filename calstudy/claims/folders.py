@@ -62,8 +62,9 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
         If it is neither, names no paper or code that may not be run, or cannot be written.
     """
     run = RunFolder(folder)
-    if "points" in run.manifest:
-        raise InputError(f"{folder}: is the folder of a sweep; give that of one of its points, below {folder}/points")
+    if run.parts and not run.members:
+        part = next(iter(run.parts.values())).path
+        raise InputError(f"{folder}: is the folder of several runs; give that of one of them, such as {part}")
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
         found, by_solver = _evaluated(run, named)

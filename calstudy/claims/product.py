@@ -30,7 +30,7 @@ def _facts(experiment: Experiment) -> Experiment:
 
 def _inputs(graph: Graph) -> dict[str, Task]:
     if graph.experiment.realizations:
-        return {REALIZATIONS: figure_task(graph, FIGURES.make(REALIZATIONS), stand_ins(graph.experiment))}
+        return {REALIZATIONS: figure_task(FIGURES.make(REALIZATIONS), {"": graph}, stand_ins(graph.experiment))}
     inputs = {
         "spectra": spectra.spectra(graph),
         "agreement": agreement.agreement(graph),

@@ -11,9 +11,8 @@ import numpy as np
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.products import spectra
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 if TYPE_CHECKING:
@@ -229,10 +228,6 @@ class Spherical(StudyFigure):
     caption = "Spherical power spectra with 95 % bars; open where negative."
     variants = ("eor",)
     tolerances = SPHERICAL_RULES
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra."""
-        return {"spectra": spectra.spectra(graph)}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
         """Return the buffer of the wedge."""

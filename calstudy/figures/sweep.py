@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.experiment.files import short_names
-from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
 from calstudy.plotting import style
@@ -148,15 +147,12 @@ def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> 
 class Sweep(StudyFigure):
     """The signal loss of all points of a sweep, with summary.csv: one row per point, region and band of k."""
 
+    of = ("sweep",)
     caption = "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars."
-
-    def refusal(self, experiment: Experiment) -> str:
-        """Refuse: a single experiment has nothing to compare."""
-        return "compares the points of a sweep, and cannot be drawn of a single experiment"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the signal loss of one point."""
-        return {"transfer": required(signal_loss.transfer(graph))}
+        return {"": required(signal_loss.transfer(graph))}
 
     def draw(self, job: Job) -> Drawing:
         """Write summary.csv, and draw T against the varied fields."""

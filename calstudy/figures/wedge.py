@@ -11,9 +11,8 @@ import numpy as np
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
-from calstudy.products import spectra
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import Drawn, cylindrical_error
 
 if TYPE_CHECKING:
@@ -170,10 +169,6 @@ class Wedge(StudyFigure):
             Drawn(cylindrical_error, "noise + sample variance, and noise x foregrounds", largest=12.0),
         ),
     )
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra."""
-        return {"spectra": spectra.spectra(graph)}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
         """Return the buffer of the wedge."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -137,12 +138,9 @@ def _files(folder: Path) -> list[str]:
 
 
 def _parts(run: RunFolder) -> list[tuple[str, str]]:
-    points = [
-        (item["folder"].rpartition("/")[2], f"{item['folder']}/report.html") for item in run.manifest.get("points", [])
-    ]
-    pages = {name: f"../{place}/report.html" for name, place in run.manifest.get("members", {}).items()}
     # Members may come from references, which have no page.
-    return points + [(name, page) for name, page in pages.items() if (run.path / page).is_file()]
+    pages = {name: part.path.resolve() / "report.html" for name, part in run.parts.items()}
+    return [(name, os.path.relpath(page, run.path.resolve())) for name, page in pages.items() if page.is_file()]
 
 
 def _claims(run: RunFolder) -> Table | None:

@@ -78,6 +78,14 @@ class RunFolder:
         beside = self.path.resolve().parent
         return {name: RunFolder(beside / place) for name, place in self.manifest.get("members", {}).items()}
 
+    @property
+    def parts(self) -> Mapping[str, RunFolder]:
+        """Folders of the runs of which this one consists, such as members of a collection, by name."""
+        # Runs of earlier versions have their points alone.
+        points = {item["folder"].rpartition("/")[2]: item["folder"] for item in self.manifest.get("points", [])}
+        places = self.manifest.get("parts", points)
+        return {**{name: RunFolder(self.path / place) for name, place in places.items()}, **self.members}
+
     @cached_property
     def content(self) -> Mapping[str, Any]:
         """The content of experiment.yaml; raises InputError if there is none."""

@@ -15,8 +15,8 @@ from calstudy.base.files import sha256
 from calstudy.results.folder import MANIFEST, RunFolder
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task
-from calstudy.studies.collection import Collection
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Study
 
 TABLES = "tables"

@@ -6,6 +6,7 @@ import re
 import types
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
@@ -17,10 +18,7 @@ from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
 from calstudy.experiment.model import Experiment, RealizationBlock, Variant
 from calstudy.instrument.as_built import DeadDipoles
 from calstudy.instrument.settings import AntennaBeam
-from calstudy.studies.collection import CollectionFile, Member
-from calstudy.studies.comparison import ComparisonFile
-from calstudy.studies.observed import ObservedFile
-from calstudy.studies.runtime import RuntimeFile
+from calstudy.studies.study import Study, built_in_kinds
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -201,6 +199,15 @@ def section_reference(section: str) -> str:
     )
 
 
+def _kind_section(kind: type[Study], listed: dict[str, str]) -> Iterator[str]:
+    """Write the fields of the files of a kind of study, and those of each block in its lists."""
+    yield from (f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed))
+    for name, info in kind.model.model_fields.items():
+        items = get_args(info.annotation) if get_origin(info.annotation) is tuple and not _registry(info) else ()
+        for block in (block for item in items for block in _blocks(item)):
+            yield from (f"## `{name}`: each", "", *_section(block, name, listed))
+
+
 def field_reference() -> str:
     """Return the reference as Markdown: every section, field, unit, default and meaning."""
     listed: dict[str, str] = {}
@@ -227,37 +234,6 @@ def field_reference() -> str:
         "## `instrument.as_built.dipoles.dead`: each",
         "",
         *_plain_section(DeadDipoles),
-        "# Collection files",
-        "",
-        "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run",
-        "folder, and figures and claims of all of them in the folder of the collection; `--scale` and `--set` go to",
-        "every member.",
-        "",
-        *_section(CollectionFile, "", listed),
-        "## `experiments`: each",
-        "",
-        *_section(Member, "experiments", listed),
-        "",
-        "# Comparison files",
-        "",
-        "A file with the key `calibrators` is a comparison. `python -m calstudy run` calibrates the data of each world",
-        "with each calibrator, and compares the results in tables and figures; `--set` changes the experiment of every",
-        "case.",
-        "",
-        *_section(ComparisonFile, "", listed),
-        "",
-        "# Run-time files",
-        "",
-        "A file with the key `runtime` is a run-time study. `python -m calstudy run` times the solvers here,",
-        "one array after the other; what it measured is kept under a key that names the machine.",
-        "",
-        *_section(RuntimeFile, "", listed),
-        "",
-        "# Files about measured data",
-        "",
-        "A file with the key `observed` is about measured data ([measured-data.md](measured-data.md)): these are",
-        "calibrated, have power spectra, and are calibrated again with an injected EoR.",
-        "",
-        *_section(ObservedFile, "", listed),
+        *(line for kind in built_in_kinds() if kind.heading for line in _kind_section(kind, listed)),
     ]
     return "\n".join(lines).rstrip() + "\n"

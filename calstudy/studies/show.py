@@ -45,9 +45,9 @@ def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[st
     InputError
         If the study does not fit, or store or run folders cannot be written.
     """
-    study, workers = study.fitted(budget)
+    study, workers = study.sized_to(budget)
     store = Store(study.outputs.store)
-    plan = schedule(study.targets, store, study.given, strict)
+    plan = schedule(study.targets, store, study.external_keys, strict)
     if plan.todo:
         require_writable(store.root, f"outputs.store = {str(store.root)!r}")
     require_writable(study.folder.parent, f"outputs.runs = {str(study.folder.parent)!r}")
@@ -84,7 +84,7 @@ def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[st
         "notes": notes,
         "sites": sites(study.tasks),
         "store": str(store.root),
-        "run_folders": [str(folder) for folder in study.folders],
+        "run_folders": [str(part.folder) for part in study.with_parts()],
     }
 
 

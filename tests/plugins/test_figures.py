@@ -44,10 +44,11 @@ class Broken(StudyFigure):
         raise KeyError("no such array")
 """
 SIZES = """
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 
-class Sizes(ComparisonFigure):
+class Sizes(StudyFigure):
+    of = ("collection",)
     caption = "Sizes."
     titles = {"small": "Small", "large": "Large"}
 

@@ -143,7 +143,7 @@ def test_leftovers_of_publishing_are_removed_from_run_folders(tmp_path):
         path.touch()
     os.utime(old, (0, 0))
     os.utime(other, (0, 0))
-    open_folder(tmp_path)
+    open_folder(tmp_path, ())
     assert [path.exists() for path in (old, new, other)] == [False, True, True]
 
 

@@ -26,11 +26,11 @@ from calstudy.results.folder import RunFolder
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.run.task import Task
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.studies.kinds.sweep import Sweep
 from calstudy.studies.load import load_study
 from calstudy.studies.preflight import require_calibration
-from calstudy.studies.study import Budget, Made, Run, make, run_study
-from calstudy.studies.sweep import Sweep
+from calstudy.studies.study import Budget, Run, RunProducts, make, run_study
 
 RESIDUAL = "residual"
 
@@ -51,7 +51,7 @@ def calibrated(graph: Graph) -> Task:
     return calibration.calibration(graph, graph.experiment.variants[RESIDUAL], "even")
 
 
-def make_here(folder: Path, *tasks: Task) -> Made:
+def make_here(folder: Path, *tasks: Task) -> RunProducts:
     console = Console(file=io.StringIO())
     return make(tasks, Store(folder / "store"), Workers(1, folder / "run.log"), console)
 

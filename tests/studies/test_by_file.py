@@ -27,10 +27,10 @@ from calstudy.products import corruption
 from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.studies.export import CARRIER, Contents
+from calstudy.studies.kinds.comparison import load_worlds
 from calstudy.studies.load import load_study
 from calstudy.studies.scores import Row, Scores, leaderboard, read_scores, scoring_of
 from calstudy.studies.study import Budget, run_study
-from calstudy.studies.worlds import load_worlds
 
 ROOT = Path(__file__).parents[2]
 # With the weights of the program of the challenge's page.
