@@ -17,7 +17,7 @@ from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
 from calstudy.experiment.model import Experiment, RealizationBlock, Variant
 from calstudy.instrument.as_built import DeadDipoles
 from calstudy.instrument.settings import AntennaBeam
-from calstudy.studies.study import Study, built_in_kinds
+from calstudy.studies.study import KINDS, Study, built_in_kinds
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -158,12 +158,10 @@ def plugin_reference(path: Path) -> str:
         If the file cannot be run, or contains none.
     """
     module = load_file(path)
-    found = [
-        value
-        for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, Plugin) and value.__module__ == module.__name__
-    ]
-    if not found:
+    own = [thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__]
+    kinds = [thing for thing in own if issubclass(thing, Study)]
+    found = [thing for thing in own if issubclass(thing, Plugin)]
+    if not found and not kinds:
         raise InputError(
             f"{path}: holds no calibrator, figure or the like (no subclass of calstudy.base.plugins.Plugin)"
         )
@@ -172,6 +170,8 @@ def plugin_reference(path: Path) -> str:
         tag = plugin.registry.tag
         lines += [f"# {plugin.registry.noun.capitalize()} `{tag}: {path.name}:{plugin.__name__}`", ""]
         lines += _section(plugin, "", {})
+    for kind in kinds:
+        lines += [f"# Files with `{KINDS.tag}: {path.name}:{kind.__name__}`", "", *_section(kind.model, "", {})]
     return "\n".join(lines).rstrip() + "\n"
 
 
