@@ -14,9 +14,7 @@ from pydantic_core import PydanticUndefined
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
-from calstudy.experiment.model import Experiment, RealizationBlock, Variant
-from calstudy.instrument.as_built import DeadDipoles
-from calstudy.instrument.settings import AntennaBeam
+from calstudy.experiment.model import Experiment
 from calstudy.studies.study import KINDS, Study, built_in_kinds
 
 
@@ -120,6 +118,16 @@ def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[s
             tags = get_args(block.model_fields[tag].annotation)
             yield from (f"### `{path}: {' | '.join(map(str, tags))}`", "")
             yield from _section(block, path, listed)
+    elif len(items := _items(info.annotation)) == 1:
+        yield from (f"## `{path}`: each", "", *_section(items[0], path, listed))
+
+
+def _items(annotation: Any) -> list[type[BaseModel]]:
+    """Return the blocks, but for plug-ins, that a field accepts as items of a list, or as values of a mapping."""
+    lists = [item for item in _alternatives(annotation) if get_origin(item) in (tuple, dict)]
+    return [
+        block for item in lists for value in get_args(item) for block in _blocks(value) if not issubclass(block, Plugin)
+    ]
 
 
 def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iterator[str]:
@@ -175,15 +183,6 @@ def plugin_reference(path: Path) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _kind_section(kind: type[Study], listed: dict[str, str]) -> Iterator[str]:
-    """Write the fields of the files of a kind of study, and those of each block in its lists."""
-    yield from (f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed))
-    for name, info in kind.model.model_fields.items():
-        items = get_args(info.annotation) if get_origin(info.annotation) is tuple and not _registry(info) else ()
-        for block in (block for item in items for block in _blocks(item)):
-            yield from (f"## `{name}`: each", "", *_section(block, name, listed))
-
-
 def field_reference() -> str:
     """Return the reference as Markdown: every section, field, unit, default and meaning."""
     listed: dict[str, str] = {}
@@ -196,20 +195,8 @@ def field_reference() -> str:
         "`beam: airy` is `beam: {kind: airy}`. Relative paths of input files start at the experiment file.",
         "",
         *_section(Experiment, "", listed),
-        "## `variants`: each",
-        "",
-        *_section(Variant, "variants", listed),
-        "## `realizations`: each",
-        "",
-        *_section(RealizationBlock, "realizations", listed),
-        "## `instrument.antenna_beams`: each",
-        "",
-        *_plain_section(AntennaBeam),
-        "`beam` takes what `instrument.beam` does.",
-        "",
-        "## `instrument.as_built.dipoles.dead`: each",
-        "",
-        *_plain_section(DeadDipoles),
-        *(line for kind in built_in_kinds() if kind.heading for line in _kind_section(kind, listed)),
     ]
+    for kind in built_in_kinds():
+        if kind.heading:
+            lines += [f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed)]
     return "\n".join(lines).rstrip() + "\n"
