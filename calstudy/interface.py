@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import yaml
 
 from calstudy.base.errors import InputError, nearest
+from calstudy.experiment.files import StudyFile
 from calstudy.products import calibration, corruption
 from calstudy.products.files import DATA, GAINS, RESIDUAL
 from calstudy.report.headline import read_headline
@@ -30,7 +31,7 @@ from calstudy.results.reader import Tables
 from calstudy.run.store import Store
 from calstudy.run.task import Job, Task
 from calstudy.studies.kinds.experiment import ExperimentStudy
-from calstudy.studies.load import load_study
+from calstudy.studies.load import load_study, study_of
 from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Budget, Study, run_study
 
@@ -48,13 +49,14 @@ Half = Literal["even", "odd"]
 REGIONS = ("outside-wedge", "inside-wedge")
 
 
-def load(source: str | Path, /, scale: str | None = None, **changes: Any) -> LoadedStudy:
+def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
     """Load a study.
 
     Parameters
     ----------
     source
-        A YAML file, or the name of a published experiment, such as "quickstart".
+        A YAML file, the name of a published experiment, such as "quickstart", or the content of a file, whose relative
+        paths start at the working directory.
     scale
         Name of a set of overrides in the file's `scales`.
     **changes
@@ -67,6 +69,8 @@ def load(source: str | Path, /, scale: str | None = None, **changes: Any) -> Loa
         If the file cannot be read, or a field is unknown or has a value that is not allowed.
     """
     texts = [f"{path}={yaml.safe_dump(value, default_flow_style=True)}" for path, value in changes.items()]
+    if isinstance(source, Mapping):
+        return LoadedStudy(study_of(StudyFile(Path("study.yaml"), source, scale, texts)))
     return LoadedStudy(load_study(Path(source), scale, texts))
 
 

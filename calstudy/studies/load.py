@@ -31,7 +31,11 @@ def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = 
     ExperimentError
         If fields are unknown, missing, or have values that are not allowed.
     """
-    file = StudyFile.open(path, scale, overrides)
+    return study_of(StudyFile.open(path, scale, overrides))
+
+
+def study_of(file: StudyFile) -> Study:
+    """Return the study that the content of a file describes; errors as for `load_study`."""
     kind = kind_of(file.content, file.folder)
     plain = {key: value for key, value in file.content.items() if key != KINDS.tag}
     return kind.load(replace(file, content=plain))

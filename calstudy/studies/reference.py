@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, nearest
 from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
 from calstudy.experiment.model import Experiment
 from calstudy.studies.study import KINDS, Study, built_in_kinds
@@ -183,16 +184,39 @@ def plugin_reference(path: Path) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
+def section_reference(section: str) -> str:
+    """Return the part of the reference with one section, such as ``calibration.basis``, and the sections inside it.
+
+    Raises
+    ------
+    InputError
+        If there is no such section.
+    """
+    sections: list[str] = []
+    for kind_of_file in re.split(r"^(?=# )", field_reference(), flags=re.MULTILINE):
+        parts = re.split(r"^(?=##+ `([\w.]+))", kind_of_file, flags=re.MULTILINE)[1:]
+        paths, texts = parts[::2], parts[1::2]
+        chosen = [text for path, text in zip(paths, texts, strict=True) if f"{path}.".startswith(f"{section}.")]
+        if chosen:
+            return "".join(chosen).rstrip() + "\n"
+        sections += paths
+    first = ", ".join(dict.fromkeys(path for path in sections if "." not in path))
+    raise InputError(
+        f"{section}: neither a section of experiment files{nearest(section, sections)} (at the top: {first}), "
+        "nor a Python file"
+    )
+
+
 def field_reference() -> str:
     """Return the reference as Markdown: every section, field, unit, default and meaning."""
     listed: dict[str, str] = {}
     lines = [
         "# Experiment files",
         "",
-        "Written by `python -m calstudy fields`; do not edit. An experiment file is YAML. Everything but `name` has a",
-        "default, which is the paper's value where the paper has one. Physical quantities are written with their unit",
-        '(`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a choice, its name alone stands for it with its defaults:',
-        "`beam: airy` is `beam: {kind: airy}`. Relative paths of input files start at the experiment file.",
+        "An experiment file is YAML. Everything but `name` has a default, which is the paper's value where the paper",
+        'has one. Physical quantities are written with their unit (`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a',
+        "choice, its name alone stands for it with its defaults: `beam: airy` is `beam: {kind: airy}`. Relative paths",
+        "of input files start at the experiment file. `calstudy fields SECTION` prints one section of this page.",
         "",
         *_section(Experiment, "", listed),
     ]
