@@ -151,7 +151,7 @@ def test_faults_name_the_case_and_the_field(tmp_path):
                 tmp_path, calibrators={"CALAMITY": {"calibrator": "calamity", "sovler": 1}}, worlds={"ideal": {}}
             )
         )
-    with pytest.raises(ExperimentError, match="'wedge' does not compare calibrators"):
+    with pytest.raises(ExperimentError, match="'wedge' is a figure for experiment files, not for comparison files"):
         load_study(comparison_file(tmp_path, figures=["wedge"]))
     with pytest.raises(ExperimentError, match="wrlds: unknown key, did you mean 'worlds'"):
         load_study(comparison_file(tmp_path, wrlds={}))
