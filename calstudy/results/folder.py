@@ -21,7 +21,7 @@ from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import CLAIMS_JSON, from_json
 
 MANIFEST, EXPERIMENT = "manifest.json", "experiment.yaml"
-NO_RUN = "not the folder of a finished run; give one that 'calstudy run' printed"
+NO_RUN = "is not the folder of a finished run; give one that 'calstudy run' printed"
 
 
 @dataclass(frozen=True)
