@@ -20,7 +20,6 @@ import typer
 from rich.console import Console
 
 from calstudy import __version__
-from calstudy.base import ranks
 from calstudy.base.errors import DiskError, ExperimentError, InputError, Terminated, exit_status, refusal_of_disk
 from calstudy.base.mwa_files import MWA_FILES
 from calstudy.cli.calibrate import calibrate
@@ -272,13 +271,9 @@ def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
     if not faulthandler.is_enabled():
         # The terminal shows the place of a library's crash: a run writes standard error itself to a file.
         faulthandler.enable(os.dup(2), all_threads=False)
-    if ranks.is_helper():
-        ranks.serve()
-        return
     termination = _Termination()
     try:
-        with ranks.leading():
-            app()
+        app()
     except InputError as error:
         for sentence in error.faults if isinstance(error, ExperimentError) else [str(error)]:
             typer.echo(f"calstudy: {sentence}", err=True)
