@@ -20,7 +20,9 @@ Differences are rms over the rms of the data.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -29,9 +31,9 @@ from calstudy.base.visibilities import baseline_vectors, to_cube
 from calstudy.calibrate.basis import dpss_vectors, make_basis
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.corrupt.levels import rms
-from calstudy.validation.measurement import Findings, Inputs
-from calstudy.validation.single_integration import SingleIntegration, SingleIntegrationMeasurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.single_integration import SingleIntegration, SingleIntegrationStep
+from calstudy.validation.step import Findings, Limit, StepInput
+from calstudy.verdicts.criterion import AtMost, Finding
 
 SMALLEST_TOLERANCE = 1e-13
 """Tolerance of the solver: residuals should agree to 1e-6 of the data, far below the noise."""
@@ -39,14 +41,35 @@ SMOOTH_DELAY = 10e-9
 """Largest delay of a smooth exchange, s: inside the buffer of the basis."""
 
 
-class Degeneracies(SingleIntegrationMeasurement):
+class Degeneracies(SingleIntegrationStep):
     """The largest difference of any exchange, before and after a fit."""
+
+    number = "2.1"
+    title = "Degeneracies"
+    proves = (
+        "overall phase, scale, tip-tilt and exchanges of smooth gains with foregrounds leave the residual unchanged"
+    )
+    small_parameters: ClassVar = {"draws": 5, "antennas": 10}
+    limits: ClassVar = {
+        "exact": Limit(
+            "rms change of V - g g* F by an exchange at the true gains, over rms V; largest value of all draws and "
+            "kinds",
+            AtMost(1e-6),
+            "the exchanges are exact; 1e-6 is far below noise and EoR",
+        ),
+        "fitted": Limit(
+            "rms change of the fitted residual when the fit starts along a degenerate direction, over rms V; largest "
+            "value of all kinds",
+            AtMost(1e-6),
+            "the fit must end with the same residual, wherever along the degeneracy it starts",
+        ),
+    }
 
     draws: int = Field(20, ge=1, description="Random exchanges of each kind.")
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare exchanges at the true gains, and fits that start from exchanged gains."""
-        integration, rng = self.integration(inputs), np.random.default_rng(20220422)
+        integration, rng = self.integration(runs), np.random.default_rng(20220422)
         gains = integration.true_gains
         noise = integration.noise_std * (rng.standard_normal((2, *integration.modelled.shape)) / np.sqrt(2))
         visibilities = integration.products(gains) * narrow_model(integration) + noise[0] + 1j * noise[1]

@@ -23,6 +23,7 @@ import csv
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -39,8 +40,8 @@ from calstudy.products import corruption, signal_loss, spectra
 from calstudy.products.files import DATA, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.measurement import Findings, Inputs, Measurement, required
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Findings, Limit, Step, StepInput, required
+from calstudy.verdicts.criterion import AtMost, Finding
 
 STAGES = ("sky", "averaging", "fringe-stop", "taper", "calibration", "flux-scale", "mask", "left")
 
@@ -65,12 +66,25 @@ class Band:
         return (self.measured.value - self.total) / self.measured.uncertainty
 
 
-class SignalLossBudget(Measurement):
+class SignalLossBudget(Step):
     """The largest pull of any band of k, for every experiment."""
 
+    number = "4.1"
+    title = "Signal-loss ledger"
+    proves = "the EoR losses of all stages add up to the end-to-end loss"
+    experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
     sections: ClassVar = ("instrument", "power", "sky")
+    limits: ClassVar = {
+        "minredundant_worst_pull": Limit(
+            "minimally redundant array, |sum of the stages - end-to-end loss| in sigma; largest value of all bands of "
+            "k",
+            AtMost(3),
+            "within the errors; 3 sigma, for the largest of four bands",
+        ),
+        "redundant_worst_pull": Limit("redundant array, the same", AtMost(3), "as above"),
+    }
 
-    def products(self, graph: Graph) -> Mapping[str, Task]:
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the EoR before averaging, its transfer function, and spectra of EoR, response, and both residuals."""
         eor = Variant(components=("eor",))
         transfer = required(signal_loss.transfer(graph), "the variants of signal loss")
@@ -84,16 +98,16 @@ class SignalLossBudget(Measurement):
             "response": transfer.inputs["response"],
         }
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compute the budgets and write them to signal_loss_budget.csv."""
         values, remarks, rows = {}, [], []
-        for name in inputs.experiments:
-            bands = budget(inputs, name)
+        for name, run in runs.items():
+            bands = budget(run)
             rows += [(name, band) for band in bands]
             worst = max(bands, key=lambda band: abs(band.pull))
             values[f"{name}_worst_pull"] = Finding(abs(worst.pull), 1.0)
             remarks += [f"{name}: {_sentence(band)}" for band in bands]
-        with (inputs.output / "signal_loss_budget.csv").open("w", newline="", encoding="utf-8") as file:
+        with (output / "signal_loss_budget.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(["experiment", "k from [h/Mpc]", "k to [h/Mpc]", *STAGES, "sum", "end to end", "error"])
             writer.writerows(
@@ -111,13 +125,13 @@ def _sentence(band: Band) -> str:
     )
 
 
-def budget(inputs: Inputs, name: str) -> list[Band]:
+def budget(run: StepInput) -> list[Band]:
     """Return the budget of one experiment, band by band."""
-    settings = inputs.power(name)
-    followed = [*_before_calibration(inputs, name), inputs.delay_spectra(name, "eor")]
-    response, residual, left = (inputs.delay_spectra(name, product) for product in ("response", "residual", "left"))
+    settings = run.experiment.power
+    followed = [*_before_calibration(run), run.delay_spectra("eor")]
+    response, residual, left = (run.delay_spectra(product) for product in ("response", "residual", "left"))
     # Without a known flux scale, its share is reported as loss of the calibration.
-    scale = inputs.flux_scale(name) or 1.0
+    scale = run.flux_scale or 1.0
     outside = outside_wedge(response, settings.wedge_buffer)
     k = np.hypot(response.k_perp[:, None], response.k_parallel)
     bands = []
@@ -125,7 +139,7 @@ def budget(inputs: Inputs, name: str) -> list[Band]:
         inside = (k > low) & (k <= high)
         if not (inside & outside).any():
             continue
-        put_in = float(inputs.input_power(name, np.array((low + high) / 2)))
+        put_in = float(run.input_power(np.array((low + high) / 2)))
         powers = [1.0, *(_mean(modes, inside).value / put_in for modes in followed)]
         after = _mean(response, inside).value / put_in
         powers += [after * scale**2, after]
@@ -156,9 +170,9 @@ def _mean(modes: DelaySpectra, used: np.ndarray, minus: Sequence[DelaySpectra] =
     return Finding(float(value[0]), float(error[0]))
 
 
-def _before_calibration(inputs: Inputs, name: str) -> list[DelaySpectra]:
+def _before_calibration(run: StepInput) -> list[DelaySpectra]:
     """Return the EoR's spectra without taper: one integration, the plain average, the fringe-stopped average."""
-    data = read_visibilities(inputs.folder(name, "data") / DATA)
+    data = read_visibilities(run.products["data"] / DATA)
     stopped, cube = fringe_stop_and_average(data), to_cube(data)
     plain = stopped.copy()
     versions = []
@@ -166,7 +180,7 @@ def _before_calibration(inputs: Inputs, name: str) -> list[DelaySpectra]:
         version = plain.copy()
         version.data_array = values.astype(complex)
         versions.append(version)
-    settings = inputs.power(name).model_copy(update={"taper": "none"})
-    instrument = inputs.instrument(name)
+    settings = run.experiment.power.model_copy(update={"taper": "none"})
+    instrument = run.experiment.instrument
     beam = make_beam(instrument.beam, instrument.channels)
     return [estimate_spectra(version, version, beam, settings) for version in (*versions, stopped)]

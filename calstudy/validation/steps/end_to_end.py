@@ -9,6 +9,8 @@ it is, and without the flux scale s of the fit, by whose square P^R is divided.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -18,29 +20,49 @@ from calstudy.claims.bins import recovered, used_bins
 from calstudy.products import signal_loss, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.measurement import Findings, Inputs, Measurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Findings, Limit, Step, StepInput
+from calstudy.verdicts.criterion import AtLeast, Finding
 
 SIGMAS = 2
 EXPECTED = 0.954
 """Fraction of a normal distribution within two sigma."""
 
 
-class EndToEnd(Measurement):
+class EndToEnd(Step):
     """The fraction of the bins of every experiment with a pull within two sigma, for both definitions of sigma."""
+
+    number = "4.0"
+    title = "End to end"
+    proves = "P^R recovers P^S outside wedge and buffer, on both arrays"
+    experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
+    limits: ClassVar = {
+        "minredundant_bars": Limit(
+            "minimally redundant array, fraction of bins with |P^R - P^S| within 2 sigma; sigma of the paper (sigma_N "
+            "+ sigma_S)",
+            AtLeast(0.9),
+            "95 % are expected; 10 % may miss",
+        ),
+        "redundant_bars": Limit("redundant array, the same", AtLeast(0.9), "as above"),
+        "minredundant_difference": Limit(
+            "minimally redundant array, the same with the error of the difference, since both contain the same EoR",
+            AtLeast(0.9),
+            "as above; stricter, because the paper's error bars contain sample variance that both share",
+        ),
+        "redundant_difference": Limit("redundant array, the same", AtLeast(0.9), "as above"),
+    }
 
     k_min: Wavenumber = Field(0.0, description="Bins below are left out.")
 
-    def products(self, graph: Graph) -> Mapping[str, Task]:
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the averaged spectra of all variants, and the transfer function, if any, which has the flux scale."""
         transfer = signal_loss.transfer(graph)
         return {"spectra": spectra.spectra(graph), **({} if transfer is None else {"transfer": transfer})}
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare the spectrum of the residual with that of the EoR."""
         values, remarks = {}, []
-        for name in inputs.experiments:
-            residual, signal = (inputs.spherical(name, variant) for variant in ("residual", "eor"))
+        for name, run in runs.items():
+            residual, signal = (run.spherical(variant, "outside-wedge") for variant in ("residual", "eor"))
             used = used_bins(residual, signal, k_min=self.k_min)
             difference = (residual.power - signal.power).real[used]
             for reading, error in (("bars", residual.error), ("difference", residual.difference_error)):
@@ -49,7 +71,7 @@ class EndToEnd(Measurement):
                 values[f"{name}_{reading}"] = Finding(float(within.mean()), float(sampling))
             ratio = recovered(residual, signal, self.k_min)
             values[f"{name}_ratio"] = ratio
-            remarks.append(f"{name}: {_sentence(ratio, int(used.sum()), inputs.flux_scale(name))}")
+            remarks.append(f"{name}: {_sentence(ratio, int(used.sum()), run.flux_scale)}")
         return Findings(values, tuple(remarks))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -21,19 +22,37 @@ from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.simulate.floor import MAIN_LOBES
 from calstudy.validation.means import clustered_mean
-from calstudy.validation.measurement import Findings, Inputs, Measurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only
+from calstudy.verdicts.criterion import AtMost, Finding
 
 MAIN_LOBE = MAIN_LOBES["blackman-harris"]
 """Half width of the main lobe of the estimator's widest taper, in units of 1 / bandwidth."""
 
 
-class Foregrounds(Measurement):
+class Foregrounds(Step):
     """P^{F+S} / P^S - 1 over all modes outside the wedge, the floor P^F / P^S, and the excess over it."""
 
+    number = "1.0"
+    title = "Foregrounds and EoR, perfect gains"
+    proves = "outside the wedge, the power of foregrounds and EoR equals that of the EoR alone"
+    experiments: ClassVar = {"minredundant": MINREDUNDANT}
     sections: ClassVar = ("power",)
+    limits: ClassVar = {
+        "beyond_floor": Limit(
+            "|P^{F+S} - P^S - P^F| / P^S over all modes beyond horizon, buffer and main lobe of the taper: excess over "
+            "the floor P^F of the foregrounds",
+            AtMost(0.01),
+            "1 %",
+        ),
+        "excess": Limit(
+            "|P^{F+S} - P^S| / P^S over the same modes, including the floor",
+            AtMost(0.01),
+            "stricter, without allowance for sidelobes of the taper; the short band of the small scale cannot meet it",
+            small="full scale only",
+        ),
+    }
 
-    def products(self, graph: Graph) -> Mapping[str, Task]:
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the spectra of EoR and foregrounds, each alone and both together, without gains."""
         components: dict[str, tuple[Component, ...]] = {
             "eor": ("eor",),
@@ -45,11 +64,11 @@ class Foregrounds(Measurement):
             for name, parts in components.items()
         }
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare the three spectra outside the wedge, for all modes together and in bands."""
-        name = inputs.only
-        signal, floor, both = (inputs.delay_spectra(name, product) for product in ("eor", "foregrounds", "both"))
-        outside = beyond_wedge(signal, inputs.power(name).wedge_buffer)
+        run = only(runs)
+        signal, floor, both = (run.delay_spectra(product) for product in ("eor", "foregrounds", "both"))
+        outside = beyond_wedge(signal, run.experiment.power.wedge_buffer)
         k = np.hypot(signal.k_perp[:, None], signal.k_parallel)
         excess = _over_signal(both.power.real - signal.power.real, signal, outside)
         beyond = both.power.real - signal.power.real - floor.power.real

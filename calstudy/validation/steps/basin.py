@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import csv
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
@@ -27,9 +29,9 @@ from calstudy.calibrate.settings import InitialGains, UnityStart
 from calstudy.corrupt.levels import rms
 from calstudy.plotting import style
 from calstudy.plotting.save import figure_arrays, save_figure
-from calstudy.validation.measurement import Findings, Inputs
-from calstudy.validation.single_integration import SingleIntegration, SingleIntegrationMeasurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.single_integration import SingleIntegration, SingleIntegrationStep
+from calstudy.validation.step import Findings, Limit, StepInput
+from calstudy.verdicts.criterion import AtMost, Finding
 
 if TYPE_CHECKING:
     from calstudy.calibrate.records import CalibrationResult
@@ -72,10 +74,48 @@ def _unity() -> dict[str, Start]:
     return {"unity": Start()}
 
 
-class BasinOfConvergence(SingleIntegrationMeasurement):
+class BasinOfConvergence(SingleIntegrationStep):
     """The distance from the true gains at which a fit may start, and the number of false statuses."""
 
     version: ClassVar[int] = 2
+    number = "2.2"
+    title = "Start-guess basin"
+    proves = "the range of starting errors from which the fit converges, and that its status is correct everywhere"
+    parameters: ClassVar = {
+        "antennas": 16,
+        "channels": 192,
+        "gain_errors": [0.01, 0.1, 0.2, 0.4, 0.7, 1.0],
+        "delays": ["0 ns", "30 ns", "100 ns", "200 ns", "300 ns", "500 ns", "1000 ns"],
+        "starts": {
+            "unity": {},
+            "delays": {"initial_gains": "delays"},
+            "delays without sky model": {"initial_gains": "delays", "sky_model": False},
+        },
+    }
+    small_parameters: ClassVar = {
+        "antennas": 8,
+        "channels": 96,
+        "gain_errors": [0.01, 0.1, 1.0],
+        "delays": ["0 ns", "30 ns", "500 ns"],
+    }
+    limits: ClassVar = {
+        "false_convergence": Limit(
+            "number of fits with status 'converged' whose misfit is more than 10 % above that of a fit from the truth",
+            AtMost(0),
+            "a status must never be wrong",
+        ),
+        "paper_case": Limit(
+            "misfit over that of a fit from the truth, at the paper's gain errors of 0.1, from unity",
+            AtMost(1.01),
+            "the paper's case must be well inside the range of convergence",
+        ),
+        "out_of_reach": Limit(
+            "number of fits from fitted delays, with gain errors up to 0.4, whose misfit is more than 10 % above that "
+            "of a fit from the truth",
+            AtMost(0),
+            "a start that fits delays must bring cables of any length within reach",
+        ),
+    }
 
     gain_errors: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(
         description="Standard deviations per channel, ascending."
@@ -88,9 +128,9 @@ class BasinOfConvergence(SingleIntegrationMeasurement):
         description="By the names that they have in the figure; the first is that of the criteria.",
     )
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Fit data with all these gain errors; write the table basin.csv and the figure."""
-        integration = self.integration(inputs)
+        integration = self.integration(runs)
         fits = {}
         for error, delay in itertools.product(self.gain_errors, self.delays):
             visibilities, gains = _data(integration, error, delay)
@@ -109,13 +149,13 @@ class BasinOfConvergence(SingleIntegrationMeasurement):
             converged=np.reshape([fits[cell][0].status == "converged" for cell in cells], shape),
             arrived=ARRIVED,
         )
-        with (inputs.output / "basin.csv").open("w", newline="", encoding="utf-8") as file:
+        with (output / "basin.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(COLUMNS)
             for cell in cells:
                 record, misfit = fits[cell]
                 writer.writerow([*cell, record.status, record.n_steps, misfit, record.message])
-        save_figure(draw_basin(basin), figure_arrays(basin), inputs.output, "basin")
+        save_figure(draw_basin(basin), figure_arrays(basin), output, "basin")
         return Findings(_findings(basin), _remarks(basin))
 
 

@@ -16,6 +16,7 @@ the sampling errors are computed: these include correlations between delays and 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -31,25 +32,38 @@ from calstudy.power.settings import PowerSettings
 from calstudy.products import corruption, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.measurement import Findings, Inputs, Measurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only
+from calstudy.verdicts.criterion import Equal, Finding
 
 
-class Noise(Measurement):
+class Noise(Step):
     """The scatter of the estimates over that of theory, and the means of Re and Im in units of P_N."""
 
+    number = "0.0"
+    title = "Noise alone"
+    proves = "the theoretical P_N equals the scatter of the estimates; even x odd has mean zero"
+    experiments: ClassVar = {"noise": MINREDUNDANT}
     sections: ClassVar = ("instrument", "power")
+    limits: ClassVar = {
+        "scatter_over_theory": Limit(
+            "rms of even x odd over P_N / sqrt(2)",
+            Equal(1, 3),
+            "3 sigma of the sampling error, from the scatter of baselines",
+        ),
+        "mean_real": Limit("mean of Re(even x odd) over P_N", Equal(0, 3), "independent noise has no cross power"),
+        "mean_imaginary": Limit("mean of Im(even x odd) over P_N", Equal(0, 3), "as above"),
+    }
 
-    def products(self, graph: Graph) -> Mapping[str, Task]:
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the spectra of the noise alone, and its level."""
         noise = Variant(components=("noise",))
         return {"noise": spectra.variant_power(graph, "noise", noise), "levels": corruption.levels(graph)}
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare the spectra of the noise with P_N."""
-        name = inputs.only
-        found = inputs.delay_spectra(name, "noise")
-        theory = noise_power(inputs.instrument(name), inputs.power(name), inputs.levels(name))
+        run = only(runs)
+        found = run.delay_spectra("noise")
+        theory = noise_power(run.experiment.instrument, run.experiment.power, run.levels)
         products = found.power * np.sqrt(found.n_pairs)[:, None] / theory
         square = _mean(np.mean(products.real**2, axis=1))
         scatter = np.sqrt(2 * square.value)

@@ -7,22 +7,43 @@ data are not rounded, and the solver also has double precision and continues unt
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar
+
 import numpy as np
 
 from calstudy.corrupt.levels import rms
-from calstudy.validation.measurement import Findings, Inputs
-from calstudy.validation.single_integration import SingleIntegrationMeasurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.single_integration import SingleIntegrationStep
+from calstudy.validation.step import Findings, Limit, StepInput
+from calstudy.verdicts.criterion import AtMost, Finding
 
 PATIENT = {"precision": "double", "tolerance": 1e-14, "max_steps": 300}
 
 
-class Noiseless(SingleIntegrationMeasurement):
+class Noiseless(SingleIntegrationStep):
     """The rms of V - g_a g_b* F over that of V, for both precisions."""
 
-    def measure(self, inputs: Inputs) -> Findings:
+    number = "2.0"
+    title = "Noiseless calibration"
+    proves = "if the foregrounds are inside the basis, the product of gains and model equals the data"
+    small_parameters: ClassVar = {"antennas": 10}
+    limits: ClassVar = {
+        "single": Limit(
+            "rms of V - g g* F over rms of V, data in single precision",
+            AtMost(1e-5),
+            "float32 resolves 6e-8; 1e-5 is a tenth of the EoR",
+        ),
+        "double": Limit(
+            "the same, data in double precision, solved until the solver makes no more progress",
+            AtMost(1e-9),
+            "float64 resolves 1e-16; a solver that reaches the minimum has no floor near the EoR",
+        ),
+    }
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Calibrate in both precisions."""
-        integration = self.integration(inputs)
+        integration = self.integration(runs)
         exact = integration.products(integration.true_gains) * integration.modelled
         patient = integration.settings.solver.model_copy(update=PATIENT)
         cases = {

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
-from functools import partial
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -27,37 +27,66 @@ from calstudy.products import corruption, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.validation.means import clustered_mean, pooled
-from calstudy.validation.measurement import Findings, Inputs, Measurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import Case, Findings, Limit, Step, StepInput
+from calstudy.verdicts.criterion import Equal, Finding, Within
 
 FINE = 8
 """Points of the integral over delays per delay of the spectrum."""
 MARGIN = 60
 """Multipoles by which the beam spreads those of a baseline."""
 BANDS = (0.3, 0.5, 1.0, np.inf)
+POWER_LAW = {"sky.eor.spectrum": "power-law", "sky.eor.index": -2.0}
+# Maps of nside 128 resolve baselines up to 80 m, more than half of the 630. The sampling error of one sky is 0.4 %.
+STEEP = Case(
+    "minredundant.yaml",
+    {
+        **POWER_LAW,
+        "sky.eor.nside": 128,
+        "sky.eor.seed": 2,
+        "simulation.chunks": 2,
+        "corruption.eor_level": None,
+        "sky.foregrounds": "none",
+        "variants": {"eor": {"components": ["eor"]}},
+        "outputs.figures": [],
+    },
+    {**POWER_LAW, "sky.eor.nside": 64},
+)
 
 
-class SteepSignal(Measurement):
+class SteepSignal(Step):
     """The mean of P^ over its expectation beyond a wavenumber, for all modes together and in bands."""
 
+    number = "0.2"
+    title = "Steep EoR alone"
+    proves = "P(k) proportional to k^-2 is recovered, with the window function applied to the input"
+    experiments: ClassVar = {"sky 2": STEEP}
     sections: ClassVar = ("power", "sky")
+    parameters: ClassVar = {"k_min": "0.3 h/Mpc"}
+    limits: ClassVar = {
+        "normalization": Limit(
+            "mean of estimated P over input P with window function, k > 0.3 h/Mpc",
+            Within(0.98, 1.02),
+            "2 %; at small scale 3 sampling errors",
+            small=Equal(1, 3),
+        ),
+    }
 
     k_min: Wavenumber = Field(description="Modes below are left out.")
 
-    def products(self, graph: Graph) -> Mapping[str, Task]:
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the spectra of the EoR alone, and its level."""
         eor = Variant(components=("eor",))
         return {"eor": spectra.variant_power(graph, "eor", eor), "levels": corruption.levels(graph)}
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare the modes of all experiments with the windowed input."""
         whole: list[Finding] = []
         bands: dict[tuple[float, float], list[Finding]] = {band: [] for band in itertools.pairwise(BANDS)}
-        for name in inputs.experiments:
-            found = inputs.delay_spectra(name, "eor")
-            relative = found.power.real / windowed(partial(inputs.input_power, name), found)
+        for run in runs.values():
+            found = run.delay_spectra("eor")
+            relative = found.power.real / windowed(run.input_power, found)
             resolved = 2 * np.pi * found.length * found.frequency / speed_of_light + MARGIN
-            relative[resolved > 3 * inputs.eor(name).nside - 1] = np.nan
+            relative[resolved > 3 * run.experiment.sky.eor.nside - 1] = np.nan
             k = np.hypot(found.k_perp[:, None], found.k_parallel)
             whole.append(clustered_mean(np.where(k > self.k_min, relative, np.nan)))
             for low, high in bands:

@@ -11,6 +11,7 @@ sample), is the residual of the foregrounds due to gain errors.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -28,32 +29,51 @@ from calstudy.products.files import DATA, VISIBILITIES, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.validation.means import clustered_mean
-from calstudy.validation.measurement import Findings, Inputs, Measurement, required
 from calstudy.validation.single_integration import first_integrations
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only, required
+from calstudy.verdicts.criterion import AtMost, Finding
 
 HUGE = 1e6
 
 
-class Flags(Measurement):
+class Flags(Step):
     """The largest influence, and the largest bias in sigma, of all patterns of flags."""
 
+    number = "2.3"
+    title = "Flagged channels"
+    proves = "flagged data (single channels, bands, 30 % at random) have no influence, and the residual is unbiased"
+    experiments: ClassVar = {"minredundant": MINREDUNDANT}
     sections: ClassVar = ("calibration",)
+    parameters: ClassVar = {"integrations": 4}
+    small_parameters: ClassVar = {"integrations": 1}
+    limits: ClassVar = {
+        "influence": Limit(
+            "largest change of any gain, model or residual if flagged data have other values (1e6, NaN)",
+            AtMost(0),
+            "the influence must be exactly zero",
+        ),
+        "bias": Limit(
+            "|mean Re R_even* R_odd| without EoR, in standard errors; largest value of all patterns",
+            AtMost(2),
+            "a part common to both realizations is not noise; 2 sigma, at small scale 3 for a single integration",
+            small=AtMost(3),
+        ),
+    }
 
     integrations: int = Field(1, ge=1, description="How many are calibrated, the first ones.")
 
-    def products(self, graph: Graph) -> Mapping[str, Task]:
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the foregrounds alone, and with gains and noise in both realizations."""
         variant = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
         data = {parity: corruption.data(graph, variant, parity) for parity in PARITIES}
         return {"foregrounds": required(simulation.foregrounds(graph), "foregrounds"), **data}
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Calibrate both realizations with all patterns of flags."""
-        name = inputs.only
-        settings = inputs.calibration(name)
-        data = {parity: self._read(inputs, parity, DATA) for parity in PARITIES}
-        sky = self._read(inputs, "foregrounds", VISIBILITIES)
+        run = only(runs)
+        settings = run.experiment.calibration
+        data = {parity: self._read(run.products[parity] / DATA) for parity in PARITIES}
+        sky = self._read(run.products["foregrounds"] / VISIBILITIES)
         influence, biases, remarks = 0.0, {}, []
         for pattern, flags in patterns(data["even"]).items():
             results = {parity: run_calibrator(settings, flagged(uvd, flags), sky) for parity, uvd in data.items()}
@@ -68,8 +88,8 @@ class Flags(Measurement):
         values = {"influence": Finding(influence, 0.0), "bias": Finding(abs(worst.value), worst.uncertainty)}
         return Findings(values, tuple(remarks))
 
-    def _read(self, inputs: Inputs, product: str, file: str) -> UVData:
-        return first_integrations(read_visibilities(inputs.folder(inputs.only, product) / file), self.integrations)
+    def _read(self, path: Path) -> UVData:
+        return first_integrations(read_visibilities(path), self.integrations)
 
 
 def patterns(data: UVData) -> dict[str, np.ndarray]:

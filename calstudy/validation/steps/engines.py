@@ -6,7 +6,8 @@ The closed form: one source of flux I at s, seen by dishes of power beam A, give
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
@@ -28,8 +29,8 @@ from calstudy.simulate.interface import Engine
 from calstudy.simulate.nodes import integration_times
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import SyntheticSources
-from calstudy.validation.measurement import Findings, Inputs, Measurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import Findings, Limit, Step, StepInput
+from calstudy.verdicts.criterion import AtMost, Finding
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -50,19 +51,42 @@ OFFSETS = ((0.0, 0.0), (6.0, 20.0), (15.0, 200.0), (40.0, 310.0))
 """Directions of the single source: degrees from the zenith, azimuth in degrees (north through east)."""
 
 
-class Engines(Measurement):
+class Engines(Step):
     """The largest differences of the engines from pyuvsim, over the rms, and from the closed form."""
 
     version: ClassVar[int] = 2
+    number = "-1"
+    title = "Engines"
+    proves = "simulation engines agree with pyuvsim and with closed forms"
+    parameters: ClassVar = {
+        "sources": 5000,
+        "antennas": 12,
+        "channels": 2,
+        "times": 2,
+        "engines": ["dense", "matvis", "fftvis", "pyuvsim"],
+    }
+    small_parameters: ClassVar = {"sources": 300, "antennas": 5, "times": 1, "engines": ["dense", "pyuvsim"]}
+    limits: ClassVar = {
+        "double_pyuvsim": Limit(
+            "largest difference of an engine in double precision from pyuvsim, over the rms of the visibilities",
+            AtMost(1e-6),
+            "-60 dB in brightness, 20 dB below the EoR",
+        ),
+        "double_closed_form": Limit(
+            "largest relative difference from A(s) I exp(2 pi i b.s) / 2 for single sources, double precision",
+            AtMost(1e-6),
+            "as above; only the coordinates of the sky are shared with the engines",
+        ),
+    }
+
     engines: Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
     sources: int = Field(ge=1, description="Brightest sources of the whole sky.")
     antennas: int = Field(ge=2, le=36, description="First tiles of the minimally redundant array.")
     channels: int = Field(ge=1, description="Spread over the paper's band.")
     times: int = Field(ge=1, description="Integrations, spread over the paper's.")
 
-    def measure(self, inputs: Inputs) -> Findings:
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Run all engines on the same simulation, and on single sources."""
-        del inputs
         compared = [item for item in CANDIDATES if item[0] in self.engines]
         errors, closed = self.errors(compared), {item: closed_form_error(*item) for item in compared}
         both = {**errors, **{key: max(errors.get(key, 0.0), value) for key, value in closed.items()}}
