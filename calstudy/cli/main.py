@@ -23,7 +23,6 @@ from calstudy import __version__
 from calstudy.base.errors import DiskError, ExperimentError, InputError, Terminated, exit_status, refusal_of_disk
 from calstudy.base.mwa_files import MWA_FILES
 from calstudy.cli.calibrate import calibrate
-from calstudy.cli.check import check_app
 from calstudy.cli.compare_gains import compare_gains
 from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.regress import regress
@@ -52,7 +51,6 @@ app.command()(init)
 app.command()(schema)
 app.command()(runs)
 app.command()(store)
-app.add_typer(check_app, name="check")
 
 EXIT_INPUT = 2
 EXIT_INTERRUPTED = 130

@@ -59,6 +59,10 @@ class StudyFigure(Plugin):
         True if the experiment must calibrate data with the EoR and without.
     needs_least_squares
         True if the calibrator must fit by least squares: it is repeated, or its tangent space is needed.
+    needs_foregrounds
+        True if the sky must have foregrounds.
+    sections
+        Sections of the experiment that it reads; see `settings`.
     shows_sky
         True if a stand-in for sky, beam or scale enters it, and so is printed on it.
     tolerances
@@ -72,6 +76,8 @@ class StudyFigure(Plugin):
     needs_calibration: ClassVar[bool] = False
     needs_signal_loss: ClassVar[bool] = False
     needs_least_squares: ClassVar[bool] = False
+    needs_foregrounds: ClassVar[bool] = False
+    sections: ClassVar[tuple[str, ...]] = ()
     shows_sky: ClassVar[bool] = True
     tolerances: ClassVar[Rules] = ()
 
@@ -82,6 +88,8 @@ class StudyFigure(Plugin):
         missing = [name for name in self.variants if name not in experiment.variants]
         if missing:
             return f"needs the variant(s) {', '.join(missing)}"
+        if self.needs_foregrounds and not experiment.sky.has_foregrounds:
+            return "needs foregrounds, and sky.foregrounds is 'none'"
         residual = experiment.variants.get("residual")
         complete = residual and residual.effects and residual.calibrate and "foregrounds" in residual.components
         if self.needs_calibration and not complete:
@@ -95,14 +103,14 @@ class StudyFigure(Plugin):
             return "needs a calibrator that fits by least squares, such as calamity"
         return None
 
-    @abstractmethod
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the products that the figure shows, by names of its own."""
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return further settings that the figure takes from the experiment: sections and JSON-able values."""
+        """Return the products that the figure shows, by names of its own; by default none."""
         del graph
         return {}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return further settings that the figure takes from the experiment: by default its `sections`."""
+        return {name: getattr(graph.experiment, name) for name in self.sections}
 
     @abstractmethod
     def draw(self, job: Job) -> Drawing:
@@ -204,11 +212,6 @@ class ObservedFigure(StudyFigure):
     def refusal(self, experiment: Experiment) -> str:
         """Refuse: an experiment has no measured data."""
         return "shows measured data, and cannot be drawn of an experiment"
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: there is no experiment to show."""
-        del graph
-        return {}
 
     @abstractmethod
     def observed_inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:

@@ -18,11 +18,12 @@ from calstudy.experiment.files import override, parse_override, validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment, Outputs
 from calstudy.experiment.yaml_files import read_mapping
+from calstudy.products.files import read_json
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import product_entries, publish, run_folder, write, write_manifest
 from calstudy.studies.study import Budget, Made, Study, run_study
-from calstudy.validation.step import MINREDUNDANT, STEPS, Case, Measured, Step, inputs_of, step_task
+from calstudy.validation.step import FINDINGS, MINREDUNDANT, STEPS, Case, Step, inputs_of, step_task
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, to_json, to_markdown
 
@@ -60,10 +61,8 @@ class Ladder(Study):
         """Return the ladder with all experiments cut to the memory, and the smallest number of workers of all."""
         steps, counts = [], []
         for step, experiments in self.steps:
-            if not self._measures(step):
-                steps.append((step, experiments))
-                continue
-            fits = {name: fit(item, budget, partial(_products, step)) for name, item in experiments.items()}
+            measured = {} if step.number in self.failures else experiments
+            fits = {name: fit(item, budget, partial(_products, step)) for name, item in measured.items()}
             steps.append((step, {name: experiment for name, (experiment, _) in fits.items()}))
             counts += [count for _, count in fits.values()]
         return self.with_steps(steps), min(counts, default=budget.workers or 1)
@@ -71,10 +70,8 @@ class Ladder(Study):
     @cached_property
     def measurements(self) -> dict[str, Task]:
         """The measurement of each step that is measured, by its number."""
-        return {step.number: step_task(step, experiments) for step, experiments in self.steps if self._measures(step)}
-
-    def _measures(self, step: Step) -> bool:
-        return step.number not in self.failures
+        measured = [item for item in self.steps if item[0].number not in self.failures]
+        return {step.number: step_task(step, experiments) for step, experiments in measured}
 
     @property
     def targets(self) -> list[Task]:
@@ -93,16 +90,15 @@ class Ladder(Study):
         keys = {number: task.key for number, task in self.measurements.items()}
         return run_folder(self.outputs.runs, self.name, keys)
 
-    def judge(self, made: Made) -> list[tuple[Step, list[Verdict], tuple[str, ...]]]:
+    def judge(self, made: Made) -> list[tuple[Step, list[Verdict], list[str]]]:
         """Return each step with the verdicts on its limits, and the remarks of its measurement."""
-        found = []
-        for step, _ in self.steps:
-            if self._measures(step):
-                measured = Measured.read(step, made.products[self.measurements[step.number].key].path)
-                found.append((step, step.judge(measured), measured.remarks))
-            else:
-                found.append((step, step.judge(None, self.failures[step.number]), ()))
-        return found
+        return [(step, *self._judged(step, made)) for step, _ in self.steps]
+
+    def _judged(self, step: Step, made: Made) -> tuple[list[Verdict], list[str]]:
+        if (reason := self.failures.get(step.number)) is not None:
+            return [statement.unevaluated(reason) for statement in step.statements()], []
+        measured = read_json(made.products[self.measurements[step.number].key].path / FINDINGS)
+        return step.judge(measured["findings"]), measured["remarks"]
 
     def fill(self, made: Made) -> None:
         """Write the table of all limits, the files of each measurement, and the manifest."""

@@ -115,28 +115,17 @@ class StepInput(RunResults):
         return read_delay_spectra(self.products[product])
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """The numbers of a step, as its product has them: value and uncertainty, null if not finite, by name."""
 
     name: str
     findings: Mapping[str, Mapping[str, float | None]]
-    remarks: tuple[str, ...]
-
-    @classmethod
-    def read(cls, step: Step, folder: Path) -> Measured:
-        """Read the product of a step."""
-        found = read_json(folder / FINDINGS)
-        return cls(step.number, found["findings"], tuple(found["remarks"]))
 
     def finding(self, name: str) -> Finding:
         """Return one of the numbers; raises Unevaluated if there is none."""
-        found = self.findings.get(name)
-        if found is None:
+        if name not in self.findings:
             raise Unevaluated("not measured")
-        value, uncertainty = found["value"], found["uncertainty"]
-        if value is None or uncertainty is None:
-            raise Unevaluated("not a finite number")
+        value, uncertainty = (math.nan if item is None else item for item in self.findings[name].values())
         return Finding(value, uncertainty)
 
 
@@ -189,10 +178,9 @@ class Step(Paper):
                 found.append(LimitStatement(*texts, (ROLE,), partial(Measured.finding, name=name), ""))
         return found
 
-    def judge(self, measured: Measured | None, reason: str = "") -> list[Verdict]:
-        """Return the verdicts on the measured numbers; without any, the reason."""
-        if measured is None:
-            return [statement.unevaluated(reason) for statement in self.statements()]
+    def judge(self, findings: Mapping[str, Any]) -> list[Verdict]:
+        """Return the verdicts on measured numbers, as `measure` of this module writes them."""
+        measured = Measured(", ".join(self.experiments) or self.label, findings)
         return [statement.evaluate({ROLE: measured}, self.roles) for statement in self.statements()]
 
 

@@ -11,7 +11,6 @@ from calstudy.base.errors import InputError
 from calstudy.power.spectra import DelaySpectra
 from calstudy.validation.ladder import SCALES, load_ladder, passed, tally
 from calstudy.validation.means import clustered_mean, pooled
-from calstudy.validation.step import Measured
 from calstudy.validation.steps.steep_signal import windowed
 from calstudy.verdicts.criterion import Finding
 
@@ -131,7 +130,7 @@ def test_small_scale_has_limits_of_its_own_only_where_a_step_says_so():
 def test_a_number_that_is_missing_or_not_finite_does_not_pass():
     ((step, _),) = load_ladder(["0.0"]).steps
     found = {"mean_real": {"value": 0.0, "uncertainty": 1.0}, "mean_imaginary": {"value": None, "uncertainty": 1.0}}
-    verdicts = step.judge(Measured("0.0", found, ()))
+    verdicts = step.judge(found)
     assert [verdict.verdict for verdict in verdicts] == ["not evaluated", "PASS", "not evaluated"]
     assert not passed(verdicts)
     assert tally(verdicts) == "0 of 1 steps pass, 1 of 3 criteria"

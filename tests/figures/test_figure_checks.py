@@ -8,13 +8,13 @@ from astropy import units
 from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError
 from calstudy.experiment.files import validate
+from calstudy.figures.beam_fit import compare_interpolations, draw_interpolations
+from calstudy.figures.delay_floor import compare_floors, draw_delay_floors
+from calstudy.figures.source_counts import count_sources, draw_counts
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.sky.counts import draw_population
-from calstudy.validation.beam_interpolation import compare_interpolations, draw_interpolations
-from calstudy.validation.delay_floor import compare_floors, draw_delay_floors
-from calstudy.validation.source_counts import count_sources, draw_counts
 
 SMALL = {
     "name": "small",
@@ -63,7 +63,7 @@ def test_the_smooth_fit_is_nearest_to_the_table():
 
 def test_a_smooth_beam_has_the_lowest_floor():
     experiment = validate(SMALL, Path())
-    floors = compare_floors(experiment)
+    floors = compare_floors(experiment.instrument, experiment.sky, experiment.simulation)
     peaks = {name: floor.floors["dolph-chebyshev"].worst_db for name, floor in floors.items()}
     assert peaks["chebyshev"] < peaks["linear"] - 10
     assert peaks["linear"] < peaks["nearest"] - 10
@@ -71,6 +71,8 @@ def test_a_smooth_beam_has_the_lowest_floor():
     assert len(draw_delay_floors(floors, -40.0).axes) == 2
 
 
-def test_a_formula_is_not_interpolated():
-    with pytest.raises(InputError, match="gaussian is a formula"):
-        compare_interpolations(InstrumentSettings(beam={"kind": "gaussian"}))
+@pytest.mark.parametrize("figure", ["beam-fit", "delay-floor"])
+def test_a_formula_is_not_interpolated(figure):
+    instrument = {**SMALL["instrument"], "beam": "gaussian"}
+    with pytest.raises(ExperimentError, match=f"asks for '{figure}', which .* gaussian is a formula"):
+        validate({**SMALL, "instrument": instrument, "outputs": {"figures": [figure]}}, Path())

@@ -1,20 +1,25 @@
-"""Interpolations of a tabulated beam in frequency: the smooth fit against the table, and others against the fit."""
+"""Check of the beam: its smooth fit in frequency against the table, and other interpolations against the fit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin
+from calstudy.experiment.model import Experiment
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
-from calstudy.instrument.beams import GriddedBeam, make_beam
 from calstudy.instrument.settings import Channels, InstrumentSettings
 from calstudy.plotting import style
+from calstudy.run.task import Job
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from calstudy.instrument.beams import GriddedBeam
 
 INTERPOLATIONS = get_args(MwaEmbeddedBeam.model_fields["interpolation"].annotation)
 SMOOTH = INTERPOLATIONS[0]
@@ -43,20 +48,15 @@ class BeamInterpolation:
     others: dict[str, np.ndarray]
 
 
-def require_tabulated(beam: Plugin) -> None:
-    """Raise InputError for a beam in closed form, which is not interpolated."""
-    if not hasattr(beam, "interpolation"):
-        raise InputError(
-            f"instrument.beam: {beam.label} is a formula, exact at every frequency; there is no fit to check"
-        )
+def not_tabulated(experiment: Experiment) -> str | None:
+    """Return a refusal of a beam in closed form, which is not interpolated, or None."""
+    if hasattr(experiment.instrument.beam, "interpolation"):
+        return None
+    return f"checks the fit of a beam, and {experiment.instrument.beam.label} is a formula, exact at every frequency"
 
 
 def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> BeamInterpolation:
-    """Compare the smooth fit of a beam with its table, and other interpolations with the fit at every `step`th channel.
-
-    Raises InputError if the beam is not tabulated.
-    """
-    require_tabulated(instrument.beam)
+    """Compare a beam's fit with its table, and other interpolations with the fit at every `step`th channel."""
     beams = {name: interpolated(instrument.beam, instrument.channels, name) for name in INTERPOLATIONS}
     tabulated = beams[SMOOTH].tabulated_frequencies
     difference = _difference(beams[SMOOTH], beams["nearest"], tabulated)
@@ -75,6 +75,8 @@ def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> Bea
 
 def interpolated(beam: Plugin, channels: Channels, interpolation: str) -> GriddedBeam:
     """Return a tabulated beam, fitted over the channels, with one of `INTERPOLATIONS` between its frequencies."""
+    from calstudy.instrument.beams import GriddedBeam, make_beam
+
     found = make_beam(beam.model_copy(update={"interpolation": interpolation}), channels)
     assert isinstance(found, GriddedBeam)
     return found
@@ -108,3 +110,21 @@ def draw_interpolations(found: BeamInterpolation, stand_ins: Sequence[str] = ())
     figure.legend(loc="outside upper center", ncols=2)
     style.note_stand_ins(figure, stand_ins)
     return figure
+
+
+class BeamFitFigure(StudyFigure):
+    """The smooth fit of a tabulated beam in frequency against its table, and other interpolations against the fit."""
+
+    caption = "Interpolations of the beam in frequency: differences of Jones components over the zenith."
+    sections = ("instrument",)
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Refuse a beam in closed form."""
+        return not_tabulated(experiment)
+
+    def draw(self, job: Job) -> Drawing:
+        """Compare the interpolations."""
+        found = compare_interpolations(job.settings["instrument"])
+        rms = {name: float(np.sqrt(np.mean(values**2))) for name, values in found.others.items()}
+        fit = {"rms": float(np.sqrt(np.mean(found.fit_rms**2))), "largest": float(found.fit_max.max())}
+        return Drawing(draw_interpolations(found, job.settings["notes"]), found, {"fit": fit, "rms_to_fit": rms})

@@ -1,25 +1,34 @@
-"""Comparison of the foregrounds that two engines simulate."""
+"""Check of the engine: the foregrounds, and the same foregrounds simulated completely by another engine."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.corrupt.levels import rms
+from calstudy.experiment.model import Experiment
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.delay_floor import folded_spectrum
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
-from calstudy.simulate.floor import DelayFloor, Taper, delay_floor, delay_profile, floor_buffers, length_bins
-from calstudy.validation.delay_floor import folded_spectrum
+from calstudy.products import simulation
+from calstudy.products.files import VISIBILITIES, read_visibilities
+from calstudy.products.graph import Graph, required
+from calstudy.run.task import Job, Task
+from calstudy.simulate.settings import ENGINES, SimulationSettings
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from pyuvdata import UVData
+
+    from calstudy.simulate.floor import DelayFloor, Taper
 
 GROUPS = 6
 SHORT_AND_LONG = (style.BLUE, style.RED)
@@ -63,24 +72,6 @@ class EngineAgreement:
     floors: dict[Taper, DelayFloor]
     differences: dict[Taper, DelayFloor]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the numbers, without the delay spectra."""
-        groups = [
-            {key: value for key, value in asdict(group).items() if not isinstance(value, np.ndarray)}
-            for group in self.groups
-        ]
-        worst = {
-            taper: {"foregrounds_db": floor.worst_db, "difference_db": self.differences[taper].worst_db}
-            for taper, floor in self.floors.items()
-        }
-        return {
-            "largest": self.largest,
-            "rms": self.rms,
-            "worst_slot": self.worst_slot,
-            "groups": groups,
-            "beyond_horizon": worst,
-        }
-
 
 def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreement:
     """Compare two simulations of the same sky, beam and observation, in Jy on equally spaced channels.
@@ -88,6 +79,8 @@ def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreeme
     Raises InputError if the band leaves no delays beyond the horizon of the longest baseline, and ValueError if the
     observations differ.
     """
+    from calstudy.simulate.floor import delay_floor, floor_buffers
+
     for name in ("baseline_array", "time_array", "freq_array", "polarization_array"):
         if not np.array_equal(getattr(foregrounds, name), getattr(reference, name)):
             raise ValueError(f"the two simulations differ in {name}, expected the same observation")
@@ -114,6 +107,8 @@ def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreeme
 
 
 def _groups(reference: UVData, difference: UVData, taper: Taper) -> tuple[GroupAgreement, ...]:
+    from calstudy.simulate.floor import delay_profile, length_bins
+
     lengths = np.linalg.norm(baseline_vectors(reference), axis=1)
     edges, bins = length_bins(lengths, GROUPS)
     delays, power = delay_profile(reference, taper)
@@ -181,3 +176,55 @@ def _draw_spectra(axes: Axes, group: GroupAgreement, colour: str) -> None:
         level = 10 * np.log10(np.maximum(values, np.finfo(float).tiny))
         axes.plot(group.delay * 1e9, level, line, color=colour, linewidth=0.9, label=label)
     axes.axvline(horizon_delay(group.longest) * 1e9, color=colour, linestyle="--", linewidth=0.6)
+
+
+class EngineAgreementFigure(StudyFigure):
+    """The foregrounds against the same foregrounds from another engine, by baseline length and in delay."""
+
+    caption = "Foregrounds of two simulation engines: difference in delay and by baseline length."
+    needs_foregrounds = True
+
+    against: str = Field("pyuvsim", description="The engine that is compared with.")
+    node_tolerance: float | None = Field(
+        None, gt=0, lt=1e-2, description="`simulation.nodes.tolerance` of that engine; by default the experiment's."
+    )
+    tolerance: float | None = Field(
+        None, gt=0, description="The run warns if any visibility differs by more, in units of the rms."
+    )
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Refuse an experiment without foregrounds, or of the same engine."""
+        same = ENGINES.make(self.against) == experiment.simulation.engine
+        refusal = f"compares {self.against} with itself: simulation.engine is the same" if same else None
+        return super().refusal(experiment) or refusal
+
+    def _simulation(self, own: SimulationSettings) -> SimulationSettings:
+        nodes = own.nodes.model_copy(update={"tolerance": self.node_tolerance or own.nodes.tolerance})
+        return own.model_copy(update={"engine": ENGINES.make(self.against), "nodes": nodes})
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the foregrounds from both engines."""
+        experiment = graph.experiment
+        other = Graph(experiment.model_copy(update={"simulation": self._simulation(experiment.simulation)}))
+        return {"own": required(simulation.foregrounds(graph)), "against": required(simulation.foregrounds(other))}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return the names of the engines, the sum of the tolerances of their nodes, and the level of the EoR."""
+        both = (graph.experiment.simulation, self._simulation(graph.experiment.simulation))
+        return {
+            "engines": [item.engine.label for item in both],
+            "node_tolerances": sum(item.nodes.tolerance for item in both if item.nodes.enabled),
+            "eor_level": graph.experiment.corruption.eor_level,
+        }
+
+    def draw(self, job: Job) -> Drawing:
+        """Compare the two simulations."""
+        own, other = (read_visibilities(job.inputs[name] / VISIBILITIES) for name in ("own", "against"))
+        found = compare_simulations(own, other)
+        first, second = job.settings["engines"]
+        allowed, level = job.settings["node_tolerances"], job.settings["eor_level"]
+        figure = draw_engine_agreement(found, (first, second), allowed, level, job.settings["notes"])
+        beyond = self.tolerance is not None and found.largest > self.tolerance
+        text = f"{first} and {second} differ by {found.largest:.1e} of the rms, more than {self.tolerance}"
+        numbers = {"largest": found.largest, "rms": found.rms, "worst_slot": found.worst_slot}
+        return Drawing(figure, found, {**numbers, "warnings": [text] if beyond else []})

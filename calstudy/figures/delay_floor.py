@@ -1,34 +1,33 @@
-"""The delay floor of an experiment's foregrounds for every interpolation of its beam between tabulated frequencies."""
+"""Check of the beam: the delay floor of foregrounds for every interpolation between its tabulated frequencies."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors, from_cube
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.beam_fit import INTERPOLATION_COLOURS, INTERPOLATIONS, interpolated, not_tabulated
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
-from calstudy.simulate.chunks import simulate_visibilities
-from calstudy.simulate.floor import MAIN_LOBES, DelayFloor, delay_floor, delay_profile, floor_buffers
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job
 from calstudy.simulate.nodes import integration_times
-from calstudy.sky.foregrounds import make_foregrounds
-from calstudy.validation.beam_interpolation import (
-    INTERPOLATION_COLOURS,
-    INTERPOLATIONS,
-    interpolated,
-    require_tabulated,
-)
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from pyuvdata import UVData
+
+    from calstudy.instrument.settings import InstrumentSettings
+    from calstudy.simulate.floor import DelayFloor
+    from calstudy.simulate.settings import SimulationSettings
+    from calstudy.sky.settings import SkySettings
 
 PAPER_FLOOR = -45.0
 """Artefacts of beam interpolation in the paper, dB of brightness."""
@@ -51,32 +50,32 @@ class InterpolationFloor:
 
 
 def compare_floors(
-    experiment: Experiment, announce: Callable[[str], None] = lambda text: None
+    instrument: InstrumentSettings, sky: SkySettings, simulation: SimulationSettings
 ) -> dict[str, InterpolationFloor]:
-    """Simulate the foregrounds of an experiment at its middle integration, once with every interpolation.
+    """Simulate foregrounds at the middle integration, once with every interpolation of a tabulated beam.
 
-    Every channel is simulated, so that only the beam is interpolated. `announce` is called with the name of each
-    interpolation before its simulation. Raises InputError if the beam is not tabulated, or a catalogue or beam file is
-    missing.
+    Every channel is simulated, so that only the beam is interpolated.
     """
-    instrument = experiment.instrument
-    require_tabulated(instrument.beam)
+    from calstudy.instrument.telescope import make_template, subset_template
+    from calstudy.simulate.chunks import simulate_visibilities
+    from calstudy.sky.foregrounds import make_foregrounds
+
     whole = make_template(instrument)
     times = integration_times(whole)
     template = subset_template(whole, times[len(times) // 2 :][:1], whole.freq_array)
-    sky = make_foregrounds(experiment.sky.foregrounds, whole.freq_array, experiment.sky.diffuse).sky
-    engine = experiment.simulation.engine
-    accuracy = experiment.simulation.nodes.for_foregrounds(smooth_beam=False, smooth_sky=False)
+    sources = make_foregrounds(sky.foregrounds, whole.freq_array, sky.diffuse).sky
+    accuracy = simulation.nodes.for_foregrounds(smooth_beam=False, smooth_sky=False)
     floors = {}
     for name in INTERPOLATIONS:
-        announce(name)
         beam = interpolated(instrument.beam, instrument.channels, name)
-        cube = simulate_visibilities(engine, sky, beam, template, accuracy)
+        cube = simulate_visibilities(simulation.engine, sources, beam, template, accuracy)
         floors[name] = _measure(from_cube(template, cube))
     return floors
 
 
 def _measure(foregrounds: UVData) -> InterpolationFloor:
+    from calstudy.simulate.floor import MAIN_LOBES, delay_floor, delay_profile, floor_buffers
+
     buffers = floor_buffers(foregrounds)
     if len(buffers) < len(MAIN_LOBES):
         raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")
@@ -135,3 +134,25 @@ def draw_delay_floors(
 def _draw_steps(axes: Axes, floor: InterpolationFloor, taper: str, colour: str, line: str) -> None:
     measured = floor.floors[taper]
     axes.stairs(measured.rms_db, measured.edges, baseline=None, linewidth=1.0, color=colour, linestyle=line)
+
+
+class DelayFloorFigure(StudyFigure):
+    """The delay floor of the foregrounds at one integration, for every interpolation of the beam in frequency."""
+
+    caption = "Delay floor of the foregrounds for every interpolation of the beam in frequency."
+    needs_foregrounds = True
+    sections = ("instrument", "sky", "simulation")
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Refuse an experiment without foregrounds, or with a beam in closed form."""
+        return super().refusal(experiment) or not_tabulated(experiment)
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return what is simulated, and the level of the EoR."""
+        return {**super().settings(graph), "eor_level": graph.experiment.corruption.eor_level}
+
+    def draw(self, job: Job) -> Drawing:
+        """Simulate with every interpolation."""
+        floors = compare_floors(**{name: job.settings[name] for name in self.sections})
+        notes = {name: {taper: found.worst_db for taper, found in item.floors.items()} for name, item in floors.items()}
+        return Drawing(draw_delay_floors(floors, job.settings["eor_level"], job.settings["notes"]), floors, notes)

@@ -1,20 +1,21 @@
-"""Differential source counts of a foreground sky, compared with published counts."""
+"""Check of the sky: differential source counts of the foregrounds, compared with published counts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import healpy
 import numpy as np
-from astropy import units
-from astropy.coordinates import SkyCoord
-from matplotlib.figure import Figure
-from pyradiosky import SkyModel
 
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
+from calstudy.run.task import Job
 from calstudy.sky.counts import FREQUENCY, differential_counts
-from calstudy.sky.foregrounds import in_complete_area
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pyradiosky import SkyModel
 
 BINS = 12
 POINTS_PER_BIN = 50
@@ -61,6 +62,10 @@ def count_sources(sky: SkyModel, faint: float = 0.1, bright: float = 4.0) -> Sou
 
     Flat spectra are counted at their constant flux density.
     """
+    from astropy import units
+
+    from calstudy.sky.foregrounds import in_complete_area
+
     if sky.spectral_type != "flat":
         sky = sky.at_frequencies(np.array([FREQUENCY]) * units.Hz, inplace=False, run_check=False)
     flux = sky.stokes[0, 0].to_value("Jy")
@@ -79,6 +84,11 @@ def count_sources(sky: SkyModel, faint: float = 0.1, bright: float = 4.0) -> Sou
 
 
 def _area() -> float:
+    import healpy
+    from astropy.coordinates import SkyCoord
+
+    from calstudy.sky.foregrounds import in_complete_area
+
     longitude, latitude = healpy.pix2ang(AREA_NSIDE, np.arange(healpy.nside2npix(AREA_NSIDE)), lonlat=True)
     pixels = SkyCoord(longitude, latitude, unit="deg", frame="icrs")
     return float(4 * np.pi * in_complete_area(pixels).mean())
@@ -105,3 +115,21 @@ def draw_counts(counts: SourceCounts, stand_ins: Sequence[str] = ()) -> Figure:
     lower.set(xlabel="flux density at 200 MHz (Jy)", ylabel="ratio", ylim=(1 - largest, 1 + largest))
     style.note_stand_ins(figure, stand_ins)
     return figure
+
+
+class SourceCountsFigure(StudyFigure):
+    """The differential source counts of the foreground sky, over those of Franzen et al. (2019)."""
+
+    caption = "Differential source counts at 200 MHz, and their ratio to those of Franzen et al. (2019)."
+    needs_foregrounds = True
+    sections = ("sky", "instrument")
+
+    def draw(self, job: Job) -> Drawing:
+        """Count the sources."""
+        from calstudy.instrument.telescope import make_template
+        from calstudy.sky.foregrounds import make_foregrounds
+
+        frequencies = make_template(job.settings["instrument"]).freq_array
+        counts = count_sources(make_foregrounds(job.settings["sky"].foregrounds, frequencies).sky)
+        notes = {"largest_deviation": float(np.abs(counts.ratio - 1).max())}
+        return Drawing(draw_counts(counts, job.settings["notes"]), counts, notes)

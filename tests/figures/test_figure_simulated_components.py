@@ -6,24 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from astropy.cosmology import Planck15
-from rich.console import Console
-from typer.testing import CliRunner
 
 from calstudy.base.visibilities import baseline_vectors, from_cube
-from calstudy.cli.main import app
 from calstudy.experiment.files import validate
+from calstudy.figures.simulated_components import draw_components, measure_components
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.telescope import make_template
 from calstudy.power.drawn import input_power
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.sky.eor import EorField
 from calstudy.sky.settings import Eor
-from calstudy.studies.components import make_component
-from calstudy.validation.simulated_components import draw_components, measure_components
-
-DRAWN = True
 
 SETTINGS = {
     "name": "look",
@@ -72,29 +65,3 @@ def test_input_power_is_in_little_h_and_millikelvin():
     np.testing.assert_allclose(flat, 1e8 * h**3)
     steep = input_power(Eor(spectrum="power-law", index=-2.0, amplitude="100 K2 Mpc3"), k, "Planck15")
     np.testing.assert_allclose(steep, 1e8 * h**3 * np.array([1, 1 / 16]))
-
-
-def test_the_command_uses_what_is_in_the_store(tmp_path: Path):
-    small = {
-        **SETTINGS,
-        "sky": {**SETTINGS["sky"], "eor": {"nside": 16}},
-        "outputs": {"store": str(tmp_path / "store")},
-    }
-    file = tmp_path / "components.yaml"
-    file.write_text(yaml.safe_dump(small))
-    call = ["check", "simulation", str(file), "--workers", "1", "--output", str(tmp_path / "checks")]
-    first = CliRunner().invoke(app, call)
-    assert first.exit_code == 0, first.output
-    assert {path.name for path in (tmp_path / "checks").glob("simulation.*")} == {
-        f"simulation.{ending}" for ending in ("npz", "pdf", "png")
-    }
-    assert "simulate" not in CliRunner().invoke(app, call).output
-    without = {
-        "sky": {"foregrounds": "none"},
-        "variants": {"eor": {"components": ["eor"]}},
-        "corruption": {"eor_level": None},
-        "outputs": {**small["outputs"], "figures": []},
-    }
-    experiment = validate({**small, **without}, tmp_path)
-    with pytest.raises(ValueError, match=r"sky\.foregrounds: this experiment simulates none"):
-        make_component(experiment, "foregrounds", tmp_path / "log", Console(quiet=True))

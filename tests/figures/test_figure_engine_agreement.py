@@ -7,20 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from typer.testing import CliRunner
 
+from calstudy.base.errors import ExperimentError
 from calstudy.base.visibilities import baseline_vectors, from_cube
-from calstudy.cli.main import app
-from calstudy.experiment.files import load
+from calstudy.experiment.files import validate
+from calstudy.figures.engine_agreement import compare_simulations, draw_engine_agreement
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
-from calstudy.products import simulation
-from calstudy.products.graph import Graph
-from calstudy.run.store import Store
-from calstudy.validation.engine_agreement import compare_simulations, draw_engine_agreement
-
-DRAWN = True
+from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.study import Budget, run_study
 
 INSTRUMENT = {
     "layout": {"kind": "mwa-compact-minredundant", "count": 6},
@@ -87,39 +82,47 @@ def test_other_observations_are_refused(template):
         compare_simulations(flat(other), flat(template))
 
 
-def test_the_command_makes_both_once_and_keeps_them_where_a_run_finds_them(tmp_path: Path):
-    pytest.importorskip("matvis", reason="needs the extra [engines]")
-    file = tmp_path / "small.yaml"
-    settings = {
-        "name": "small",
-        "instrument": INSTRUMENT,
-        "sky": {"foregrounds": {"kind": "g4jy-and-counts", "count": 100}},
-        "simulation": {"chunks": 1, "engine": "dense"},
-        "outputs": {"store": str(tmp_path / "store")},
-    }
-    file.write_text(yaml.safe_dump(settings))
-    call = [
-        "check",
-        "engine",
-        str(file),
-        "--reference",
-        "matvis",
-        "--workers",
-        "1",
-        "--output",
-        str(tmp_path / "checks"),
+SMALL = {
+    "name": "small",
+    "instrument": {**INSTRUMENT, "times": {"count": 1}},
+    "sky": {"foregrounds": {"kind": "g4jy-and-counts", "count": 100}, "eor": {"nside": 16}},
+    "simulation": {"chunks": 1, "engine": "dense"},
+    "variants": {"foregrounds": {"components": ["foregrounds"]}},
+}
+
+
+def test_a_run_compares_engines_and_shows_the_components_from_one_simulation(tmp_path: Path):
+    """What a run has simulated is used, and a difference beyond the tolerance is a warning."""
+    engines = {"kind": "engine-agreement", "node_tolerance": 1e-6, "tolerance": 1e-17}
+    outputs = {"store": str(tmp_path / "store"), "runs": str(tmp_path), "figures": [engines, "simulated-components"]}
+    study = ExperimentStudy(validate({**SMALL, "outputs": outputs}, tmp_path))
+    assert [task.label for task in study.tasks if task.stage.name == "simulate"] == [
+        "foregrounds",
+        "foregrounds",
+        "eor",
     ]
-    loose = ["--reference-set", "simulation.nodes.tolerance=1e-6", "--tolerance", "1e-5"]
-    first = CliRunner().invoke(app, [*call, *loose])
-    assert first.exit_code == 0, first.output
-    numbers = json.loads((tmp_path / "checks" / "engine.json").read_text())
-    assert 1e-16 < numbers["largest"] < 1e-6
-    overrides = ["simulation.engine=matvis", "simulation.nodes.tolerance=1e-6", "simulation.chunks=3"]
-    task = simulation.foregrounds(Graph(load(file, None, overrides)))
-    assert task.key == numbers["simulations"][1]["key"]
-    assert Store(tmp_path / "store").verify(task.stage.name, task.key) is not None
-    again = CliRunner().invoke(app, [*call, *loose[:2], "--tolerance", "1e-17"])
-    assert "simulate" not in again.output
-    assert again.exit_code == 1
-    same = CliRunner().invoke(app, ["check", "engine", str(file), "--reference", "dense"])
-    assert "own engine" in str(same.exception)
+    run = run_study(study, Budget(1))
+    (warning,) = [text for text in run.warnings if "pyuvsim" in text]
+    assert warning.startswith("figure (engine-agreement): dense and pyuvsim differ by")
+    notes = {
+        item["label"]: item["notes"] for item in json.loads((run.folder / "manifest.json").read_text())["products"]
+    }
+    assert 1e-16 < notes["engine-agreement"]["largest"] < 1e-6
+    with np.load(run.folder / "figures" / "simulated-components.npz") as arrays:
+        assert arrays["baselines.0.eor"].shape == arrays["baselines.2.foregrounds"].shape == (96,)
+
+
+def test_an_engine_is_not_compared_with_itself(tmp_path: Path):
+    outputs = {"figures": [{"kind": "engine-agreement", "against": "dense"}]}
+    with pytest.raises(ExperimentError, match="compares dense with itself"):
+        validate({**SMALL, "outputs": outputs}, tmp_path)
+    outputs = {"figures": [{"kind": "engine-agreement", "against": "fast"}]}
+    with pytest.raises(ExperimentError, match=r"outputs\.figures\.0: 'fast' is not an engine"):
+        validate({**SMALL, "outputs": outputs}, tmp_path)
+
+
+def test_without_foregrounds_there_is_nothing_to_compare(tmp_path: Path):
+    without = {"foregrounds": "none", "eor": {"nside": 16}}
+    settings = {"sky": without, "variants": {"eor": {"components": ["eor"]}}, "corruption": {"eor_level": None}}
+    with pytest.raises(ExperimentError, match="'simulated-components', which needs foregrounds"):
+        validate({**SMALL, **settings, "outputs": {"figures": ["simulated-components"]}}, tmp_path)

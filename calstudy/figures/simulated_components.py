@@ -1,40 +1,43 @@
-"""Overview of a simulation: the wedge of F alone, P(k) of S alone over its input, and delay spectra of baselines."""
+"""Check of a simulation: the wedge of F alone, P(k) of S alone over its input, and delay spectra of baselines."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
 from calstudy.corrupt.levels import rms, set_levels
+from calstudy.experiment.model import Experiment
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.spherical import SIGMAS_95
 from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
-from calstudy.instrument.beams import make_beam
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, draw_horizon, label_axes
-from calstudy.power.average import fringe_stop_and_average
 from calstudy.power.cylindrical import cylindrical_average
 from calstudy.power.delay import delay_transform, delays, horizon_delay
 from calstudy.power.drawn import input_power
-from calstudy.power.errors import with_errors
 from calstudy.power.interface import estimate_spectra
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
-from calstudy.power.spherical import spherical_average
+from calstudy.products import simulation
+from calstudy.products.files import VISIBILITIES, read_visibilities
+from calstudy.products.graph import Graph, required
+from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from pyuvdata import UVData
-
-    from calstudy.experiment.model import Experiment
 
 LENGTHS = (0.0, 0.5, 1.0)
 """The baselines that are shown, as quantiles of length: shortest, median, longest."""
 MAX_DELAY = 2e-6
+WAVENUMBERS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, np.inf)
+"""Limits of the ranges of k, h/Mpc, for which the notes have a ratio."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,9 @@ def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment)
 
     The beam, power section and levels are those of the experiment.
     """
+    from calstudy.power.errors import with_errors
+    from calstudy.power.spherical import spherical_average
+
     settings = experiment.power
     levels = set_levels(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption)
     of_foregrounds, of_eor = (_delay_spectra(data, experiment) for data in (foregrounds, eor))
@@ -100,6 +106,9 @@ def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment)
 
 
 def _delay_spectra(data: UVData, experiment: Experiment) -> DelaySpectra:
+    from calstudy.instrument.beams import make_beam
+    from calstudy.power.average import fringe_stop_and_average
+
     average = fringe_stop_and_average(data)
     beam = make_beam(experiment.instrument.beam, experiment.instrument.channels)
     return estimate_spectra(average, average, beam, experiment.power)
@@ -146,6 +155,8 @@ def draw_components(components: SimulatedComponents, stand_ins: Sequence[str] = 
 
 
 def _draw_wedge(figure: Figure, axes: Axes, components: SimulatedComponents) -> None:
+    from matplotlib.colors import LogNorm
+
     x, y, power = cells(components.wedge, np.abs(components.wedge.power.real))
     shown = power[np.isfinite(power) & (power > 0)]
     lowest, highest = 10 ** np.floor(np.log10(np.quantile(shown, 0.01))), 10 ** np.ceil(np.log10(shown.max()))
@@ -188,3 +199,24 @@ def _draw_baseline(axes: Axes, baseline: BaselineDelays, buffer: float) -> None:
     axes.set(yscale="log", xlabel=style.DELAY, xlim=(-span, span))
     first, second = baseline.antennas
     axes.set_title(rf"({first}, {second}), $|\mathbf{{b}}| = {baseline.length:.1f}$ m")
+
+
+class SimulatedComponentsFigure(StudyFigure):
+    """The simulated components alone: wedge of F, P(k) of S over its input, delay spectra of three baselines."""
+
+    caption = "Simulated components alone: wedge of F, P(k) of S over its input, and delay spectra of three baselines."
+    needs_foregrounds = True
+    sections = ("instrument", "sky", "corruption", "power")
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return both components."""
+        return {"foregrounds": required(simulation.foregrounds(graph)), "eor": simulation.eor(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Measure the spectra."""
+        experiment = cast(Experiment, SimpleNamespace(**{name: job.settings[name] for name in self.sections}))
+        foregrounds, eor = (read_visibilities(job.inputs[name] / VISIBILITIES) for name in ("foregrounds", "eor"))
+        found = measure_components(foregrounds, eor, experiment)
+        ratios = {f"{low:g} to {high:g}": found.ratio(low, high) for low, high in pairwise(WAVENUMBERS)}
+        measured = {k: list(ratio) for k, ratio in ratios.items() if np.isfinite(ratio[0])}
+        return Drawing(draw_components(found, job.settings["notes"]), found, {"eor_over_input": measured})
