@@ -134,8 +134,8 @@ class Step(Paper):
 
     Attributes
     ----------
-    number, title, proves
-        Its place in the ladder, such as "2.1", its name, and what it proves, in words.
+    number, proves
+        Its place in the ladder, such as "2.1", and what it proves, in words.
     experiments
         The experiments on whose products it measures, by name.
     sections
@@ -149,7 +149,6 @@ class Step(Paper):
     registry: ClassVar = STEPS
     roles: ClassVar[Mapping[str, str]] = {ROLE: "a measurement"}
     number: ClassVar[str] = ""
-    title: ClassVar[str] = ""
     proves: ClassVar[str] = ""
     experiments: ClassVar[Mapping[str, Case]] = {}
     sections: ClassVar[tuple[str, ...]] = ()

@@ -79,7 +79,6 @@ class BasinOfConvergence(SingleIntegrationStep):
 
     version: ClassVar[int] = 2
     number = "2.2"
-    title = "Start-guess basin"
     proves = "the range of starting errors from which the fit converges, and that its status is correct everywhere"
     parameters: ClassVar = {
         "antennas": 16,

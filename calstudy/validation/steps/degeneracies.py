@@ -45,7 +45,6 @@ class Degeneracies(SingleIntegrationStep):
     """The largest difference of any exchange, before and after a fit."""
 
     number = "2.1"
-    title = "Degeneracies"
     proves = (
         "overall phase, scale, tip-tilt and exchanges of smooth gains with foregrounds leave the residual unchanged"
     )

@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
-from calstudy.base.units import Wavenumber
 from calstudy.claims.bins import recovered, used_bins
 from calstudy.products import signal_loss, spectra
 from calstudy.products.graph import Graph
@@ -32,7 +30,6 @@ class EndToEnd(Step):
     """The fraction of the bins of every experiment with a pull within two sigma, for both definitions of sigma."""
 
     number = "4.0"
-    title = "End to end"
     proves = "P^R recovers P^S outside wedge and buffer, on both arrays"
     experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
     limits: ClassVar = {
@@ -51,8 +48,6 @@ class EndToEnd(Step):
         "redundant_difference": Limit("redundant array, the same", AtLeast(0.9), "as above"),
     }
 
-    k_min: Wavenumber = Field(0.0, description="Bins below are left out.")
-
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the averaged spectra of all variants, and the transfer function, if any, which has the flux scale."""
         transfer = signal_loss.transfer(graph)
@@ -63,13 +58,13 @@ class EndToEnd(Step):
         values, remarks = {}, []
         for name, run in runs.items():
             residual, signal = (run.spherical(variant, "outside-wedge") for variant in ("residual", "eor"))
-            used = used_bins(residual, signal, k_min=self.k_min)
+            used = used_bins(residual, signal)
             difference = (residual.power - signal.power).real[used]
             for reading, error in (("bars", residual.error), ("difference", residual.difference_error)):
                 within = np.abs(difference / error[used]) <= SIGMAS
                 sampling = np.sqrt(EXPECTED * (1 - EXPECTED) / within.size)
                 values[f"{name}_{reading}"] = Finding(float(within.mean()), float(sampling))
-            ratio = recovered(residual, signal, self.k_min)
+            ratio = recovered(residual, signal, 0.0)
             values[f"{name}_ratio"] = ratio
             remarks.append(f"{name}: {_sentence(ratio, int(used.sum()), run.flux_scale)}")
         return Findings(values, tuple(remarks))

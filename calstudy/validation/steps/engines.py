@@ -56,7 +56,6 @@ class Engines(Step):
 
     version: ClassVar[int] = 2
     number = "-1"
-    title = "Engines"
     proves = "simulation engines agree with pyuvsim and with closed forms"
     parameters: ClassVar = {
         "sources": 5000,

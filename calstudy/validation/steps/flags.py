@@ -40,7 +40,6 @@ class Flags(Step):
     """The largest influence, and the largest bias in sigma, of all patterns of flags."""
 
     number = "2.3"
-    title = "Flagged channels"
     proves = "flagged data (single channels, bands, 30 % at random) have no influence, and the residual is unbiased"
     experiments: ClassVar = {"minredundant": MINREDUNDANT}
     sections: ClassVar = ("calibration",)

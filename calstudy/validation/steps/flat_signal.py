@@ -58,7 +58,6 @@ class FlatSignal(Step):
     """Normalization, p-value of the distribution, and imaginary part."""
 
     number = "0.1"
-    title = "Flat EoR alone"
     proves = "the estimator recovers a flat input P(k) of the EoR, seen through the embedded element beam"
     # Several skies reduce the sampling error, 0.3 % for one.
     experiments: ClassVar = {"sky 2": MINREDUNDANT, "sky 12": _sky(12), "sky 22": _sky(22), "redundant": REDUNDANT}

@@ -33,7 +33,6 @@ class Foregrounds(Step):
     """P^{F+S} / P^S - 1 over all modes outside the wedge, the floor P^F / P^S, and the excess over it."""
 
     number = "1.0"
-    title = "Foregrounds and EoR, perfect gains"
     proves = "outside the wedge, the power of foregrounds and EoR equals that of the EoR alone"
     experiments: ClassVar = {"minredundant": MINREDUNDANT}
     sections: ClassVar = ("power",)

@@ -40,7 +40,6 @@ class LowSnr(Step):
     """
 
     number = "3.0"
-    title = "Reflections at low signal to noise"
     proves = "cable reflections below the noise of a baseline are removed"
     experiments: ClassVar = {"lowsnr": Case("lowsnr.yaml", small=SMALL)}
     sections: ClassVar = ("corruption",)

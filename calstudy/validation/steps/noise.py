@@ -40,7 +40,6 @@ class Noise(Step):
     """The scatter of the estimates over that of theory, and the means of Re and Im in units of P_N."""
 
     number = "0.0"
-    title = "Noise alone"
     proves = "the theoretical P_N equals the scatter of the estimates; even x odd has mean zero"
     experiments: ClassVar = {"noise": MINREDUNDANT}
     sections: ClassVar = ("instrument", "power")

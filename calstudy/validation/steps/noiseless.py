@@ -25,7 +25,6 @@ class Noiseless(SingleIntegrationStep):
     """The rms of V - g_a g_b* F over that of V, for both precisions."""
 
     number = "2.0"
-    title = "Noiseless calibration"
     proves = "if the foregrounds are inside the basis, the product of gains and model equals the data"
     small_parameters: ClassVar = {"antennas": 10}
     limits: ClassVar = {

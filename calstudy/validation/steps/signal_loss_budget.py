@@ -70,7 +70,6 @@ class SignalLossBudget(Step):
     """The largest pull of any band of k, for every experiment."""
 
     number = "4.1"
-    title = "Signal-loss ledger"
     proves = "the EoR losses of all stages add up to the end-to-end loss"
     experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
     sections: ClassVar = ("instrument", "power", "sky")

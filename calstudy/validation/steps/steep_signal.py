@@ -57,7 +57,6 @@ class SteepSignal(Step):
     """The mean of P^ over its expectation beyond a wavenumber, for all modes together and in bands."""
 
     number = "0.2"
-    title = "Steep EoR alone"
     proves = "P(k) proportional to k^-2 is recovered, with the window function applied to the input"
     experiments: ClassVar = {"sky 2": STEEP}
     sections: ClassVar = ("power", "sky")
