@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
 import pytest
 
 from calstudy.cli.main import main as cli
+from calstudy.validation.ladder import load_ladder
 
 OWN = """
 from calstudy.base.errors import InputError
@@ -73,6 +75,16 @@ def test_a_step_that_cannot_be_measured_fails_alone(monkeypatch, capsys):
     assert {name for name, verdict in verdicts.items() if verdict["verdict"] == "PASS"} == {"0.0"}
     for number, reason in enumerate(broken.values(), 1):
         assert reason in verdicts[f"{number}.0"]["reason"]
+
+
+def test_the_step_of_the_page_can_be_measured():
+    page = (Path(__file__).parents[2] / "docs" / "validation.md").read_text()
+    name, text = re.search(r"```python\n# (\S+)\n(.*?)```", page, re.DOTALL).groups()
+    Path(name).write_text(text)
+    ladder = load_ladder([name], "small")
+    assert list(ladder.measurements) == ["0.3"]
+    (statement,) = ladder.steps[0][0].statements()
+    assert str(statement.threshold) == "0.5 within 3 sigma"
 
 
 @pytest.mark.parametrize(
