@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, get_args
 
@@ -14,7 +14,8 @@ from calstudy.figures import Drawing, StudyFigure
 from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
 from calstudy.instrument.settings import Channels, InstrumentSettings
 from calstudy.plotting import style
-from calstudy.run.task import Job
+from calstudy.products.graph import Graph
+from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -117,6 +118,11 @@ class BeamFitFigure(StudyFigure):
 
     caption = "Interpolations of the beam in frequency: differences of Jones components over the zenith."
     sections = ("instrument",)
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return nothing: the beam is read again."""
+        del graph
+        return {}
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Refuse a beam in closed form."""

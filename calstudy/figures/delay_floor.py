@@ -16,7 +16,7 @@ from calstudy.figures.beam_fit import INTERPOLATION_COLOURS, INTERPOLATIONS, int
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job
+from calstudy.run.task import Job, Task
 from calstudy.simulate.nodes import integration_times
 
 if TYPE_CHECKING:
@@ -142,6 +142,11 @@ class DelayFloorFigure(StudyFigure):
     caption = "Delay floor of the foregrounds for every interpolation of the beam in frequency."
     needs_foregrounds = True
     sections = ("instrument", "sky", "simulation")
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return nothing: single integrations are simulated."""
+        del graph
+        return {}
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Refuse an experiment without foregrounds, or with a beam in closed form."""

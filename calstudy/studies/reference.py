@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import types
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, nearest
 from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
 from calstudy.experiment.model import Experiment, RealizationBlock, Variant
 from calstudy.instrument.as_built import DeadDipoles
 from calstudy.instrument.settings import AntennaBeam
-from calstudy.studies.collection import CollectionFile, Member
-from calstudy.studies.comparison import ComparisonFile
-from calstudy.studies.observed import ObservedFile
-from calstudy.studies.runtime import RuntimeFile
+from calstudy.studies.study import Study, built_in_kinds
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -177,16 +176,48 @@ def plugin_reference(path: Path) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
+def section_reference(section: str) -> str:
+    """Return the part of the reference with one section, such as ``calibration.basis``, and the sections inside it.
+
+    Raises
+    ------
+    InputError
+        If there is no such section.
+    """
+    sections: list[str] = []
+    for kind_of_file in re.split(r"^(?=# )", field_reference(), flags=re.MULTILINE):
+        parts = re.split(r"^(?=##+ `([\w.]+))", kind_of_file, flags=re.MULTILINE)[1:]
+        paths, texts = parts[::2], parts[1::2]
+        chosen = [text for path, text in zip(paths, texts, strict=True) if f"{path}.".startswith(f"{section}.")]
+        if chosen:
+            return "".join(chosen).rstrip() + "\n"
+        sections += paths
+    first = ", ".join(dict.fromkeys(path for path in sections if "." not in path))
+    raise InputError(
+        f"{section}: neither a section of experiment files{nearest(section, sections)} (at the top: {first}), "
+        "nor a Python file"
+    )
+
+
+def _kind_section(kind: type[Study], listed: dict[str, str]) -> Iterator[str]:
+    """Write the fields of the files of a kind of study, and those of each block in its lists."""
+    yield from (f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed))
+    for name, info in kind.model.model_fields.items():
+        items = get_args(info.annotation) if get_origin(info.annotation) is tuple and not _registry(info) else ()
+        for block in (block for item in items for block in _blocks(item)):
+            yield from (f"## `{name}`: each", "", *_section(block, name, listed))
+
+
 def field_reference() -> str:
     """Return the reference as Markdown: every section, field, unit, default and meaning."""
     listed: dict[str, str] = {}
     lines = [
         "# Experiment files",
         "",
-        "Written by `python -m calstudy fields`; do not edit. An experiment file is YAML. Everything but `name` has a",
-        "default, which is the paper's value where the paper has one. Physical quantities are written with their unit",
-        '(`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a choice, its name alone stands for it with its defaults:',
-        "`beam: airy` is `beam: {kind: airy}`. Relative paths of input files start at the experiment file.",
+        "An experiment file is YAML. Everything but `name` has a default, which is the paper's value where the paper",
+        'has one. Physical quantities are written with their unit (`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a',
+        "choice, its name alone stands for it with its defaults: `beam: airy` is `beam: {kind: airy}`. Relative paths",
+        "of input files start at the experiment file. `calstudy fields SECTION` prints one section of this page.",
         "",
         *_section(Experiment, "", listed),
         "## `variants`: each",
@@ -203,37 +234,6 @@ def field_reference() -> str:
         "## `instrument.as_built.dipoles.dead`: each",
         "",
         *_plain_section(DeadDipoles),
-        "# Collection files",
-        "",
-        "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run",
-        "folder, and figures and claims of all of them in the folder of the collection; `--scale` and `--set` go to",
-        "every member.",
-        "",
-        *_section(CollectionFile, "", listed),
-        "## `experiments`: each",
-        "",
-        *_section(Member, "experiments", listed),
-        "",
-        "# Comparison files",
-        "",
-        "A file with the key `calibrators` is a comparison. `python -m calstudy run` calibrates the data of each world",
-        "with each calibrator, and compares the results in tables and figures; `--set` changes the experiment of every",
-        "case.",
-        "",
-        *_section(ComparisonFile, "", listed),
-        "",
-        "# Run-time files",
-        "",
-        "A file with the key `runtime` is a run-time study. `python -m calstudy run` times the solvers here,",
-        "one array after the other; what it measured is kept under a key that names the machine.",
-        "",
-        *_section(RuntimeFile, "", listed),
-        "",
-        "# Files about measured data",
-        "",
-        "A file with the key `observed` is about measured data ([measured-data.md](measured-data.md)): these are",
-        "calibrated, have power spectra, and are calibrated again with an injected EoR.",
-        "",
-        *_section(ObservedFile, "", listed),
+        *(line for kind in built_in_kinds() if kind.heading for line in _kind_section(kind, listed)),
     ]
     return "\n".join(lines).rstrip() + "\n"

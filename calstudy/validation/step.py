@@ -22,7 +22,6 @@ from calstudy.base.plugins import Registry, guarded
 from calstudy.base.resources import Cost
 from calstudy.base.schema import UNKEYED
 from calstudy.claims.paper import Paper
-from calstudy.claims.results import RunResults
 from calstudy.corrupt.levels import Levels
 from calstudy.experiment.model import Experiment
 from calstudy.power.drawn import input_power
@@ -31,6 +30,7 @@ from calstudy.products.corruption import LEVELS
 from calstudy.products.files import read_json, write_json
 from calstudy.products.graph import Graph
 from calstudy.products.spectra import read_delay_spectra
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Stage, Task
 from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
 from calstudy.verdicts.statement import Statement, Unevaluated
@@ -86,9 +86,10 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class StepInput(RunResults):
+class StepInput(Tables):
     """What a step reads of one of its experiments: the sections that it names, and `products` by its names for them."""
 
+    experiment: Experiment
     products: Mapping[str, Path]
 
     @property
@@ -233,7 +234,7 @@ def measure(job: Job) -> Mapping[str, Any]:
     for name, sections in job.settings["experiments"].items():
         products = {key.partition(":")[2]: path for key, path in job.inputs.items() if key.startswith(f"{name}:")}
         experiment = cast(Experiment, SimpleNamespace(name=name, **sections))
-        runs[name] = StepInput(experiment, tuple(products.values()), products)
+        runs[name] = StepInput(tuple(products.values()), experiment, products)
     with guarded(step):
         found = step.measure(runs, job.output)
     if not isinstance(found, Findings):

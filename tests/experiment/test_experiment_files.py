@@ -9,16 +9,16 @@ from calstudy.base.errors import InputError
 from calstudy.experiment.files import apply_scale, dump, load, override, parse_override, validate
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import parse_yaml, read_mapping
-from calstudy.studies.collection import Collection
-from calstudy.studies.comparison import Comparison
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.comparison import Comparison
+from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.studies.kinds.observed import ObservedStudy
+from calstudy.studies.kinds.realizations import Realizations
+from calstudy.studies.kinds.runtime import RuntimeStudy
+from calstudy.studies.kinds.sweep import Sweep
 from calstudy.studies.load import load_study
-from calstudy.studies.observed import ObservedStudy
 from calstudy.studies.preflight import require_calibration
-from calstudy.studies.realizations import Realizations
-from calstudy.studies.runtime import RuntimeStudy
 from calstudy.studies.study import Study
-from calstudy.studies.sweep import Sweep
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 HERE = Path(__file__).parent

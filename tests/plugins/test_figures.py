@@ -20,6 +20,7 @@ from calstudy.experiment.model import FIGURES
 from calstudy.regression.comparison import compare_figures, rules_of
 from calstudy.regression.reference import accept, read_reference, read_run
 from calstudy.report.contents import read_contents
+from calstudy.results.folder import RunFolder
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
@@ -43,10 +44,11 @@ class Broken(StudyFigure):
         raise KeyError("no such array")
 """
 SIZES = """
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 
-class Sizes(ComparisonFigure):
+class Sizes(StudyFigure):
+    of = ("collection",)
     caption = "Sizes."
     titles = {"small": "Small", "large": "Large"}
 
@@ -96,7 +98,7 @@ def test_it_is_drawn_into_the_run_folder_with_its_caption_in_the_order_of_the_fi
     captions = json.loads((finished.folder / "manifest.json").read_text())["captions"]
     assert list(captions) == ["wedge", NAME, "layout"]
     assert captions[NAME] == CAPTION
-    shown = {picture.name: picture.caption for picture in read_contents(finished.folder).pictures}
+    shown = {picture.name: picture.caption for picture in read_contents(RunFolder(finished.folder)).pictures}
     assert list(shown) == ["wedge", NAME, "layout"]
     assert f"{NAME}</strong>: {CAPTION}" in (finished.folder / "report.html").read_text()
 

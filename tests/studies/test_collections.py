@@ -24,9 +24,9 @@ from calstudy.products.spectra import power
 from calstudy.regression.reference import accept
 from calstudy.run.execution import schedule
 from calstudy.run.store import Store
-from calstudy.studies.collection import Collection
-from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.finished import with_finished
+from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.show import describe_plan
 from calstudy.studies.study import Budget, Run, run_study

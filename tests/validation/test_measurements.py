@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ladders import load_ladder
 
 from calstudy.base.errors import InputError
 from calstudy.power.spectra import DelaySpectra
-from calstudy.validation.ladder import SCALES, load_ladder, passed, tally
+from calstudy.validation.ladder import SCALES, passed, tally
 from calstudy.validation.means import clustered_mean, pooled
 from calstudy.validation.steps.steep_signal import windowed
 from calstudy.verdicts.criterion import Finding

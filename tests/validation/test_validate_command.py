@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from ladders import load_ladder
 
 from calstudy.cli.main import main as cli
-from calstudy.validation.ladder import load_ladder
 
 OWN = """
 from calstudy.base.errors import InputError

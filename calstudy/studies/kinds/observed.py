@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, Any, Self
 
-import yaml
-from pydantic import Field, SerializeAsAny, ValidationError, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 
-from calstudy.base.errors import ExperimentError, InputError, nearest
+from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
-from calstudy.base.plugins import Plugin, guarded
+from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.by_file import ByFile
 from calstudy.calibrate.calibrators.calamity import Calamity
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
-from calstudy.experiment.files import apply_scale, override, parse_override
-from calstudy.experiment.messages import sentences
-from calstudy.experiment.model import FIGURES, StudyName
-from calstudy.figures import ObservedFigure, observed_task
+from calstudy.experiment.files import StudyFile, checked
+from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
+from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.measured.defaults import with_defaults
 from calstudy.measured.halves import PARITIES, Halves, modelled, read_facts, require_same_sky
@@ -34,23 +30,16 @@ from calstudy.products.observed_quality import quality
 from calstudy.products.observed_spectra import observed_spectra
 from calstudy.run.task import Task
 from calstudy.studies.capacity import workers_for
-from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
-from calstudy.studies.study import Budget, Made, Study
+from calstudy.studies.study import Budget, Study
 
-KEY = "observed"
-"""Key that marks a file of measured data."""
 DEFAULT_FIGURES = ("observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)
 
 
-class ObservedOutputs(Section):
+class ObservedOutputs(Folders):
     """Figures, and the folders of products and runs."""
 
-    figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] | None = (
-        Field(None, description="Figures of measured data; null: all.")
-    )
-    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all experiments.")
-    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
+    figures: Figures | None = Field(None, description="Figures of measured data; null: all.")
 
 
 class ObservedFile(Section):
@@ -83,15 +72,26 @@ class ObservedFile(Section):
 class ObservedStudy(Study):
     """A study of measured data, from its file and the metadata of the two halves."""
 
+    key = "observed"
+    model = ObservedFile
+    heading = "Files about measured data"
+    guide = (
+        "A file with the key `observed` is about measured data ([measured-data.md](measured-data.md)): these are "
+        "calibrated, have power spectra, and are calibrated again with an injected EoR."
+    )
+
     def __init__(self, file: ObservedFile, halves: Halves) -> None:
         self.file, self.halves = file, halves
-        self.name, self.description = file.name, file.description
         self.graph = ObservedGraph(file.observed, file.calibration, file.power, file.injection, halves)
 
-    @property
-    def outputs(self) -> ObservedOutputs:
-        """Store and folder of runs."""
-        return self.file.outputs
+    @classmethod
+    def load(cls, file: StudyFile) -> ObservedStudy:
+        """Return the study of a file, with the metadata of its data."""
+        content = checked(ObservedFile, with_defaults(file.changed(), file.folder), file.folder)
+        for figure in figures_for("observed", content.outputs.figures or (), "outputs.figures"):
+            if content.injection is None and figure.needs_injection:
+                raise ExperimentError([f"outputs.figures: {figure.label!r} needs the section injection"])
+        return cls(content, _halves(content))
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
@@ -102,14 +102,12 @@ class ObservedStudy(Study):
         return ("flux scale: autocorrelations at an assumed system temperature",)
 
     @property
-    def folder(self) -> Path:
-        """The run folder: the name, and a digest of the content of the file without output paths."""
+    def content(self) -> Any:
+        """The content of the file without scales and the folders of outputs."""
         outputs = self.file.outputs.reset("store", "runs")
-        return run_folder(
-            self.outputs.runs, self.name, identity(self.file.model_copy(update={"outputs": outputs}).reset("scales"))
-        )
+        return identity(self.file.model_copy(update={"outputs": outputs}).reset("scales"))
 
-    def fitted(self, budget: Budget) -> tuple[Self, int]:
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study itself and the number of workers.
 
         Raises InputError if a beam cannot be made, the memory is too small, the calibrator refuses the data, or they
@@ -129,68 +127,20 @@ class ObservedStudy(Study):
         return self, workers_for(self.targets, self.outputs.store, budget)
 
     @cached_property
-    def shown(self) -> list[ObservedFigure]:
-        """The requested figures."""
-        figures = self.file.outputs.figures
-        if figures is None:
-            names = DEFAULT_FIGURES + (INJECTION_FIGURES if self.file.injection else ())
-            figures = tuple(FIGURES.make(name) for name in names)
-        return [figure for figure in figures if isinstance(figure, ObservedFigure)]
-
-    @cached_property
     def figures(self) -> list[Task]:
-        """Tasks of the figures."""
-        return [observed_task(figure, self.graph, self.stand_ins) for figure in self.shown]
+        """The requested figures."""
+        asked = self.file.outputs.figures
+        if asked is None:
+            names = DEFAULT_FIGURES + (INJECTION_FIGURES if self.file.injection else ())
+            asked = tuple(FIGURES.make(name) for name in names)
+        settings = {"wedge_buffer": self.graph.power.wedge_buffer}
+        shown = figures_for("observed", asked, "outputs.figures")
+        return [figure_task(figure, {"": self.graph}, self.stand_ins, settings) for figure in shown]
 
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
         return [observed_spectra(self.graph), quality(self.graph), *injection_tables(self.graph)]
-
-    @property
-    def targets(self) -> Sequence[Task]:
-        """Figures and tables."""
-        return [*self.figures, *self.tables]
-
-    def fill(self, made: Made) -> None:
-        """Write figures, tables, the file and the manifest."""
-        folder, products = self.folder, made.products
-        publish([products[task.key] for task in self.figures], folder / "figures")
-        publish([products[task.key] for task in self.tables], folder / "tables")
-        text = yaml.safe_dump(self.file.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)
-        write(folder / EXPERIMENT, text)
-        fields = {
-            "description": self.description,
-            "stand_ins": list(self.stand_ins),
-            "captions": {figure.label: figure.caption for figure in self.shown},
-            "products": product_entries(self.tasks, made.products, made.tasks),
-        }
-        write_manifest(folder, self.name, fields)
-
-
-def load_observed(
-    path: Path, data: Mapping[str, Any], scale: str | None = None, overrides: Sequence[str] = ()
-) -> ObservedStudy:
-    """Validate the content of a file of measured data, and read their metadata.
-
-    Parameters and errors are as for `calstudy.studies.load.load_study`.
-    """
-    plain, folder = apply_scale(data, scale), path.resolve().parent
-    for text in overrides:
-        plain = override(plain, *parse_override(text))
-    plain = with_defaults(plain, folder)
-    try:
-        file = ObservedFile.model_validate(plain, context={"folder": folder})
-    except ValidationError as error:
-        raise ExperimentError(sentences(error, ObservedFile, plain)) from None
-    for place, figure in enumerate(file.outputs.figures or ()):
-        if not isinstance(figure, ObservedFigure):
-            built_in = [name for name in FIGURES.built_in() if issubclass(FIGURES.find(name), ObservedFigure)]
-            hint = f"{nearest(figure.label, built_in)} (built in: {', '.join(built_in)})"
-            raise ExperimentError([f"outputs.figures.{place}: {figure.label!r} is no figure of measured data{hint}"])
-        if file.injection is None and figure.needs_injection:
-            raise ExperimentError([f"outputs.figures.{place}: {figure.label!r} needs the section injection"])
-    return ObservedStudy(file, _halves(file))
 
 
 def _halves(file: ObservedFile) -> Halves:
