@@ -101,7 +101,7 @@ class StudyFigure(Plugin):
     def refusal(self, experiment: Experiment) -> str | None:
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
         if "experiment" not in self.of:
-            return f"is a figure of {_listed(self.of)}, and cannot be drawn of a single experiment"
+            return f"is a figure {_listed(self.of)}, and cannot be drawn of a single experiment"
         missing = [name for name in self.variants if name not in experiment.variants]
         if missing:
             return f"needs the variant(s) {', '.join(missing)}"
@@ -208,13 +208,13 @@ def figures_for(kind: str, figures: Sequence[Plugin], field: str) -> tuple[Study
         if kind not in figure.of:
             known = [name for name in FIGURES.built_in() if kind in FIGURES.find(name).of]
             hint = f"{nearest(figure.label, known)} (built in: {', '.join(known)})"
-            sentence = f"is a figure of {_listed(figure.of)}, not of {_listed((kind,))}{hint}"
+            sentence = f"is a figure {_listed(figure.of)}, not {_listed((kind,))}{hint}"
             raise ExperimentError([f"{field}.{place}: {figure.label!r} {sentence}"])
     return cast(tuple[StudyFigure, ...], tuple(figures))
 
 
 def _listed(kinds: Sequence[str]) -> str:
-    return f"the kind of study {' or '.join(map(repr, kinds))}"
+    return f"for {' or '.join(kinds)} files"
 
 
 def draw(job: Job) -> Mapping[str, Any]:

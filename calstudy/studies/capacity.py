@@ -45,20 +45,10 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     _require_sane(budget)
     if scheduler is not None:
         return experiment, workers or 1
-    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    # The parent process has the libraries in memory, too.
-    memory -= LIBRARIES_MEMORY
+    memory = _memory(budget)
     hoped = workers or cores()
     lean = _stream(_cut(_Work(experiment, targets), memory / hoped), memory / hoped)
-    cut, needs = lean.experiment, {task: task.cost.memory for task in lean.missing}
-    if not needs:
-        return cut, workers or hoped
-    largest = max(needs, key=needs.__getitem__)
-    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
-    fitting = max(1, int(memory // needs[largest]))
-    if workers is not None and budget.max_memory is None:
-        return cut, workers
-    return cut, min(hoped, fitting)
+    return lean.experiment, _workers(lean.missing, memory, hoped, budget)
 
 
 def require_data_fit(experiment: Experiment, budget: Budget) -> None:
@@ -83,12 +73,20 @@ def workers_for(targets: Sequence[Task], store: Path, budget: Budget) -> int:
     _require_sane(budget)
     if budget.scheduler is not None:
         return budget.workers or 1
+    return _workers(_missing(targets, store), _memory(budget), budget.workers or cores(), budget)
+
+
+def _memory(budget: Budget) -> float:
+    """Return the memory for work, in bytes; the parent process has the libraries in memory, too."""
     memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    memory -= LIBRARIES_MEMORY
-    needs = {task: task.cost.memory for task in _missing(targets, store)}
-    hoped = budget.workers or cores()
+    return memory - LIBRARIES_MEMORY
+
+
+def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget) -> int:
+    """Return how many workers fit into the memory, of those hoped for; raises InputError if not even one does."""
+    needs = {task: task.cost.memory for task in missing}
     if not needs:
-        return hoped
+        return budget.workers or hoped
     largest = max(needs, key=needs.__getitem__)
     _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
     if budget.workers is not None and budget.max_memory is None:

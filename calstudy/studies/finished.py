@@ -105,7 +105,6 @@ def with_finished(collection: Study, folders: Sequence[Path], console: Console, 
         if (reason := _needs_more(collection, name, study)) is not None:
             console.print(f"{name}: will be run ({reason})", markup=False)
             continue
-        assert isinstance(study, ExperimentStudy)
         if (run := _choose(name, study, runs, console)) is not None:
             taken[name] = run, study.tables
     if not taken:
@@ -136,11 +135,11 @@ def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], cons
     return None
 
 
-def _needs_more(collection: Collection, name: str, study: Study) -> str | None:
+def _needs_more(collection: Collection, name: str, study: ExperimentStudy) -> str | None:
     """Return the reason why a collection needs more of a member than its tables, or None."""
-    if not isinstance(study, ExperimentStudy):
+    if not study.kept_tables:
         return "it has realizations; such members are always run"
-    tables = {task.key for task in study.tables}
+    tables = {task.key for task in study.kept_tables}
     others = {task.key for task in study.tasks} - tables
     for task in collection.own:
         for needed in task.needs.values():

@@ -15,10 +15,8 @@ from pydantic_core import PydanticUndefined
 
 from calstudy.base.errors import InputError, nearest
 from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
-from calstudy.experiment.model import Experiment, RealizationBlock, Variant
-from calstudy.instrument.as_built import DeadDipoles
-from calstudy.instrument.settings import AntennaBeam
-from calstudy.studies.study import Study, built_in_kinds
+from calstudy.experiment.model import Experiment
+from calstudy.studies.study import KINDS, Study, built_in_kinds
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -121,6 +119,16 @@ def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[s
             tags = get_args(block.model_fields[tag].annotation)
             yield from (f"### `{path}: {' | '.join(map(str, tags))}`", "")
             yield from _section(block, path, listed)
+    elif len(items := _items(info.annotation)) == 1:
+        yield from (f"## `{path}`: each", "", *_section(items[0], path, listed))
+
+
+def _items(annotation: Any) -> list[type[BaseModel]]:
+    """Return the blocks, but for plug-ins, that a field accepts as items of a list, or as values of a mapping."""
+    lists = [item for item in _alternatives(annotation) if get_origin(item) in (tuple, dict)]
+    return [
+        block for item in lists for value in get_args(item) for block in _blocks(value) if not issubclass(block, Plugin)
+    ]
 
 
 def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iterator[str]:
@@ -159,12 +167,10 @@ def plugin_reference(path: Path) -> str:
         If the file cannot be run, or contains none.
     """
     module = load_file(path)
-    found = [
-        value
-        for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, Plugin) and value.__module__ == module.__name__
-    ]
-    if not found:
+    own = [thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__]
+    kinds = [thing for thing in own if issubclass(thing, Study)]
+    found = [thing for thing in own if issubclass(thing, Plugin)]
+    if not found and not kinds:
         raise InputError(
             f"{path}: holds no calibrator, figure or the like (no subclass of calstudy.base.plugins.Plugin)"
         )
@@ -173,6 +179,8 @@ def plugin_reference(path: Path) -> str:
         tag = plugin.registry.tag
         lines += [f"# {plugin.registry.noun.capitalize()} `{tag}: {path.name}:{plugin.__name__}`", ""]
         lines += _section(plugin, "", {})
+    for kind in kinds:
+        lines += [f"# Files with `{KINDS.tag}: {path.name}:{kind.__name__}`", "", *_section(kind.model, "", {})]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -199,15 +207,6 @@ def section_reference(section: str) -> str:
     )
 
 
-def _kind_section(kind: type[Study], listed: dict[str, str]) -> Iterator[str]:
-    """Write the fields of the files of a kind of study, and those of each block in its lists."""
-    yield from (f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed))
-    for name, info in kind.model.model_fields.items():
-        items = get_args(info.annotation) if get_origin(info.annotation) is tuple and not _registry(info) else ()
-        for block in (block for item in items for block in _blocks(item)):
-            yield from (f"## `{name}`: each", "", *_section(block, name, listed))
-
-
 def field_reference() -> str:
     """Return the reference as Markdown: every section, field, unit, default and meaning."""
     listed: dict[str, str] = {}
@@ -220,20 +219,8 @@ def field_reference() -> str:
         "of input files start at the experiment file. `calstudy fields SECTION` prints one section of this page.",
         "",
         *_section(Experiment, "", listed),
-        "## `variants`: each",
-        "",
-        *_section(Variant, "variants", listed),
-        "## `realizations`: each",
-        "",
-        *_section(RealizationBlock, "realizations", listed),
-        "## `instrument.antenna_beams`: each",
-        "",
-        *_plain_section(AntennaBeam),
-        "`beam` takes what `instrument.beam` does.",
-        "",
-        "## `instrument.as_built.dipoles.dead`: each",
-        "",
-        *_plain_section(DeadDipoles),
-        *(line for kind in built_in_kinds() if kind.heading for line in _kind_section(kind, listed)),
     ]
+    for kind in built_in_kinds():
+        if kind.heading:
+            lines += [f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed)]
     return "\n".join(lines).rstrip() + "\n"

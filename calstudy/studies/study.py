@@ -201,7 +201,8 @@ class Study(ABC):
     @property
     def texts(self) -> Mapping[str, str]:
         """Further files of the run folder, such as the resolved file: their content by relative path."""
-        return {EXPERIMENT: dump(self.file)}
+        named = "" if self.is_built_in() else f"{KINDS.tag}: {KINDS.reference_of(type(self))}\n"
+        return {EXPERIMENT: named + dump(self.file)}
 
     @property
     def entries(self) -> Mapping[str, Any]:
@@ -242,6 +243,11 @@ class Study(ABC):
     def external_keys(self) -> frozenset[str]:
         """Keys of products that a run of this study needs but does not make."""
         return frozenset()
+
+    @classmethod
+    def is_built_in(cls) -> bool:
+        """Return whether the kind is one of calstudy's own, whose files have its key."""
+        return cls.__module__.startswith(f"{KINDS.package}.")
 
     def with_parts(self) -> Iterator[Study]:
         """Yield the study and all of its parts."""

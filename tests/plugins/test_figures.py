@@ -135,7 +135,7 @@ def test_an_installed_one_is_used_by_its_name(folder, finished, monkeypatch, tmp
         ("none.py", {}, "cannot be read (No such file or directory)"),
         ("wegde", {}, "outputs.figures.1: 'wegde' is not a figure, did you mean 'wedge'? (there are: baselines, "),
         ("layout", {}, "outputs.figures.1: 'layout' cannot name a picture, or does so already"),
-        ("sizes.py", {}, "outputs.figures: asks for 'sizes', which compares the members of a collection"),
+        ("sizes.py", {}, "outputs.figures: asks for 'sizes', which is a figure for collection files"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_in_a_sentence(tmp_path, figure, changes, told):

@@ -402,7 +402,7 @@ def test_the_report_has_figures_and_numbers(one_file):
         ({"beam": "no-beam"}, {}, "observed.beam: 'no-beam' is not a beam"),
         ({}, {"calibration": {"integrations_per_solve": 4}}, "a half of the data has 2 integrations"),
         ({}, {"calibration": {"assumed": {"sky.diffuse": "none"}}}, "calibration.assumed: is for simulated data"),
-        ({}, {"outputs": {"figures": ["wedge"]}}, "'wedge' is no figure of measured data"),
+        ({}, {"outputs": {"figures": ["wedge"]}}, "'wedge' is a figure for experiment files, not for observed files"),
         ({}, {"outputs": {"figures": ["observed-signal-loss"]}}, "needs the section injection"),
         ({}, {"injection": {"level": -30}}, "injection.level"),
         ({"positions": "few.csv"}, {}, "has no antenna"),

@@ -137,7 +137,7 @@ def test_a_second_run_makes_nothing_and_a_lost_product_comes_from_averages(finis
     study = Realizations(validate(small(folder), folder))
     assert run_study(study, Budget(workers=1)).made.tasks == ()
     store = Store(study.outputs.store)
-    for task in (inputs(study.graph)["spectra:2"], study.table):
+    for task in (inputs(study.graph)["spectra:2"], study.tables[0]):
         store.discard(task.stage.name, task.key)
     made = [
         task.stage.name
@@ -318,7 +318,7 @@ def test_an_experiment_without_realizations_has_none_and_cannot_draw_their_figur
     data.pop("realizations")
     with pytest.raises(InputError, match="has no realizations"):
         Realizations(validate(data, folder))
-    with pytest.raises(ExperimentError, match="pools the realizations of an experiment"):
+    with pytest.raises(ExperimentError, match="is a figure for realizations files"):
         validate(override(data, "outputs.figures", ["realizations"]), folder)
 
 

@@ -194,9 +194,10 @@ class Family(Study):
 
     @property
     def content(self) -> Any:
-        """The file, and the names of the run folders of the members."""
+        """The file without scales and outputs, and the names of the run folders of the members."""
+        names = [name for name in type(self.file).model_fields if name not in ("scales", "outputs")]
         return {
-            "file": identity(self.file),
+            "file": {name: identity(getattr(self.file, name)) for name in names},
             "members": {name: study.folder.name for name, study in self.studies.items()},
         }
 
