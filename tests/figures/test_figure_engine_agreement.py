@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calstudy.studies.experiment import ExperimentStudy
 
 from calstudy.base.errors import ExperimentError
 from calstudy.base.visibilities import baseline_vectors, from_cube
@@ -15,6 +14,7 @@ from calstudy.experiment.files import validate
 from calstudy.figures.engine_agreement import compare_simulations, draw_engine_agreement
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Budget, run_study
 
 INSTRUMENT = {
