@@ -14,7 +14,7 @@ from calstudy.experiment.files import validate
 from calstudy.figures.engine_agreement import compare_simulations, draw_engine_agreement
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Budget, run_study
 
 INSTRUMENT = {
@@ -95,7 +95,7 @@ def test_a_run_compares_engines_and_shows_the_components_from_one_simulation(tmp
     """What a run has simulated is used, and a difference beyond the tolerance is a warning."""
     engines = {"kind": "engine-agreement", "node_tolerance": 1e-6, "tolerance": 1e-17}
     outputs = {"store": str(tmp_path / "store"), "runs": str(tmp_path), "figures": [engines, "simulated-components"]}
-    study = ExperimentStudy(validate({**SMALL, "outputs": outputs}, tmp_path))
+    study = ExperimentStudy.of(validate({**SMALL, "outputs": outputs}, tmp_path))
     assert [task.label for task in study.tasks if task.stage.name == "simulate"] == [
         "foregrounds",
         "foregrounds",
