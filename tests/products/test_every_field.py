@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args, get_origin
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, plain
+from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.files import override, validate
 from calstudy.studies.kinds.experiment import ExperimentStudy
 
@@ -213,6 +214,9 @@ def test_every_field_changes_a_key_or_is_known_not_to():
 
 
 def test_no_other_field_is_left_out_of_keys():
+    # Plug-ins are imported when they are found.
+    for name in CALIBRATORS.built_in():
+        CALIBRATORS.find(name)
     waiting, found = [Section], set()
     while waiting:
         section = waiting.pop()
