@@ -14,6 +14,7 @@ from calstudy.base.schema import Section, plain
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.files import override, validate
 from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.validation.step import Step
 
 BASE: dict[str, Any] = {
     "name": "fields",
@@ -34,6 +35,8 @@ REQUIRED: dict[str, Any] = {
 }
 """What blocks need besides their names, or to have all their fields."""
 OTHER: dict[str, list[Any]] = {
+    "EngineAgreementFigure.against": ["fftvis"],
+    "EngineAgreementFigure.node_tolerance": [1e-6],
     "InstrumentSettings.antenna_beams": [{"set": {"antennas": [0], "beam": "airy"}}],
     "InstrumentSettings.polarizations": [["yy"]],
     "DipoleErrors.dead": [{"set": {"antennas": [0], "x": [1]}}],
@@ -68,8 +71,8 @@ SAME: dict[str, str] = {
     "Experiment.description": "words",
     "Experiment.scales": "are applied before",
     "Experiment.sweep": "makes other experiments of this one",
-    "Outputs.store": "where products go",
-    "Outputs.runs": "where products go",
+    "Folders.store": "where products go",
+    "Folders.runs": "where products go",
     "GainFit.models_at_once": "how much is worked on at a time",
     "PyuvsimEngine.precision": "has one value",
     "MwaEmbeddedBeam.path": "a file, which counts by its content",
@@ -88,8 +91,14 @@ NOT_TRIED = {
     "must be null where foregrounds are fitted": "tried with other calibrators",
 }
 """Blocks that are not tried, by what they are refused with, and why."""
-UNKEYED = {("SimulationSettings", "chunks"), ("GainFit", "models_at_once"), ("ByFile", "salt")}
-"""How results are made; `chunks` is in the keys of the pieces, and a salt finds files that count by their content."""
+UNKEYED = {
+    ("SimulationSettings", "chunks"),
+    ("GainFit", "models_at_once"),
+    ("ByFile", "salt"),
+    (Step.__name__, "scale"),
+}
+"""How results are made; `chunks` is in the keys of the pieces, a salt finds files that count by their content, and the
+scale of a step is in its experiments."""
 
 
 def keys(data: dict[str, Any]) -> set[str]:
