@@ -87,6 +87,8 @@ NOT_TRIED = {
     "asks for foregrounds, but": "the variants of the base have foregrounds",
     "asks for noise, but": "the variants of the base have noise",
     "cannot be drawn": "figures of other studies",
+    "asks for 'beam-fit'": "the beam of the base is a formula",
+    "asks for 'delay-floor'": "the bandwidth of the base is too small",
     "weights that stay as they are": "in the other experiment",
     "must be null where foregrounds are fitted": "tried with other calibrators",
 }
