@@ -162,7 +162,7 @@ class LoadedStudy:
         return open_run(finished.folder)
 
     def __repr__(self) -> str:
-        figures = [task.label for task in _figures(self._study)]
+        figures = [task.label for task in self._study.figures]
         return "\n".join(
             (
                 f"study {self.name!r}: {self._study.description}",
@@ -330,7 +330,7 @@ class OpenRun:
     def plot(self, name: str) -> Figure:
         """Draw a figure of the study again from the products in the store; raises InputError if they are not there."""
         study = self._study
-        tasks = {task.label: task for task in _figures(study)}
+        tasks = {task.label: task for task in study.figures}
         if name not in tasks:
             raise InputError(
                 f"{name!r}: no figure of this study{nearest(name, list(tasks))}; it has {', '.join(tasks)}"
@@ -408,10 +408,6 @@ def _single(study: Study) -> ExperimentStudy:
     if not isinstance(study, ExperimentStudy):
         raise InputError(f"{study.name}: has several experiments; take one of its parts")
     return study
-
-
-def _figures(study: Study) -> list[Task]:
-    return [task for task in study.tasks if task.stage.name == "figure"]
 
 
 def _printed(show: Callable[[Console], None]) -> str:
