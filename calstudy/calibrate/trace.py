@@ -16,7 +16,7 @@ from calstudy.calibrate.solvers.reduced import newton_decrement_at
 class Checkpoint(NamedTuple):
     """An intermediate estimate: gains (Nants, Nfreqs) and model (Nbls, Nfreqs), complex128, with degeneracies fixed.
 
-    The decrements are as in `calstudy.calibrate.solution.Solution`.
+    The decrements are as in `calstudy.calibrate.records.Solve`.
     """
 
     n_steps: int

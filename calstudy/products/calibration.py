@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of
-from calstudy.calibrate.interface import SETTLED, Calibrator
+from calstudy.calibrate.interface import Calibrator
+from calstudy.calibrate.records import SETTLED
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import LEVELS

@@ -238,8 +238,8 @@ def descend(layout: Layout, channels: Channels, basis: BasisSettings, max_steps:
     simulation = make_simulation(layout, channels)
     structure = simulation.structure(basis)
     problem = simulation.problem(0, structure)
-    floor = min(solve(problem, GaussNewton(FLOOR_TOLERANCE, FLOOR_STEPS)).loss_history)
-    history = solve(problem, FirstOrder(Optimizer(max_steps=max_steps), tolerance=0.0)).loss_history
+    floor = min(solve(problem, GaussNewton(FLOOR_TOLERANCE, FLOOR_STEPS)).record.loss_history)
+    history = solve(problem, FirstOrder(Optimizer(max_steps=max_steps), tolerance=0.0)).record.loss_history
     return Descent(structure.n_antennas, float(floor), history)
 
 

@@ -222,7 +222,7 @@ def test_adamax_is_one_setting_away(data):
     ticks = []
     result = run_calibrator(settings, data, progress=lambda done, total: ticks.append((done, total)))
     assert ticks == [(1, 3), (2, 3), (3, 3)]
-    assert all(record.n_steps == 100 for record in result.solutions)
+    assert all(record.steps == 100 for record in result.solutions)
 
 
 def test_bad_data_are_refused_in_one_sentence(toy, data):

@@ -76,7 +76,7 @@ def test_what_is_left_is_orthogonal_to_the_minimum(pair):
         problem.visibilities - gain_products(found.gains, antennas) * found.model for found in (early, late)
     )
     going, power = (np.sum(problem.weights * np.abs(part) ** 2) for part in (before - after, before))
-    fallen = 1 - late.loss_history[-1] / (power)
+    fallen = 1 - late.record.loss_history[-1] / (power)
     assert going / power == pytest.approx(fallen, rel=0.25)
     assert early.newton_decrement == pytest.approx(fallen, rel=0.5)
 
@@ -87,19 +87,20 @@ def test_every_solver_tells_how_far_it_is(pair):
     for solver in (GaussNewton(), Lbfgs(max_steps=100), FirstOrder(Optimizer(max_steps=300))):
         solution = solve(problem, solver)
         # Gauss-Newton judges with the blocks of an earlier step, whose prediction is a little off.
-        assert solution.newton_decrement == pytest.approx(min(newton_decrement_at(problem, solution.gains), 1), rel=0.1)
+        decrement = min(newton_decrement_at(problem, solution.gains), 1)
+        assert solution.record.newton_decrement == pytest.approx(decrement, rel=0.1)
         residual = problem.visibilities / gain_products(solution.gains, pair[0].antennas) - solution.model
-        rms = np.sqrt(solution.newton_decrement * np.mean(np.abs(residual) ** 2))
-        assert solution.decrement_rms == pytest.approx(rms, rel=0.2)
-        if solution.status == "converged":
-            assert solution.newton_decrement < solver.tolerance
+        rms = np.sqrt(solution.record.newton_decrement * np.mean(np.abs(residual) ** 2))
+        assert solution.record.decrement_rms == pytest.approx(rms, rel=0.2)
+        if solution.record.status == "converged":
+            assert solution.record.newton_decrement < solver.tolerance
 
 
 def test_a_loss_that_stands_still_short_of_the_minimum_has_not_converged(pair):
     solution = solve(pair[0].problem(), FirstOrder(Optimizer(learning_rate=0.1, max_steps=3000), tolerance=1e-6))
-    assert solution.n_steps < 3000
-    assert solution.status == "stalled"
-    assert "a Gauss-Newton step would lower it" in solution.message
+    assert solution.record.steps < 3000
+    assert solution.record.status == "stalled"
+    assert "a Gauss-Newton step would lower it" in solution.record.message
 
 
 def drifting_bias(case, solver, integrations, warm_start):
@@ -118,7 +119,7 @@ def drifting_bias(case, solver, integrations, warm_start):
             problem = simulation.problem(integration, structure, realization)
             noises.append(problem.visibilities / products - foregrounds)
             solution, start = solve_warm(problem, solver, starts[realization])
-            assert solution.status == "converged"
+            assert solution.record.status == "converged"
             starts[realization] = start if warm_start else None
             truth = Realization(problem.visibilities, noises[-1], products)
             fitted = gain_products(solution.gains, simulation.antennas)

@@ -195,7 +195,7 @@ def test_a_vanishing_deviation_is_sky_based_calibration_by_hera_cal(toy):
     sky = spoiled(toy)
     problem = noisy(toy, free_structure(toy), sky, (1e-7, 1e-7))
     found = solved(problem)
-    assert found.status == "converged", found.message
+    assert found.record.status == "converged", found.record.message
     ratio, weights, start = {}, {}, {}
     for row, (a, b) in enumerate(toy.antennas.tolist()):
         ratio[a, b, "nn"] = (problem.visibilities[row] / sky[row])[None]
@@ -316,9 +316,9 @@ def test_wide_priors_converge_to_the_minimum(hexagon, prior, own, shared):
     sky = turned_foregrounds + 0.06 * rms * complex_normal(rng, (len(data), 1))
     problem = CalibrationProblem(structure, data, weights, start, sky, deviations=(own * rms, shared * rms))
     found = solve(problem, GaussNewton(tolerance=1e-5))
-    assert found.status == "converged", found.message
+    assert found.record.status == "converged", found.record.message
     further = solve(problem, GaussNewton(tolerance=1e-8, max_steps=300, precision="double"))
-    assert found.loss_history[-1] < 1.01 * further.loss_history[-1]
+    assert found.record.loss_history[-1] < 1.01 * further.record.loss_history[-1]
 
 
 def test_refused_steps_are_the_exception_in_curved_valleys():
@@ -333,8 +333,8 @@ def test_refused_steps_are_the_exception_in_curved_valleys():
     weights, start = np.full(data.shape, (NOISE * rms) ** -2), np.ones(simulation.gains.shape, complex)
     problem = CalibrationProblem(structure, data, weights, start, sky, deviations=(rms, np.inf))
     found = solve(problem, GaussNewton(tolerance=1e-5))
-    assert found.status == "converged", found.message
-    refused = np.diff(found.loss_history) == 0
+    assert found.record.status == "converged", found.record.message
+    refused = np.diff(found.record.loss_history) == 0
     assert refused.mean() < 0.15
 
 

@@ -149,10 +149,10 @@ def test_reduced_problem_is_that_of_the_limit(limit):
 
 def test_solution_is_that_of_the_limit(limit):
     usual, joint = (solve(problem, GaussNewton(max_steps=300)) for problem in limit)
-    assert usual.status == joint.status == "converged", (usual.message, joint.message)
+    assert usual.record.status == joint.record.status == "converged", (usual.record.message, joint.record.message)
     # Both creep on along nearly degenerate directions of so small an array, where 4 % of the loss are left to go after
     # hundreds of steps; how far they are differs with the preconditioner, and with the rounding of the processor.
-    assert joint.loss_history[-1] == pytest.approx(usual.loss_history[-1], rel=0.04)
+    assert joint.record.loss_history[-1] == pytest.approx(usual.record.loss_history[-1], rel=0.04)
 
 
 @pytest.mark.parametrize(

@@ -39,12 +39,12 @@ def test_lbfgs_reaches_the_minimum_of_gauss_newton(converged):
     # Without curvature L-BFGS crawls: 1400 steps or more than 2000, as rounding decides.
     found = solve(problem, Lbfgs(tolerance=1e-3, max_steps=10_000))
     same = solve(problem, GaussNewton(tolerance=1e-3))
-    assert found.status == "converged", found.message
-    assert found.newton_decrement < 1e-3
-    assert found.loss_history[-1] == pytest.approx(same.loss_history[-1], rel=0.05)
+    assert found.record.status == "converged", found.record.message
+    assert found.record.newton_decrement < 1e-3
+    assert found.record.loss_history[-1] == pytest.approx(same.record.loss_history[-1], rel=0.05)
     onwards = solve_warm(problem, GaussNewton(tolerance=3e-4), WarmStart(found.gains, None))[0]
-    assert onwards.status == "converged", onwards.message
-    assert onwards.loss_history[-1] == pytest.approx(best.loss_history[-1], rel=0.05)
+    assert onwards.record.status == "converged", onwards.record.message
+    assert onwards.record.loss_history[-1] == pytest.approx(best.record.loss_history[-1], rel=0.05)
 
 
 def test_solvers_meet_where_no_direction_is_flat():
@@ -58,7 +58,7 @@ def test_solvers_meet_where_no_direction_is_flat():
     noise = 1e-3 * np.sqrt(np.mean(np.abs(foregrounds) ** 2)) * complex_normal(rng, foregrounds.shape)
     flat = replace(toy, foregrounds=foregrounds, noise=noise)
     losses = [
-        solve(flat.problem(prior="none"), solver).loss_history.min()
+        solve(flat.problem(prior="none"), solver).record.loss_history.min()
         for solver in (
             GaussNewton(tolerance=1e-5),
             Lbfgs(tolerance=1e-5),
@@ -70,8 +70,8 @@ def test_solvers_meet_where_no_direction_is_flat():
 
 def test_lbfgs_says_when_it_ran_out_of_steps(toy):
     solution = solve(toy.problem(), Lbfgs(max_steps=3))
-    assert (solution.status, solution.n_steps) == ("max-steps", 3)
-    assert solution.loss_history[-1] < solution.loss_history[0]
+    assert (solution.record.status, solution.record.steps) == ("max-steps", 3)
+    assert solution.record.loss_history[-1] < solution.record.loss_history[0]
 
 
 @pytest.mark.parametrize("schedule", ["constant", "cosine", "exponential"])
@@ -89,8 +89,8 @@ def test_falling_rates_reach_the_minimum_where_the_constant_one_jitters(converge
     for name in ("cosine", "exponential", "constant"):
         optimizer = Optimizer(learning_rate=0.03, schedule=name, final_rate=1e-3, max_steps=8000)
         solution = solve(problem, FirstOrder(optimizer, precision="double", tolerance=0.0))
-        losses[name] = np.median(solution.loss_history[-50:])
-    assert max(losses["cosine"], losses["exponential"]) < 1.2 * best.loss_history[-1] < losses["constant"]
+        losses[name] = np.median(solution.record.loss_history[-50:])
+    assert max(losses["cosine"], losses["exponential"]) < 1.2 * best.record.loss_history[-1] < losses["constant"]
 
 
 def smooth_toy(delay=400e-9):
@@ -130,9 +130,9 @@ def test_smooth_gains_stay_smooth_and_fit_as_well(solver):
     solution = solve(problem, solver)
     outside = solution.gains - solution.gains @ vectors @ vectors.T
     assert np.abs(outside).max() < 1e-5
-    used = solve(toy.problem(), GaussNewton()).loss_history[-1]
+    used = solve(toy.problem(), GaussNewton()).record.loss_history[-1]
     noise = np.sum(problem.weights * np.abs(gain_products(toy.gains, toy.antennas) * toy.noise) ** 2)
-    assert used < solution.loss_history.min() < 1.1 * noise
+    assert used < solution.record.loss_history.min() < 1.1 * noise
 
 
 def test_a_frozen_sky_gives_the_true_gains(quiet):
@@ -166,7 +166,7 @@ def test_joint_solves_share_gains_and_lose_less_of_the_noise():
     toys = [make_toy(positions, seed=seed) for seed in (1, 2, 3)]
     toys = [replace(toy, gains=toys[0].gains) for toy in toys]
     solution = solve(joint_problem(toys), GaussNewton())
-    assert solution.status == "converged", solution.message
+    assert solution.record.status == "converged", solution.record.message
     assert solution.gains.shape == toys[0].gains.shape
     products = np.tile(gain_products(solution.gains, toys[0].antennas), (3, 1))
     true = np.tile(gain_products(toys[0].gains, toys[0].antennas), (3, 1))
@@ -224,9 +224,9 @@ def test_gaps_in_frequency_are_flagged_channels(toy):
         initial_gains=np.ones((8, present.sum()), complex),
     )
     part = solve(problem, GaussNewton(tolerance=1e-4))
-    assert part.status == whole.status == "converged", (part.message, whole.message)
+    assert part.record.status == whole.record.status == "converged", (part.record.message, whole.record.message)
     # Sixty steps that bring 1e-4 each end at losses that differ by up to 1e-3, as rounding decides.
-    assert part.loss_history[-1] == pytest.approx(whole.loss_history[-1], rel=1e-2)
+    assert part.record.loss_history[-1] == pytest.approx(whole.record.loss_history[-1], rel=1e-2)
     product = gain_products(part.gains, toy.antennas) * part.model
     expected = (gain_products(whole.gains, toy.antennas) * whole.model)[:, present]
     # A tenth of the noise, which is 1e-3 of the foregrounds.
@@ -243,9 +243,9 @@ def test_warm_start_of_lbfgs(converged):
     """It begins where it is told to, and does not leave the minimum."""
     problem, best = converged
     again = solve_warm(problem, Lbfgs(), WarmStart(best.gains, None))[0]
-    assert again.status == "converged"
-    assert again.loss_history[0] == pytest.approx(best.loss_history[-1], rel=1e-6)
-    assert 0.95 * best.loss_history[-1] < again.loss_history[-1] <= again.loss_history[0]
+    assert again.record.status == "converged"
+    assert again.record.loss_history[0] == pytest.approx(best.record.loss_history[-1], rel=1e-6)
+    assert 0.95 * best.record.loss_history[-1] < again.record.loss_history[-1] <= again.record.loss_history[0]
 
 
 def test_wide_delays_leave_gains_free():
@@ -265,11 +265,11 @@ def test_a_partly_flagged_baseline_does_not_slow_the_default_solver(toy):
     flags[11, 50:] = True
     problem = toy.problem(weights=flag_weights(flags))
     solution = solve(problem, GaussNewton())
-    assert solution.status == "converged", solution.message
-    assert solution.newton_decrement < GaussNewton().tolerance
+    assert solution.record.status == "converged", solution.record.message
+    assert solution.record.newton_decrement < GaussNewton().tolerance
     products = gain_products(toy.gains, toy.antennas)
-    assert solution.loss_history[-1] < np.sum(problem.weights * np.abs(products * toy.noise) ** 2)
+    assert solution.record.loss_history[-1] < np.sum(problem.weights * np.abs(products * toy.noise) ** 2)
     # All that many more steps bring is the 5 % of the noise that such directions hold.
     patient = solve(problem, GaussNewton(tolerance=1e-4, max_steps=500))
-    assert patient.status == "converged", patient.message
-    assert solution.loss_history[-1] < 1.05 * patient.loss_history[-1]
+    assert patient.record.status == "converged", patient.record.message
+    assert solution.record.loss_history[-1] < 1.05 * patient.record.loss_history[-1]

@@ -173,7 +173,7 @@ def test_starting_at_the_solution_takes_fewer_steps(toy, tmp_path):
     result.gains.write_calh5(str(tmp_path / "g.calh5"))
     settings = ONE_SOLVE.model_copy(update={"initial_gains": FileStart(kind="file", path=tmp_path / "g.calh5")})
     again = run_calibrator(settings, data)
-    assert again.solutions[0].n_steps < result.solutions[0].n_steps
+    assert again.solutions[0].steps < result.solutions[0].steps
     assert again.solutions[0].loss_history[0] < 1.01 * result.solutions[0].loss_history[-1]
 
 

@@ -12,7 +12,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import fix_phase
-from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
+from calstudy.calibrate.interface import Assumed, Calibration, Progress, Solve
 from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
 from calstudy.calibrate.settings import RUNAWAY, GainWeights, WeightedFit, unsettled_message
 
@@ -68,7 +68,7 @@ class OtherPackage(WeightedFit):
     @abstractmethod
     def solve(
         self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Outcome]]:
+    ) -> tuple[np.ndarray, list[Solve]]:
         """Return gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how each solve ended.
 
         The data are of one polarization, with weight in each group of integrations. `start` is None in the first pass.
@@ -92,7 +92,7 @@ class OtherPackage(WeightedFit):
         factors = 1.0 if self.baselines is None else self.baselines.factors(data.lengths)[:, None]
         groups = self.solves(data.n_times)
         gains = np.full((data.n_antennas, data.n_channels, len(groups), data.n_polarizations), np.nan, complex)
-        outcomes: list[Outcome] = []
+        outcomes: list[Solve] = []
         for p in range(data.n_polarizations):
             used = (weights[..., p] > 0) & (sky.visibilities[..., p] != 0) & (data.visibilities[..., p] != 0)
             visibilities = np.where(used, data.visibilities[..., p], 0).astype(complex)
@@ -112,13 +112,13 @@ class OtherPackage(WeightedFit):
             outcomes=outcomes,
         )
 
-    def _solve_timed(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def _solve_timed(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Solve]]:
         """Solve the groups that have data, and skip the others."""
         full = [number for number, times in enumerate(groups) if measured.weights[times].any()]
         shape = (measured.frame.n_antennas, measured.frame.n_channels, len(groups))
         gains = np.full(shape, np.nan, complex)
         message = "every sample is flagged or has no weight"
-        ended = [Outcome(status="skipped", message=message, seconds=0.0, cpu_seconds=0.0)] * len(groups)
+        ended = [Solve(status="skipped", message=message, seconds=0.0, cpu_seconds=0.0)] * len(groups)
         if full:
             with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
                 # These packages divide by zeros, and warn of numbers that they replace themselves.
@@ -133,7 +133,7 @@ class OtherPackage(WeightedFit):
                 )
         return gains, ended
 
-    def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Solve]]:
         """Solve groups; with weights from the gains, repeat with those of the previous pass until they settle."""
         settings, weights = self.weights, measured.weights
         gains, outcomes = self.solve(measured, groups)
@@ -153,7 +153,7 @@ class OtherPackage(WeightedFit):
         return gains, [_in_passes(*ended, passes) for ended in zip(outcomes, changes, unsettled, strict=True)]
 
 
-def _in_passes(outcome: Outcome, change: float, unsettled: bool, passes: int) -> Outcome:
+def _in_passes(outcome: Solve, change: float, unsettled: bool, passes: int) -> Solve:
     """Return an outcome with the number of passes and the last change of the weights."""
     diagnostics = {**outcome.diagnostics, "passes": passes, "weight_change": change}
     if not unsettled or outcome.status != "converged":

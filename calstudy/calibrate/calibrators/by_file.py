@@ -13,7 +13,7 @@ from calstudy.base.gains import read_gains, require_solutions, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.schema import FOLDER, UNKEYED, fault
 from calstudy.calibrate.exchange import find_returned, salted
-from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Outcome, Progress
+from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress, Solve
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal
@@ -83,7 +83,7 @@ class ByFile(Calibrator):
         count = len(self.solves(observation.n_times)) * observation.n_polarizations
         if progress is not None:
             progress(count, count)
-        outcome = Outcome(status="by-file", message=f"gains of {self.gains.name}")
+        outcome = Solve(status="by-file", message=f"gains of {self.gains.name}")
         return Calibration(gains=gains, gain_flags=flags, model=self._model(observation), outcomes=[outcome] * count)
 
     def _model(self, observation: Observation) -> np.ndarray | None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Outcome, Progress
+from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress, Solve
 from calstudy.instrument.size import Size
 
 
@@ -31,5 +31,5 @@ class NoCalibration(Calibrator):
         count = n_polarizations * len(self.solves(n_times))
         if progress is not None:
             progress(count, count)
-        outcome = Outcome(status="converged", message="gains of one: nothing is fitted")
+        outcome = Solve(status="converged", message="gains of one: nothing is fitted")
         return Calibration(gains=gains, outcomes=[outcome] * count)

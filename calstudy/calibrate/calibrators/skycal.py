@@ -7,7 +7,7 @@ from pydantic import Field
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.calibrators._other_packages import FEED, Measured, OtherPackage, patterns
-from calstudy.calibrate.interface import Outcome
+from calstudy.calibrate.interface import Solve
 from calstudy.instrument.size import Size
 
 
@@ -31,14 +31,14 @@ class Skycal(OtherPackage):
 
     def solve(
         self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Outcome]]:
+    ) -> tuple[np.ndarray, list[Solve]]:
         """Solve every group of integrations."""
         if start is not None:
             measured = measured.weighted_by(start, groups)
         found = [self._solve_group(measured, times) for times in groups]
         return np.stack([gains for gains, _ in found], axis=2), [outcome for _, outcome in found]
 
-    def _solve_group(self, measured: Measured, times: slice) -> tuple[np.ndarray, Outcome]:
+    def _solve_group(self, measured: Measured, times: slice) -> tuple[np.ndarray, Solve]:
         """Return gains (Nants, Nfreqs), NaN where there are none.
 
         Common gains depend only on the sums of w V M* and w |M|^2 over integrations.
@@ -96,14 +96,14 @@ class Skycal(OtherPackage):
         (steps,) = details["iter"].values()
         return gains, steps
 
-    def _outcome(self, steps: np.ndarray) -> Outcome:
+    def _outcome(self, steps: np.ndarray) -> Solve:
         solved, failed = steps > 0, steps < 0
         longest = int(steps.max(initial=0))
         if not solved.any():
-            return Outcome(status="failed", message=f"gains converged in no channel within {self.max_steps} steps")
+            return Solve(status="failed", message=f"gains converged in no channel within {self.max_steps} steps")
         if failed.any():
             message = (
                 f"gains did not converge in {failed.sum()} of {(solved | failed).sum()} channels, which are flagged"
             )
-            return Outcome(status="stalled", message=message, steps=longest)
-        return Outcome(status="converged", message=f"gains changed by less than {self.tolerance:g}", steps=longest)
+            return Solve(status="stalled", message=message, steps=longest)
+        return Solve(status="converged", message=f"gains changed by less than {self.tolerance:g}", steps=longest)

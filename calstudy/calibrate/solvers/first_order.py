@@ -20,7 +20,8 @@ from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.loss import FitData, JointLoss, Parameters
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, Prior
 from calstudy.calibrate.projection import Projector
-from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
+from calstudy.calibrate.records import Solve
+from calstudy.calibrate.solvers.interface import WarmStart
 from calstudy.calibrate.solvers.reduced import newton_decrement_at
 from calstudy.calibrate.tensors import FitTensors
 
@@ -140,7 +141,7 @@ class JointKernels:
         data = FitData(visibilities, weights, pairs.to_pair(target, self.dtype), summed, model)
         return Parameters(self.space.reduce(tf.cast(start, self.dtype)), coefficients), data, exact.scale
 
-    def estimate(self, parameters: Parameters, data: FitData, scale: float) -> Estimate:
+    def estimate(self, parameters: Parameters, data: FitData, scale: float) -> tuple[np.ndarray, np.ndarray]:
         """Return gains and model in the problem's order and unit.
 
         `data` contain the model if it is frozen; `scale` is their unit, in the problem's unit.
@@ -148,7 +149,7 @@ class JointKernels:
         model = data.model
         if model is None:
             model = self.loss.model(parameters.coefficients)
-        return Estimate(pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload([model], scale))
+        return pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload([model], scale)
 
     def _descend(
         self, n_steps: tf.Tensor, done: tf.Tensor, descent: Descent, data: FitData
@@ -252,38 +253,38 @@ class FirstOrder:
                 return step
         return None
 
-    def terminate(self, state: FirstOrderState) -> Verdict | None:
+    def terminate(self, state: FirstOrderState) -> Solve | None:
         """Decide by the change of the loss, with the chosen rule."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
-            return Verdict("failed", f"the loss is not finite after {n_steps} steps; lower the learning rate")
+            return Solve("failed", f"the loss is not finite after {n_steps} steps; lower the learning rate")
         if self.stop == "published":
             if self._last_step(state.history, n_steps - 1) is not None:
-                return Verdict("converged", f"two consecutive losses differ by less than {self.tolerance:g}")
+                return Solve("converged", f"two consecutive losses differ by less than {self.tolerance:g}")
         elif n_steps >= STEPS_PER_CALL:
             before = min(state.history[:-STEPS_PER_CALL])
             if abs(before - float(state.descent.best_loss)) < self.tolerance:
-                return Verdict(
+                return Solve(
                     "converged", f"the best loss fell by less than {self.tolerance:g} over {STEPS_PER_CALL} steps"
                 )
         if n_steps >= self.optimizer.max_steps:
             if self.tolerance == 0:
-                return Verdict("max-steps", f"stopped after {n_steps} steps, a fixed number (tolerance: 0)")
-            return Verdict("max-steps", f"not converged after {n_steps} steps")
+                return Solve("max-steps", f"stopped after {n_steps} steps, a fixed number (tolerance: 0)")
+            return Solve("max-steps", f"not converged after {n_steps} steps")
         return None
 
     def losses(self, state: FirstOrderState) -> Sequence[float]:
         """Return the loss history, prior included, in the unit of the data squared."""
         return [loss * state.scale**2 for loss in state.history]
 
-    def estimate(self, state: FirstOrderState) -> Estimate:
+    def estimate(self, state: FirstOrderState) -> tuple[np.ndarray, np.ndarray]:
         """Return the best gains and foregrounds so far, or the last."""
         chosen = state.descent.best if self.keep == "best" else state.descent.parameters
         return state.kernels.estimate(chosen, state.data, state.scale)
 
     def newton_decrement(self, state: FirstOrderState, problem: CalibrationProblem) -> float:
         """Return the relative Newton decrement at the estimate."""
-        return newton_decrement_at(problem, self.estimate(state).gains)
+        return newton_decrement_at(problem, self.estimate(state)[0])
 
     def memory(self, state: FirstOrderState) -> None:
         """Return nothing: only the gains carry over."""

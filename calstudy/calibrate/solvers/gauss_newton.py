@@ -26,11 +26,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
-from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
+from calstudy.calibrate.records import Solve
+from calstudy.calibrate.solvers.interface import WarmStart
 from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, CoupledBlocks, Inverse
 from calstudy.calibrate.solvers.reduced import (
     ROUNDING_LOSS,
@@ -215,27 +218,27 @@ class GaussNewton:
         # small does not predict the next.
         return state if boosted else replace(state, predicted=step.promised)
 
-    def terminate(self, state: GaussNewtonState) -> Verdict | None:
+    def terminate(self, state: GaussNewtonState) -> Solve | None:
         """Decide by the predicted decrease of the loss in the next step."""
         loss, n_steps = state.history[-1], len(state.history) - 1
         if not math.isfinite(loss):
-            return Verdict("failed", "the loss at the first gains is not finite")
+            return Solve("failed", "the loss at the first gains is not finite")
         if loss < self._rounding:
-            return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
+            return Solve("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
         if self._settled(state) and (state.checked or not (state.beyond_single or state.curved)):
-            return Verdict("converged", f"the next step would lower the loss by {fall:.1e} of itself")
+            return Solve("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.checked and self.precision == "single":
-            return Verdict(
+            return Solve(
                 "stalled",
                 f"{fall:.1e} of the loss is predicted to go, in directions that single precision does not resolve "
                 "(a solver with 'precision: double' goes on)",
             )
         hint = f"{fall:.1e} of {{}} is predicted to go" if math.isfinite(fall) else ""
         if state.damping > MAX_DAMPING:
-            return Verdict("stalled", f"no step lowers the loss{', though ' + hint.format('it') if hint else ''}")
+            return Solve("stalled", f"no step lowers the loss{', though ' + hint.format('it') if hint else ''}")
         if n_steps >= self.max_steps:
-            return Verdict(
+            return Solve(
                 "max-steps", f"not converged after {n_steps} steps{': ' + hint.format('the loss') if hint else ''}"
             )
         return None
@@ -301,10 +304,10 @@ class GaussNewton:
         """Return the loss history in the unit of the data squared."""
         return [loss * state.loss_unit for loss in state.history]
 
-    def estimate(self, state: GaussNewtonState) -> Estimate:
+    def estimate(self, state: GaussNewtonState) -> tuple[np.ndarray, np.ndarray]:
         """Return the current gains and their best-fitting foregrounds."""
         model = state.kernels.tensors.unload(state.projection.model, state.scale)
-        return Estimate(pairs.to_complex(state.gains), model)
+        return pairs.to_complex(state.gains), model
 
     def newton_decrement(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
         """Return the predicted relative decrease of the loss; computed anew if the iteration has no prediction."""

@@ -6,13 +6,14 @@ import logging
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from calstudy.calibrate.degeneracy import fix_degeneracies
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
-from calstudy.calibrate.solution import Solution, Status
+from calstudy.calibrate.records import Solve
 
 logger = logging.getLogger(__name__)
 
@@ -23,11 +24,22 @@ STILL = 0.01
 HIDDEN, ROUNDING = 1e-8, 1e-10
 
 
-class Estimate(NamedTuple):
-    """Gains (Nants, Nfreqs) and intrinsic model (Nbls, Nfreqs), complex128, in the problem's order and unit."""
+class Solution(NamedTuple):
+    """Gains and foreground model of one integration and polarization, and how the solve ended.
+
+    Attributes
+    ----------
+    gains
+        Shape (Nants, Nfreqs), complex128, dimensionless.
+    model
+        Intrinsic visibilities F, shape (Nbls, Nfreqs), complex128, in the unit of the data.
+    record
+        Its loss is in the unit of the data squared.
+    """
 
     gains: np.ndarray
     model: np.ndarray
+    record: Solve
 
 
 class WarmStart(NamedTuple):
@@ -45,13 +57,6 @@ class WarmStart(NamedTuple):
     memory: Any
 
 
-class Verdict(NamedTuple):
-    """Why an iteration ends: the status and one sentence."""
-
-    status: Status
-    message: str
-
-
 class Solver(Protocol):
     """An iteration over states of its own kind. Solvers hold settings only; everything that changes is in the state."""
 
@@ -65,17 +70,17 @@ class Solver(Protocol):
     def step(self, state: Any) -> Any:
         """Return the next state; some solvers take several of their steps at once."""
 
-    def terminate(self, state: Any) -> Verdict | None:
-        """Return why the iteration ends here, or None if it goes on."""
+    def terminate(self, state: Any) -> Solve | None:
+        """Return the status and the message if the iteration ends here, or None if it goes on."""
 
     def losses(self, state: Any) -> Sequence[float]:
         """Return the loss before the first step and after each, in the unit of the data squared."""
 
-    def estimate(self, state: Any) -> Estimate:
-        """Return the best gains and model so far."""
+    def estimate(self, state: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the best gains and model so far, complex128, in the problem's order and unit."""
 
     def newton_decrement(self, state: Any, problem: CalibrationProblem) -> float:
-        """Return the relative Newton decrement at the estimate (see `Solution`); NaN if unknown."""
+        """Return the relative Newton decrement at the estimate (see `Solve`); NaN if unknown."""
 
     def memory(self, state: Any) -> Any:
         """Return data that the next solve can reuse, or None."""
@@ -91,45 +96,41 @@ def solve_warm(
     initial gains.
     """
     solution, state = _solve(problem, solver, warm)
-    return solution, WarmStart(solution.gains, solver.memory(state)) if solution.usable else None
+    return solution, WarmStart(solution.gains, solver.memory(state)) if solution.record.usable else None
 
 
 def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) -> tuple[Solution, Any]:
     """Return the solution and the solver's last state."""
     started, cpu_started = time.perf_counter(), time.process_time()
     state = solver.init(problem, warm)
-    while (verdict := solver.terminate(state)) is None:
+    while (ended := solver.terminate(state)) is None:
         state = solver.step(state)
     losses = np.array(solver.losses(state), float)
     gains, model = solver.estimate(state)
     newton_decrement = rms = math.nan
-    if verdict.status != "failed":
+    if ended.status != "failed":
         newton_decrement = float(np.clip(solver.newton_decrement(state, problem), 0, 1))
-        if verdict.status == "converged" and newton_decrement > max(STILL, solver.tolerance):
-            message = f"{verdict.message}, but a Gauss-Newton step would lower it by {newton_decrement:.1e} of itself"
-            verdict = Verdict("stalled", message)
-        if verdict.status == "converged" and (hidden := _hidden(gains, model, problem)) is not None:
-            verdict, newton_decrement = Verdict("stalled", hidden), math.nan
+        if ended.status == "converged" and newton_decrement > max(STILL, solver.tolerance):
+            message = f"{ended.message}, but a Gauss-Newton step would lower it by {newton_decrement:.1e} of itself"
+            ended = Solve("stalled", message)
+        if ended.status == "converged" and (hidden := _hidden(gains, model, problem)) is not None:
+            ended, newton_decrement = Solve("stalled", hidden), math.nan
         try:
             gains, model = fix_degeneracies(gains, model, problem)
             rms = decrement_rms(gains, model, problem, newton_decrement)
         except ValueError as error:
-            verdict = Verdict("failed", str(error))
-    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    solution = Solution(
-        gains,
-        model,
-        losses,
-        verdict.status,
-        verdict.message,
-        losses.size - 1,
-        seconds,
-        cpu_seconds,
-        newton_decrement,
-        rms,
+            ended = Solve("failed", str(error))
+    record = replace(
+        ended,
+        steps=losses.size - 1,
+        loss_history=losses,
+        seconds=time.perf_counter() - started,
+        cpu_seconds=time.process_time() - cpu_started,
+        newton_decrement=newton_decrement,
+        decrement_rms=rms,
     )
-    logger.debug("%s after %d steps, %.2f s: %s", solution.status, solution.n_steps, seconds, solution.message)
-    return solution, state
+    logger.debug("%s after %d steps, %.2f s: %s", record.status, record.steps, record.seconds, record.message)
+    return Solution(gains, model, record), state
 
 
 def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> str | None:

@@ -17,7 +17,8 @@ from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
-from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
+from calstudy.calibrate.records import Solve
+from calstudy.calibrate.solvers.interface import WarmStart
 from calstudy.calibrate.solvers.preconditioners import antenna_degrees
 from calstudy.calibrate.solvers.reduced import ReducedData, ReducedKernels, compiled, newton_decrement_at
 
@@ -38,7 +39,7 @@ class LbfgsState:
     unit
         Scale of each antenna's coordinates, (1, Nants, 1), float64.
     newton_decrement
-        Relative Newton decrement (see `Solution`); infinite while unknown.
+        Relative Newton decrement (see `Solve`); infinite while unknown.
     message
         Message of scipy at the end; None before.
     """
@@ -135,30 +136,30 @@ class Lbfgs:
             message=str(found.message).strip(),
         )
 
-    def terminate(self, state: LbfgsState) -> Verdict | None:
+    def terminate(self, state: LbfgsState) -> Solve | None:
         """Decide by the Newton decrement."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
-            return Verdict("failed", f"the loss is not finite after {n_steps} steps")
+            return Solve("failed", f"the loss is not finite after {n_steps} steps")
         if state.message is None:
             return None
         if state.newton_decrement < self.tolerance:
-            return Verdict(
+            return Solve(
                 "converged", f"a Gauss-Newton step would lower the loss by {state.newton_decrement:.1e} of itself"
             )
         hint = f"{state.newton_decrement:.1e} of the loss is predicted to go"
         if n_steps >= self.max_steps:
-            return Verdict("max-steps", f"not converged after {n_steps} steps: {hint}")
-        return Verdict("stalled", f"no step lowers the loss any more after {n_steps} steps ({state.message}): {hint}")
+            return Solve("max-steps", f"not converged after {n_steps} steps: {hint}")
+        return Solve("stalled", f"no step lowers the loss any more after {n_steps} steps ({state.message}): {hint}")
 
     def losses(self, state: LbfgsState) -> Sequence[float]:
         """Return the loss history in the unit of the data squared."""
         return [loss * state.reduced.loss_unit for loss in state.history]
 
-    def estimate(self, state: LbfgsState) -> Estimate:
+    def estimate(self, state: LbfgsState) -> tuple[np.ndarray, np.ndarray]:
         """Return the current gains, and the foregrounds that fit best with them."""
         gains, projection = state.project(state.coordinates)
-        return Estimate(pairs.to_complex(gains), state.kernels.tensors.unload(projection.model, state.reduced.scale))
+        return pairs.to_complex(gains), state.kernels.tensors.unload(projection.model, state.reduced.scale)
 
     def newton_decrement(self, state: LbfgsState, problem: CalibrationProblem) -> float:
         """Return the relative Newton decrement at the estimate."""

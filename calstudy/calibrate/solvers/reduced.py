@@ -307,7 +307,7 @@ _kernels = lru_cache(maxsize=6)(ReducedKernels)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
-    """Return the relative Newton decrement of the reduced problem at gains (Nants, Nfreqs) (see `Solution`)."""
+    """Return the relative Newton decrement of the reduced problem at gains (Nants, Nfreqs) (see `Solve`)."""
     kernels = compiled(problem.structure, problem.frozen)
     reduced = kernels.reduce(problem, gains)
     projection = kernels.project(reduced.gains, *reduced.data)
