@@ -19,13 +19,11 @@ from calstudy.calibrate.settings import (
     GainFit,
     GainWeights,
     GaussNewtonSettings,
-    LbfgsSettings,
     unsettled_message,
 )
-from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
+from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, solve_warm
-from calstudy.calibrate.solvers.lbfgs import Lbfgs
 from calstudy.calibrate.structure import repeat_structure
 
 
@@ -34,10 +32,7 @@ def make_solver(settings: GainFit) -> Solver:
     solver = settings.solver
     if isinstance(solver, GaussNewtonSettings):
         return GaussNewton(solver.tolerance, solver.max_steps, solver.precision)
-    if isinstance(solver, LbfgsSettings):
-        return Lbfgs(solver.tolerance, solver.max_steps, solver.memory)
-    optimizer = Optimizer(solver.name, solver.learning_rate, solver.schedule, solver.final_rate, solver.max_steps)
-    return FirstOrder(optimizer, solver.tolerance, solver.precision, solver.stop, solver.keep)
+    return Adamax(**solver.model_dump(exclude={"name", "warm_start"}))
 
 
 def fit(

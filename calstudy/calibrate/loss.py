@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import Prior
@@ -59,15 +57,13 @@ class Part(NamedTuple):
 def foreground_model(coefficients: Sequence[tf.Tensor], bases: Sequence[tf.Tensor]) -> RealImaginary:
     """Return sum_i u_i A_i of all models, real and imaginary part, each (Nmodels, Nfreqs) (paper Eq. FGMODEL).
 
-    There is one matrix product per bucket, of u, (2, Nmembers, Nvec), and the basis A, (Nvec, Nfreqs); of (2, 1, Nvec)
-    and (Nvec, Nmembers, Nfreqs) for a joint bucket.
+    There is one matrix product per bucket, of u, (2, Nmembers, Nvec), and the basis A, (Nvec, Nfreqs).
     """
     real, imaginary = [], []
     for u, basis in zip(coefficients, bases, strict=True):
-        n_vectors, n_frequencies = basis.shape[0], basis.shape[-1]
-        both = tf.reshape(u, [-1, n_vectors]) @ tf.reshape(basis, [n_vectors, -1])
+        both = tf.reshape(u, [-1, basis.shape[0]]) @ basis
         # The gradient of a split is one concatenation; that of two slices would be two arrays padded with zeros.
-        parts = tf.split(tf.reshape(both, [-1, n_frequencies]), 2)
+        parts = tf.split(both, 2)
         real.append(parts[0])
         imaginary.append(parts[1])
     return tf.concat(real, axis=0), tf.concat(imaginary, axis=0)
@@ -120,13 +116,6 @@ def _make_parts(tensors: FitTensors) -> list[Part]:
     return parts
 
 
-def _coefficients(model: tf.Tensor, basis: np.ndarray) -> tf.Tensor:
-    """Return the coefficients of models (2, Nmembers, Nfreqs) in an orthonormal basis; see `foreground_model`."""
-    if basis.ndim == 2:
-        return model @ basis
-    return tf.reshape(model, [2, 1, -1]) @ basis.reshape(-1, basis.shape[-1])
-
-
 class JointLoss:
     """The loss of one fit structure, in parts.
 
@@ -136,7 +125,7 @@ class JointLoss:
 
     def __init__(self, tensors: FitTensors, space: GainSpace, prior: Prior, dtype: tf.DType) -> None:
         self._tensors, self._space, self._with_prior, self._dtype = tensors, space, prior == "sum", dtype
-        self._bases = [tf.constant(np.moveaxis(basis, -1, 0), self._dtype) for basis in tensors.bases]
+        self._bases = [tf.constant(basis.T, self._dtype) for basis in tensors.bases]
         self._parts = _make_parts(tensors)
 
     def summed(self, weights: tf.Tensor) -> tuple[tf.Tensor, ...]:
@@ -152,9 +141,7 @@ class JointLoss:
     def coefficients(self, models: tf.Tensor) -> tuple[tf.Tensor, ...]:
         """Return A^T F of each bucket for models (2, Nmodels, Nfreqs), float64; the transpose of `foreground_model`."""
         parts = zip(self._tensors.slices, self._tensors.bases, strict=True)
-        return tuple(
-            tf.cast(_coefficients(models[:, first:last], basis), self._dtype) for (first, last), basis in parts
-        )
+        return tuple(tf.cast(models[:, first:last] @ basis, self._dtype) for (first, last), basis in parts)
 
     def model(self, coefficients: Sequence[tf.Tensor]) -> tf.Tensor:
         """Return F on the baselines, (2, Nbls, Nfreqs), for the coefficients of each bucket; see `foreground_model`."""

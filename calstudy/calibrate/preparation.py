@@ -60,7 +60,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     """Check data and settings, and compute the arrays of a fit.
 
     Raises InputError if there are polarizations that are not parallel hands, or unflagged data that are not finite, or
-    if weights, gains or joint groups do not fit the data.
+    if weights or gains do not fit the data.
     """
     require_parallel_hands(observation.uvd)
     fitted = fitted_baselines(observation, settings.autos)
@@ -106,11 +106,8 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         return cube[times, :, :, polarization].reshape(structure.n_baselines, structure.n_frequencies)
 
     weights, visibilities = rows(prepared.weights), rows(prepared.data.visibilities)
-    flagged = 1 - float(np.mean(rows(prepared.used)))
     if not weights.any():
         return "every sample is flagged or has no weight"
-    if flagged >= settings.skip_flagged:
-        return f"{100 * flagged:.0f} % of the samples are flagged, which skip_flagged excludes"
     if not np.any(visibilities, where=weights > 0):
         return "the data are zero"
     sky = None if prepared.sky is None else rows(prepared.sky)

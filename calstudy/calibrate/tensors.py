@@ -75,12 +75,10 @@ class FitTensors:
         Whether any baselines share a model.
     model_index
         Model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model.
-    coupled
-        Whether any baselines share a model or coefficients.
     slices
         Range of models of each bucket.
     bases
-        Basis of each bucket, shape (Nfreqs, Nvec), or (Nmodels, Nfreqs, Nvec) if it is joint, float64 arrays.
+        Basis of each bucket, shape (Nfreqs, Nvec), float64 arrays.
     batches
         Batches of models that are processed one after the other: the temporary arrays of one batch bound the memory,
         and the size of compiled graphs grows with the number of batches.
@@ -110,7 +108,6 @@ class FitTensors:
         self.bases = [bucket.vectors for bucket in buckets]
         # The first baseline of each model, and one past the last of all.
         self._baseline_edges = np.searchsorted(position[self._order], np.arange(self.n_models + 1))
-        self.coupled = self.shared or any(bucket.joint for bucket in buckets)
         sizes = [bucket.members.size for bucket in buckets]
         self.batches = make_batches(self.bases, sizes, self._baseline_edges, structure.models_at_once)
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None

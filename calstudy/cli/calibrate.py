@@ -34,7 +34,7 @@ Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format tha
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
 Gains = Annotated[Path | None, typer.Option(help="CalH5 or calfits file to start from; by default unity.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="YAML file: a `calibration` section.")]
-SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default), lbfgs, adamax, adam or sgd.")]
+SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default) or adamax.")]
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
 Redundant = Annotated[bool, typer.Option("--redundant", help="One foreground model per redundant group.")]
 GainsOnly = Annotated[bool, typer.Option("--gains-only", help="Freeze the sky model and solve for gains alone.")]

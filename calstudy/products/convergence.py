@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
-from calstudy.calibrate.cost import FIRST_ORDER_STEP, PAPER_SAMPLES
+from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import PARITIES
@@ -159,7 +159,7 @@ def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Basel
 def _cost(task: Task) -> Cost:
     size, solver = size_of(task), task.settings["calibration"].solver
     work = size.baselines * size.channels.count / PAPER_SAMPLES
-    step = 0.3 if solver.name == "gauss-newton" else FIRST_ORDER_STEP
+    step = 0.3 if solver.name == "gauss-newton" else ADAMAX_STEP
     steps = 10 if solver.name == "gauss-newton" else min(solver.max_steps, max(task.settings["steps"]))
     data = 4 * size.samples * 8
     return Cost(20 + 2 * steps * step * work, LIBRARIES_MEMORY + 1.5e9 * work + data, 1e6)

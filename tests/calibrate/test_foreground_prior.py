@@ -111,7 +111,7 @@ def gains(problem):
 
 def test_the_root_has_the_covariance_of_a_flat_wedge():
     channels, width = 64, 5.3
-    covariance = flat_wedge_root(channels, width, 1e-13) @ flat_wedge_root(channels, width, 1e-13).T
+    covariance = flat_wedge_root(channels, width) @ flat_wedge_root(channels, width).T
     lag = np.subtract.outer(np.arange(channels), np.arange(channels))
     assert np.abs(covariance - np.sinc(2 * width / channels * lag)).max() < 1e-6
 
@@ -377,7 +377,6 @@ def test_a_partial_solver_block_keeps_what_the_calibrator_has_of_its_own():
     assert (
         DelayWeighted.model_validate({"solver": {"name": "gauss-newton", "tolerance": 1e-6}}).solver.tolerance == 1e-6
     )
-    assert DelayWeighted.model_validate({"solver": "lbfgs"}).solver.tolerance == 1e-3
 
 
 def test_a_solve_whose_sky_model_is_zero_is_skipped_with_the_reason():

@@ -158,15 +158,6 @@ def test_zero_weights_everywhere_are_skipped_solves(toy):
     assert (result.gains.gain_array == 1).all()
 
 
-def test_mostly_flagged_integrations_are_skipped_where_asked(toy):
-    data = make_uvdata(toy, 2)
-    data.flag_array[:20] = True
-    settings = SETTINGS.model_copy(update={"skip_flagged": 0.5})
-    first, second = run_calibrator(settings, data).solutions
-    assert (first.status, second.status) == ("skipped", "converged")
-    assert first.message == "71 % of the samples are flagged, which skip_flagged excludes"
-
-
 def test_starting_at_the_solution_takes_fewer_steps(toy, tmp_path):
     data = make_uvdata(toy, 2)
     result = run_calibrator(ONE_SOLVE, data)

@@ -85,20 +85,10 @@ class LeastSquares(GainFit):
 
 
 def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
-    """Raise InputError if the channels cannot hold the foreground basis of the longest baseline.
-
-    Also if joint groups cannot be read or do not fit the array; the longest baseline is then that of the others.
-    """
+    """Raise InputError if the channels cannot hold the foreground basis of the longest baseline."""
     from calstudy.calibrate.basis import require_room
-    from calstudy.calibrate.joint import other_baselines, place_groups, read_joint_groups
 
-    lengths = frame.lengths
-    if settings.joint_basis is not None:
-        placed = place_groups(read_joint_groups(settings.joint_basis.path), frame.pairs, frame.n_channels)
-        lengths = lengths[other_baselines(placed, lengths.size)]
-        if lengths.size == 0:
-            return
-    longest = lengths.max()
+    longest = frame.lengths.max()
     try:
         require_room(longest, frame.frequencies, settings.basis)
     except InputError as error:

@@ -159,7 +159,7 @@ class ReducedKernels:
         self.tensors = FitTensors(structure)
         self.structure, self.frozen, self.dtype = structure, frozen, dtype
         finite = structure.prior != "none" and not frozen
-        self.by_channel = ((self.tensors.coupled and not finite) or frozen) and structure.gain_vectors is None
+        self.by_channel = ((self.tensors.shared and not finite) or frozen) and structure.gain_vectors is None
         self.dampings = (FINITE if finite else FREE)[dtype]
         self.projector = (
             FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype, thorough)
@@ -180,7 +180,7 @@ class ReducedKernels:
         if isinstance(self.projector, FrozenForegrounds):
             return False
         rows = 2 * self.tensors.n_antennas * self.projector.common.shape[1]
-        alone = not self.tensors.coupled and self.structure.prior != "both"
+        alone = not self.tensors.shared and self.structure.prior != "both"
         return alone and self.structure.gain_vectors is None and rows <= MOST_COUPLED
 
     def in_double(self, thorough: bool) -> ReducedKernels:

@@ -1,4 +1,4 @@
-"""First-order descent on gains and foreground coefficients together; Adamax at 0.01 is the paper's solver.
+"""Adamax (Kingma & Ba 2014) on gains and foreground coefficients together; a rate of 0.01 is the paper's solver.
 
 One call runs many steps inside one compiled loop. The loss is Eq. LOGLIKELIHOOD of visibilities in units of their rms,
 so that the learning rate is a relative change, plus the prior on the summed model where the problem has it.
@@ -25,12 +25,10 @@ from calstudy.calibrate.solvers.interface import WarmStart
 from calstudy.calibrate.solvers.reduced import newton_decrement_at
 from calstudy.calibrate.tensors import FitTensors
 
-Method = Literal["adamax", "adam", "sgd"]
-Schedule = Literal["constant", "cosine", "exponential"]
 Precision = Literal["single", "double"]
 Stop = Literal["best-loss", "published"]
 
-# Decay of the first and second moment and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
+# Decay of the moments and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-7
 STEPS_PER_CALL = 50
 
@@ -47,81 +45,36 @@ class Descent(NamedTuple):
     best_loss: tf.Tensor
 
 
-@dataclass(frozen=True)
-class Optimizer:
-    """Method and learning rate of the descent.
-
-    Attributes
-    ----------
-    method
-        Adamax, Adam (Kingma & Ba 2014) or plain gradient descent.
-    learning_rate
-        Size of the first step, for visibilities in units of their rms.
-    schedule
-        Decrease of the rate: none, along half a cosine, or by the same factor each step.
-    final_rate
-        Rate of the last step relative to the first, unless it is constant.
-    max_steps
-        Number of the last step.
-    """
-
-    method: Method = "adamax"
-    learning_rate: float = 0.01
-    schedule: Schedule = "constant"
-    final_rate: float = 0.01
-    max_steps: int = 10_000
-
-    def rate(self, step: tf.Tensor) -> tf.Tensor:
-        """Return the learning rate of a step, counted from one; scalar of the dtype of `step`."""
-        done = (step - 1) / max(self.max_steps - 1, 1)
-        if self.schedule == "cosine":
-            return self.learning_rate * (self.final_rate + (1 - self.final_rate) * (1 + tf.cos(math.pi * done)) / 2)
-        if self.schedule == "exponential":
-            return self.learning_rate * tf.exp(math.log(self.final_rate) * done)
-        return tf.constant(self.learning_rate, step.dtype)
-
-
 def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
     """Apply a function to all tensors of one or more parameters of the same structure."""
     return tf.nest.map_structure(function, *parameters)
 
 
 def update(
-    method: Method,
-    learning_rate: tf.Tensor,
+    learning_rate: float,
     step: tf.Tensor,
     parameters: Parameters,
     moments: tuple[Parameters, Parameters],
     gradient: Parameters,
 ) -> tuple[Parameters, tuple[Parameters, Parameters]]:
-    """Take one step of Adamax, Adam (Kingma & Ba 2014) or plain gradient descent; return parameters and moments.
-
-    `step` counts from one, in the dtype of the parameters.
-    """
-    if method == "sgd":
-        return _map(lambda x, g: x - learning_rate * g, parameters, gradient), moments
+    """Take one step; return parameters and moments. `step` counts from one, in the dtype of the parameters."""
     first = _map(lambda m, g: BETA_1 * m + (1 - BETA_1) * g, moments[0], gradient)
-    rate = learning_rate / (1 - tf.cast(BETA_1, step.dtype) ** step)
-    if method == "adamax":
-        second = _map(lambda n, g: tf.maximum(BETA_2 * n, tf.abs(g)), moments[1], gradient)
-        moved = _map(lambda x, m, n: x - rate * m / (n + EPSILON), parameters, first, second)
-    else:
-        rate *= tf.sqrt(1 - tf.cast(BETA_2, step.dtype) ** step)
-        second = _map(lambda n, g: BETA_2 * n + (1 - BETA_2) * g * g, moments[1], gradient)
-        moved = _map(lambda x, m, n: x - rate * m / (tf.sqrt(n) + EPSILON), parameters, first, second)
+    rate = tf.constant(learning_rate, step.dtype) / (1 - tf.cast(BETA_1, step.dtype) ** step)
+    second = _map(lambda n, g: tf.maximum(BETA_2 * n, tf.abs(g)), moments[1], gradient)
+    moved = _map(lambda x, m, n: x - rate * m / (n + EPSILON), parameters, first, second)
     return moved, (first, second)
 
 
 class JointKernels:
-    """Loss, gradient and the compiled descent for one fit structure and one setting of the optimizer."""
+    """Loss, gradient and the compiled descent for one fit structure and one learning rate."""
 
-    def __init__(self, structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> None:
+    def __init__(self, structure: FitStructure, learning_rate: float, precision: Precision, prior: Prior) -> None:
         self.dtype = tf.float32 if precision == "single" else tf.float64
         self.tensors = FitTensors(structure)
         self.projector = Projector(structure, self.tensors)
         self.space = GainSpace(structure.gain_vectors, self.dtype)
         self.loss = JointLoss(self.tensors, self.space, prior, self.dtype)
-        self._optimizer = optimizer
+        self._learning_rate = learning_rate
         self.descend = tf.function(self._descend, jit_compile=True, autograph=False)
 
     def load(self, problem: CalibrationProblem, gains: np.ndarray) -> tuple[Parameters, FitData, float]:
@@ -161,8 +114,7 @@ class JointKernels:
             better = value < now.best_loss
             best = _map(lambda new, old: tf.where(better, new, old), now.parameters, now.best)
             step = tf.cast(done + index + 1, self.dtype)
-            rate = self._optimizer.rate(step)
-            moved = update(self._optimizer.method, rate, step, now.parameters, now.moments, gradient)
+            moved = update(self._learning_rate, step, now.parameters, now.moments, gradient)
             descent = Descent(*moved, best, tf.where(better, value, now.best_loss))
             return index + 1, descent, tf.tensor_scatter_nd_update(losses, [[index]], [value])
 
@@ -172,13 +124,13 @@ class JointKernels:
 
 
 @lru_cache(maxsize=4)
-def compiled(structure: FitStructure, optimizer: Optimizer, precision: Precision, prior: Prior) -> JointKernels:
+def compiled(structure: FitStructure, learning_rate: float, precision: Precision, prior: Prior) -> JointKernels:
     """Return the kernels of a structure and setting, compiled once for all its integrations."""
-    return JointKernels(structure, optimizer, precision, prior)
+    return JointKernels(structure, learning_rate, precision, prior)
 
 
 @dataclass(frozen=True, eq=False)
-class FirstOrderState:
+class AdamaxState:
     """One point of the descent; losses are in units of the data's mean square."""
 
     kernels: JointKernels
@@ -189,11 +141,15 @@ class FirstOrderState:
 
 
 @dataclass(frozen=True)
-class FirstOrder:
-    """Adamax, Adam or gradient descent.
+class Adamax:
+    """Descent with a constant learning rate.
 
     Parameters
     ----------
+    learning_rate
+        Size of the first step, for visibilities in units of their rms.
+    max_steps
+        Number of the last step.
     tolerance
         In units of the data's mean square. With zero, the number of steps is fixed.
     precision
@@ -207,32 +163,33 @@ class FirstOrder:
         Return the ``best`` parameters, or the ``last``, as the authors do.
     """
 
-    optimizer: Optimizer = Optimizer()
+    learning_rate: float = 0.01
+    max_steps: int = 10_000
     tolerance: float = 1e-14
     precision: Precision = "single"
     stop: Stop = "best-loss"
     keep: Literal["best", "last"] = "best"
 
-    def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> FirstOrderState:
+    def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> AdamaxState:
         """Start from the first gains and their best-fitting foregrounds, in weighted least squares."""
-        kernels = compiled(problem.structure, self.optimizer, self.precision, problem.prior)
+        kernels = compiled(problem.structure, self.learning_rate, self.precision, problem.prior)
         gains = problem.initial_gains if warm is None else warm.gains
         parameters, data, scale = kernels.load(problem, gains)
         loss = kernels.loss.value(parameters, data)
         zero = _map(tf.zeros_like, parameters)
         descent = Descent(parameters, (zero, zero), parameters, loss)
-        return FirstOrderState(kernels, data, scale, descent, (float(loss),))
+        return AdamaxState(kernels, data, scale, descent, (float(loss),))
 
-    def step(self, state: FirstOrderState) -> FirstOrderState:
+    def step(self, state: AdamaxState) -> AdamaxState:
         """Take up to `STEPS_PER_CALL` steps."""
         done = len(state.history) - 1
-        n_steps = min(STEPS_PER_CALL, self.optimizer.max_steps - done)
+        n_steps = min(STEPS_PER_CALL, self.max_steps - done)
         after = self._steps(state, n_steps)
         if self.stop == "published" and (last := self._last_step(after.history, done)) is not None:
             return self._steps(state, last - done) if last - done < n_steps else after
         return after
 
-    def _steps(self, state: FirstOrderState, n_steps: int) -> FirstOrderState:
+    def _steps(self, state: AdamaxState, n_steps: int) -> AdamaxState:
         done = len(state.history) - 1
         descent, losses, final = state.kernels.descend(
             tf.constant(n_steps), tf.constant(done), state.descent, state.data
@@ -253,7 +210,7 @@ class FirstOrder:
                 return step
         return None
 
-    def terminate(self, state: FirstOrderState) -> Solve | None:
+    def terminate(self, state: AdamaxState) -> Solve | None:
         """Decide by the change of the loss, with the chosen rule."""
         n_steps = len(state.history) - 1
         if not math.isfinite(state.history[-1]):
@@ -267,24 +224,24 @@ class FirstOrder:
                 return Solve(
                     "converged", f"the best loss fell by less than {self.tolerance:g} over {STEPS_PER_CALL} steps"
                 )
-        if n_steps >= self.optimizer.max_steps:
+        if n_steps >= self.max_steps:
             if self.tolerance == 0:
                 return Solve("max-steps", f"stopped after {n_steps} steps, a fixed number (tolerance: 0)")
             return Solve("max-steps", f"not converged after {n_steps} steps")
         return None
 
-    def losses(self, state: FirstOrderState) -> Sequence[float]:
+    def losses(self, state: AdamaxState) -> Sequence[float]:
         """Return the loss history, prior included, in the unit of the data squared."""
         return [loss * state.scale**2 for loss in state.history]
 
-    def estimate(self, state: FirstOrderState) -> tuple[np.ndarray, np.ndarray]:
+    def estimate(self, state: AdamaxState) -> tuple[np.ndarray, np.ndarray]:
         """Return the best gains and foregrounds so far, or the last."""
         chosen = state.descent.best if self.keep == "best" else state.descent.parameters
         return state.kernels.estimate(chosen, state.data, state.scale)
 
-    def newton_decrement(self, state: FirstOrderState, problem: CalibrationProblem) -> float:
+    def newton_decrement(self, state: AdamaxState, problem: CalibrationProblem) -> float:
         """Return the relative Newton decrement at the estimate."""
         return newton_decrement_at(problem, self.estimate(state)[0])
 
-    def memory(self, state: FirstOrderState) -> None:
+    def memory(self, state: AdamaxState) -> None:
         """Return nothing: only the gains carry over."""
