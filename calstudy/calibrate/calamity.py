@@ -12,7 +12,7 @@ from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import sky_model_slope
 from calstudy.calibrate.interface import Assumed, Calibration, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure, weight_change
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, repeat_structure, weight_change
 from calstudy.calibrate.records import Solve
 from calstudy.calibrate.settings import (
     RUNAWAY,
@@ -24,7 +24,6 @@ from calstudy.calibrate.settings import (
 from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, solve_warm
-from calstudy.calibrate.structure import repeat_structure
 
 
 def make_solver(settings: GainFit) -> Solver:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SINGLE, DOUBLE = 4, 8
 # Python with TensorFlow and pyuvdata, and the compiled graphs.
 TENSORFLOW_MEMORY = 1.2e9
-# What the allocators keep besides what is in use, measured for 128 and 350 antennas.
+# Memory that allocators hold over memory in use, measured for 128 and 350 antennas.
 RETAINED = 1.6
 LEAST_MODELS = 32
 # The common basis spans the edges of all bases besides the widest.
@@ -141,7 +141,7 @@ def dimensions_of(size: Size, settings: GainFit) -> Dimensions:
 
 
 def solve_cost(settings: GainFit, size: Size) -> Cost:
-    """Return what consecutive solves of data of this size take, compilation included: seconds of one core, and bytes.
+    """Return the cost of consecutive solves of data of this size, compilation included: seconds of one core, and bytes.
 
     The constants were measured on one core of a 2020s server; they serve to plan, within a factor of about two.
     """

@@ -16,7 +16,7 @@ from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import FILE_REFERENCE, guarded
 from calstudy.base.resources import Cost, Usage
 from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress
-from calstudy.calibrate.records import CalibrationResult, Solve, Status
+from calstudy.calibrate.records import CalibrationResult, Solve, Status, make_gains, make_visibilities
 from calstudy.calibrate.smoothing import smooth
 from calstudy.instrument.size import Size
 
@@ -221,9 +221,6 @@ class _Returned:
 
     def result(self, usage: Usage) -> CalibrationResult:
         """Return gains, model and residual as standard objects, with the records of all solves."""
-        # pyuvdata takes long to import, and plans need other parts of this module.
-        from calstudy.calibrate.standard_formats import make_gains, make_visibilities
-
         flags = np.array(self.fitted.flags)
         if self.returned.flags is not None:
             excluded = np.asarray(self.returned.flags)

@@ -1,6 +1,6 @@
 """Interface of calibrators: settings, refusals, cost, and the calibration of visibilities.
 
-Built-in calibrators are the modules of `calstudy.calibrate.calibrators`. Your own is a subclass of `Calibrator` in a
+Built-in calibrators are in the modules of `calstudy.calibrate.calibrators`. Your own is a subclass of `Calibrator` in a
 file or an installed package (docs/extending.md). `calstudy.calibrate.execution` calls either.
 """
 
@@ -87,7 +87,7 @@ class Calibration:
 
 
 @dataclass(frozen=True)
-class Outline:
+class SolvePlan:
     """Properties of a calibration that are known before it starts.
 
     Attributes
@@ -189,6 +189,7 @@ class Calibrator(Plugin):
         "calstudy.calibrate.calibrators",
         "calstudy.calibrate.interface:Calibrator",
         tag="calibrator",
+        families=True,
     )
 
     calibrator: str = Field("", description="Its name, or the path of a Python file that defines it.")
@@ -211,6 +212,11 @@ class Calibrator(Plugin):
     smooth_gains: SmoothGains | None = Field(
         None, description="Smooth the gains once they are found, and calibrate with those; the model stays as it is."
     )
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the name of a built-in calibrator."""
+        return (cls.model_fields["calibrator"].default,)
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return in one sentence why data cannot be calibrated, or None if they can.
@@ -242,11 +248,11 @@ class Calibrator(Plugin):
         """Return the cost of calibrating data of this size; by default little beyond the data themselves."""
         return Cost(5.0 + 1e-6 * size.samples, LIBRARIES_MEMORY + 6 * COMPLEX128 * size.samples)
 
-    def outline(self, frame: Frame) -> Outline:
+    def plan(self, frame: Frame) -> SolvePlan:
         """Return the properties of a calibration of data with these baselines; by default the cost of their size."""
-        return Outline(self.cost(Size.of_frame(frame)))
+        return SolvePlan(self.cost(Size.of_frame(frame)))
 
-    def leaner(self) -> Self | None:
+    def with_less_memory(self) -> Self | None:
         """Return a calibrator with the same results that needs less memory; None if there is none."""
         return None
 

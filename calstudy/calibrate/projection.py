@@ -27,9 +27,8 @@ import numpy as np
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.batches import Piece, joined, make_piece, product_span, span_of
-from calstudy.calibrate.elementwise import BaselineProducts
 from calstudy.calibrate.problem import FitStructure
-from calstudy.calibrate.tensors import Ends, FitTensors
+from calstudy.calibrate.tensors import BaselineProducts, Ends, FitTensors
 
 # Regularizes N relative to its mean diagonal: far below any signal, enough for models with most channels flagged.
 RIDGE = 1e-12

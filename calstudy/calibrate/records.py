@@ -1,4 +1,4 @@
-"""Results of a calibration: gains, model and residual in standard formats, and the record of every solve."""
+"""Results of a calibration: the record of every solve, and gains, model and residual as UVCal and UVData."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
+from calstudy.base.errors import InputError
+from calstudy.base.gains import make_uvcal
+from calstudy.base.visibilities import from_cube
+
 if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
 
@@ -16,6 +20,8 @@ USABLE: tuple[Status, ...] = ("converged", "max-steps", "stalled", "by-file")
 """Statuses of solves that gave gains; samples of other solves are flagged."""
 SETTLED: tuple[Status, ...] = ("converged", "by-file")
 """Statuses that need no warning."""
+# The AIPS convention, which UVCal's Jones numbers share.
+PARALLEL_HANDS = {-5: "xx", -6: "yy", -1: "rr", -2: "ll"}
 NOT_FINITE = ("newton_decrement", "decrement_rms")
 """Numbers of a solve that are null in JSON where they are NaN."""
 
@@ -160,3 +166,32 @@ class CalibrationResult:
             "seconds": sum(record.seconds for record in self.solutions),
             "records": [record.summary() for record in self.solutions],
         }
+
+
+def require_parallel_hands(data: UVData) -> None:
+    """Raise InputError unless all polarizations are xx, yy, rr or ll."""
+    if not np.isin(data.polarization_array, list(PARALLEL_HANDS)).all():
+        raise InputError(
+            f"polarizations: {', '.join(data.get_pols())}; calibration takes {', '.join(PARALLEL_HANDS.values())} only"
+        )
+
+
+def make_gains(data: UVData, numbers: np.ndarray, gains: np.ndarray, flags: np.ndarray) -> UVCal:
+    """Return gains as a UVCal object for the whole telescope; antennas without data are flagged, with unit gains.
+
+    `numbers` are the antenna numbers of the rows, (Nants,). Gains and flags are (Nants, Nfreqs, Ntimes, Npols).
+    """
+    known = data.telescope.antenna_numbers
+    rows = {int(number): row for row, number in enumerate(known)}
+    places = [rows[int(number)] for number in numbers]
+    everywhere = np.ones((len(known), *gains.shape[1:]), complex)
+    nowhere = np.ones(everywhere.shape, bool)
+    everywhere[places], nowhere[places] = gains, flags
+    return make_uvcal(data, everywhere, nowhere)
+
+
+def make_visibilities(data: UVData, cube: np.ndarray, flags: np.ndarray) -> UVData:
+    """Return a copy of `data` with other visibilities and flags, (Ntimes, Nbls, Nfreqs, Npols)."""
+    result = from_cube(data, cube)
+    result.flag_array = flags.reshape(result.data_array.shape)
+    return result

@@ -20,7 +20,7 @@ MODELS_AT_ONCE = 1024
 # precision: a matrix of 0.5 GB, and some ten seconds to factorize it.
 MOST_COUPLED = 8192
 NOISE_UNKNOWN = (
-    "calibration.foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; "
+    "calibration.foreground_prior.noise: a finite deviation is weighed against the noise, which is not known; "
     "give the standard deviation of a sample, such as '1 Jy', or use `weights: autos`"
 )
 

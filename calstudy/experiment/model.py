@@ -12,7 +12,7 @@ from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.schema import Section, fault
-from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import AdamaxSettings, GaussNewtonSettings, Solver
 from calstudy.corrupt.settings import CorruptionSettings

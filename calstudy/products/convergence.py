@@ -18,10 +18,9 @@ from calstudy.run.task import Job, Stage, Task
 if TYPE_CHECKING:
     import numpy as np
 
-    from calstudy.calibrate.agreement import Baselines
-    from calstudy.calibrate.bias import Realization
+    from calstudy.calibrate.agreement import Baselines, Realization
     from calstudy.calibrate.settings import Solver
-    from calstudy.calibrate.trace import Checkpoint
+    from calstudy.calibrate.solvers.interface import Checkpoint
 
 PATHS = "convergence.json"
 
@@ -43,7 +42,7 @@ def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
     settings = {
-        "calibration": experiment.calibration.reset("assumed").model_copy(update={"solver": solver}),
+        "calibration": experiment.calibration.with_defaults("assumed").model_copy(update={"solver": solver}),
         "integration": integration,
         "steps": list(experiment.outputs.convergence.steps),
         "buffer": experiment.power.wedge_buffer,
@@ -58,7 +57,7 @@ def follow(job: Job) -> Mapping[str, Any]:
     """
     import numpy as np
 
-    from calstudy.calibrate.bias import cross_power
+    from calstudy.calibrate.agreement import cross_power
     from calstudy.calibrate.problem import gain_products
 
     paths, realizations = {}, {}
@@ -117,13 +116,12 @@ def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Basel
     import numpy as np
 
     from calstudy.base.observation import Observation
-    from calstudy.calibrate.agreement import Baselines
-    from calstudy.calibrate.bias import Realization
+    from calstudy.calibrate.agreement import Baselines, Realization
     from calstudy.calibrate.calamity import make_solver
     from calstudy.calibrate.interface import Assumed
     from calstudy.calibrate.preparation import make_problem, prepare
     from calstudy.calibrate.problem import gain_products
-    from calstudy.calibrate.trace import trace
+    from calstudy.calibrate.solvers.interface import trace
     from calstudy.products.selection import read_gains
 
     settings = job.settings["calibration"]

@@ -38,7 +38,7 @@ def quality(graph: ObservedGraph) -> Task:
     for parity in PARITIES:
         inputs |= {f"data:{parity}": observed(graph, parity), f"calibration:{parity}": calibrated(graph, parity)}
     settings = {
-        "calibration": graph.calibration.reset("assumed"),
+        "calibration": graph.calibration.with_defaults("assumed"),
         "autos": all(facts.autos for facts in graph.halves.facts.values()),
         "interleaved": graph.halves.interleaved,
         "sky_model": graph.observed.sky_model is not None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
 from calstudy.base.schema import Section
-from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES, Dimensions, basis_vectors, solve_memory
 from calstudy.calibrate.settings import BasisSettings
 from calstudy.instrument.settings import Channels, Layout

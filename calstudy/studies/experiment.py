@@ -153,6 +153,6 @@ def targets_of(experiment: Experiment) -> list[Task]:
 
 def experiment_folder(experiment: Experiment) -> Path:
     """Return the run folder of an experiment: its name, and a digest of its content without output paths."""
-    outputs = experiment.outputs.reset("store", "runs")
-    content = identity(experiment.model_copy(update={"outputs": outputs}).reset("scales"))
+    outputs = experiment.outputs.with_defaults("store", "runs")
+    content = identity(experiment.model_copy(update={"outputs": outputs}).with_defaults("scales"))
     return run_folder(experiment.outputs.runs, experiment.name, content)

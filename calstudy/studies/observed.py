@@ -14,8 +14,8 @@ from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.schema import Section, fault
-from calstudy.calibrate.calibrators.by_file import ByFile
-from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.given_gains import ByFile
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.experiment.files import apply_scale, override, parse_override
@@ -104,10 +104,9 @@ class ObservedStudy(Study):
     @property
     def folder(self) -> Path:
         """The run folder: the name, and a digest of the content of the file without output paths."""
-        outputs = self.file.outputs.reset("store", "runs")
-        return run_folder(
-            self.outputs.runs, self.name, identity(self.file.model_copy(update={"outputs": outputs}).reset("scales"))
-        )
+        outputs = self.file.outputs.with_defaults("store", "runs")
+        file = self.file.model_copy(update={"outputs": outputs}).with_defaults("scales")
+        return run_folder(self.outputs.runs, self.name, identity(file))
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
         """Return the study itself and the number of workers.

@@ -12,8 +12,7 @@ from pyuvdata.utils import ECEF_from_ENU, uvcalibrate
 from toy import FREQUENCIES, HEX, make_toy, scattered
 
 from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
-from calstudy.calibrate.calibrators.calamity import Calamity
-from calstudy.calibrate.calibrators.calamity_redundant import CalamityRedundant
+from calstudy.calibrate.calibrators.least_squares import Calamity, CalamityRedundant
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.settings import AdamaxSettings, BasisSettings, FlagWeights, GaussNewtonSettings

@@ -9,10 +9,10 @@ from toy import HEX, complex_normal, make_toy
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import make_basis
-from calstudy.calibrate.loss import FitData, Parameters
 from calstudy.calibrate.problem import FitStructure, flag_weights, gain_products
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers import adamax
+from calstudy.calibrate.solvers.adamax import FitData, Parameters
 from calstudy.calibrate.tensors import FitTensors
 from calstudy.instrument.layouts import redundant_groups
 

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
-from calstudy.calibrate.agreement import Baselines
-from calstudy.calibrate.bias import Realization, cross_power, ratio_over_antennas
+from calstudy.calibrate.agreement import Baselines, Realization, cross_power, ratio_over_antennas
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
-from calstudy.calibrate.solvers.interface import solve, solve_warm
+from calstudy.calibrate.solvers.interface import solve, solve_warm, trace
 from calstudy.calibrate.solvers.reduced import newton_decrement_at
 from calstudy.calibrate.synthetic import Case, Simulation
-from calstudy.calibrate.trace import trace
 
 
 @pytest.fixture(scope="module")

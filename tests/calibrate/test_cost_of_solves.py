@@ -11,7 +11,7 @@ from test_calamity import SETTINGS, make_uvdata
 from test_hera_cal_calibrators import sky_of
 
 from calstudy.base.resources import Usage
-from calstudy.calibrate.calibrators.skycal import Skycal
+from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibration, Calibrator, Solve
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton

@@ -17,10 +17,7 @@ from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis
-from calstudy.calibrate.calibrators.calamity import Calamity
-from calstudy.calibrate.calibrators.delay_weighted import DelayWeighted
-from calstudy.calibrate.calibrators.sky_based import SkyBased
-from calstudy.calibrate.calibrators.unified import Unified
+from calstudy.calibrate.calibrators.least_squares import Calamity, DelayWeighted, SkyBased, Unified
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products

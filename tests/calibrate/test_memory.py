@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calstudy.calibrate.basis import make_basis
-from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.cost import (
     LEAST_MODELS,
     TENSORFLOW_MEMORY,
@@ -30,7 +30,7 @@ def test_fewer_models_at_a_time_take_less_memory():
     sizes, fit = [], DEFAULT
     while fit is not None:
         sizes.append((fit.models_at_once, solve_memory(LARGE, fit)))
-        fit = fit.leaner()
+        fit = fit.with_less_memory()
     assert [count for count, _ in sizes] == [1024, 512, 256, 128, 64, LEAST_MODELS]
     memory = [size for _, size in sizes]
     assert memory == sorted(memory, reverse=True)

@@ -12,14 +12,12 @@ from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import dpss_vectors, gain_vectors
-from calstudy.calibrate.gain_space import GainSpace
-from calstudy.calibrate.problem import flag_weights, gain_products
+from calstudy.calibrate.problem import flag_weights, gain_products, repeat_structure
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve, solve_warm
-from calstudy.calibrate.structure import repeat_structure
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.tensors import FitTensors, GainSpace
 
 
 def test_solvers_meet_where_no_direction_is_flat():

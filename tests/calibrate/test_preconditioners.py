@@ -12,19 +12,18 @@ from toy import FREQUENCIES, HEX, complex_normal, make_toy
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import gain_vectors
-from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import flag_weights
 from calstudy.calibrate.projection import Projector
-from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.preconditioners import (
     antenna_blocks,
     antenna_inverse,
     channel_inverse,
+    conjugate_gradients,
     coordinate_inverse,
     coupled_blocks,
     coupled_inverse,
 )
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.tensors import FitTensors, GainSpace
 
 DAMPING = 1e-4
 

@@ -11,11 +11,10 @@ from toy import make_toy, scattered
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_pairs, to_cube
-from calstudy.calibrate.calibrators.delay_weighted import DelayWeighted
-from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.calibrators.least_squares import DelayWeighted, SkyBased
 from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.preparation import starting_gains
 from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, FlagWeights, ForegroundPrior, SampleWeights
-from calstudy.calibrate.starts import starting_gains
 from calstudy.calibrate.weights import inverse_variances, make_weights
 from calstudy.measured.noise import radiometer_variance, sample_noise
 

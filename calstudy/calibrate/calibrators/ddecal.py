@@ -19,7 +19,7 @@ from pydantic import Field
 from calstudy.base.observation import Frame
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.units import Frequency
-from calstudy.calibrate.calibrators._other_packages import Measured, OtherPackage
+from calstudy.calibrate.calibrators.other_packages import Measured, OtherPackage
 from calstudy.calibrate.interface import Solve
 from calstudy.instrument.size import Size
 

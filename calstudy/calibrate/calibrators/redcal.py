@@ -12,7 +12,7 @@ from calstudy.base.observation import Frame
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import fault
 from calstudy.base.units import Length
-from calstudy.calibrate.calibrators._other_packages import FEED, POL, Measured, OtherPackage, patterns
+from calstudy.calibrate.calibrators.other_packages import FEED, POL, Measured, OtherPackage, patterns
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Solve
 from calstudy.calibrate.problem import gain_products

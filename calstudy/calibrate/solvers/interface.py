@@ -14,14 +14,15 @@ import numpy as np
 from calstudy.calibrate.degeneracy import fix_degeneracies
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
 from calstudy.calibrate.records import Solve
+from calstudy.calibrate.solvers.reduced import newton_decrement_at
 
 logger = logging.getLogger(__name__)
 
 # A loss that stalls while it could fall by more than this fraction has not converged: fixed learning rates jitter.
-STILL = 0.01
+STALL_LIMIT = 0.01
 # Power of a baseline relative to the strongest one of either of its antennas, below which Gauss-Newton steps in single
 # precision do not resolve it; and the relative power of its residual that is rounding.
-HIDDEN, ROUNDING = 1e-8, 1e-10
+HIDDEN_POWER, ROUNDING_POWER = 1e-8, 1e-10
 
 
 class Solution(NamedTuple):
@@ -110,7 +111,7 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
     newton_decrement = rms = math.nan
     if ended.status != "failed":
         newton_decrement = float(np.clip(solver.newton_decrement(state, problem), 0, 1))
-        if ended.status == "converged" and newton_decrement > max(STILL, solver.tolerance):
+        if ended.status == "converged" and newton_decrement > max(STALL_LIMIT, solver.tolerance):
             message = f"{ended.message}, but a Gauss-Newton step would lower it by {newton_decrement:.1e} of itself"
             ended = Solve("stalled", message)
         if ended.status == "converged" and (hidden := _hidden(gains, model, problem)) is not None:
@@ -142,7 +143,7 @@ def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -
     strongest = np.zeros(problem.structure.n_antennas)
     for column in antennas.T:
         np.maximum.at(strongest, column, power)
-    weak = (power > 0) & (power < HIDDEN * strongest[antennas].min(axis=1)) & (left > ROUNDING * power)
+    weak = (power > 0) & (power < HIDDEN_POWER * strongest[antennas].min(axis=1)) & (left > ROUNDING_POWER * power)
     if not weak.any():
         return None
     share = math.sqrt(np.max(left[weak] / power[weak]))
@@ -166,3 +167,40 @@ def decrement_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProb
 def solve(problem: CalibrationProblem, solver: Solver) -> Solution:
     """Solve one problem from its initial gains (see `solve_warm`)."""
     return _solve(problem, solver, None)[0]
+
+
+class Checkpoint(NamedTuple):
+    """An intermediate estimate: gains (Nants, Nfreqs) and model (Nbls, Nfreqs), complex128, with degeneracies fixed.
+
+    The decrements are as in `calstudy.calibrate.records.Solve`.
+    """
+
+    n_steps: int
+    gains: np.ndarray
+    model: np.ndarray
+    newton_decrement: float
+    decrement_rms: float
+
+
+def trace(problem: CalibrationProblem, solver: Solver, steps: Sequence[int]) -> list[Checkpoint]:
+    """Run a solver from the problem's initial gains, and return its estimates after given numbers of steps.
+
+    The last estimate is that at the end of the solve. A solver that takes several steps at once gives its estimate
+    after as many steps or more; `Checkpoint.n_steps` is their number. Raises ValueError if an estimate has no positive
+    scale (see `calstudy.calibrate.degeneracy.model_scale`).
+    """
+    state = solver.init(problem)
+    due = sorted(set(steps))
+    found: list[Checkpoint] = []
+    while True:
+        done = len(solver.losses(state)) - 1
+        ended = solver.terminate(state) is not None
+        if ended or (due and done >= due[0]):
+            due = [step for step in due if step > done]
+            gains, model = fix_degeneracies(*solver.estimate(state), problem)
+            newton_decrement = min(max(newton_decrement_at(problem, gains), 0.0), 1.0)
+            rms = decrement_rms(gains, model, problem, newton_decrement)
+            found.append(Checkpoint(done, gains, model, newton_decrement, rms))
+        if ended:
+            return found
+        state = solver.step(state)
