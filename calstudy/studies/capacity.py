@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from calstudy.base import ranks
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
@@ -39,31 +38,17 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     Raises
     ------
     InputError
-        If a single task is estimated to need more memory than there is, `max_memory` is not an amount of memory, or
-        MPI ranks cannot help; before any work starts.
+        If a single task is estimated to need more memory than there is, or `max_memory` is not an amount of memory;
+        before any work starts.
     """
     workers, scheduler = budget.workers, budget.scheduler
     _require_sane(budget)
-    if ranks.count() > 1:
-        _require_sharing(experiment, workers, scheduler)
     if scheduler is not None:
         return experiment, workers or 1
-    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    # The parent process has the libraries in memory, too.
-    memory -= LIBRARIES_MEMORY
-    hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
+    memory = _memory(budget)
+    hoped = workers or cores()
     lean = _stream(_cut(_Work(experiment, targets), memory / hoped), memory / hoped)
-    cut, needs = lean.experiment, {task: task.cost.memory for task in lean.missing}
-    if not needs:
-        return cut, workers or hoped
-    largest = max(needs, key=needs.__getitem__)
-    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
-    if ranks.count() > 1:
-        return cut, 1
-    fitting = max(1, int(memory // needs[largest]))
-    if workers is not None and budget.max_memory is None:
-        return cut, workers
-    return cut, min(hoped, fitting)
+    return lean.experiment, _workers(lean.missing, memory, hoped, budget)
 
 
 def require_data_fit(experiment: Experiment, budget: Budget) -> None:
@@ -86,16 +71,22 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
 def workers_for(targets: Sequence[Task], store: Path, budget: Budget) -> int:
     """Return the number of workers for products that cannot be cut further; errors as for `fit`."""
     _require_sane(budget)
-    if ranks.count() > 1:
-        raise InputError("mpiexec: measured data are not shared between MPI ranks; use --workers")
     if budget.scheduler is not None:
         return budget.workers or 1
+    return _workers(_missing(targets, store), _memory(budget), budget.workers or cores(), budget)
+
+
+def _memory(budget: Budget) -> float:
+    """Return the memory for work, in bytes; the parent process has the libraries in memory, too."""
     memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    memory -= LIBRARIES_MEMORY
-    needs = {task: task.cost.memory for task in _missing(targets, store)}
-    hoped = budget.workers or cores()
+    return memory - LIBRARIES_MEMORY
+
+
+def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget) -> int:
+    """Return how many workers fit into the memory, of those hoped for; raises InputError if not even one does."""
+    needs = {task: task.cost.memory for task in missing}
     if not needs:
-        return hoped
+        return budget.workers or hoped
     largest = max(needs, key=needs.__getitem__)
     _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
     if budget.workers is not None and budget.max_memory is None:
@@ -119,20 +110,6 @@ def _require_room(largest: Task, need: float, budget: float, source: str) -> Non
         raise InputError(
             f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
             f"needs about {need / 1e9:.1f} GB; {more}use fewer antennas, channels, integrations or sources"
-        )
-
-
-def _require_sharing(experiment: Experiment, workers: int | None, scheduler: str | None) -> None:
-    engine = experiment.simulation.engine
-    if not engine.shares_ranks:
-        raise InputError(
-            f"simulation.engine = {engine.label!r} does not share its work between MPI ranks; leave out "
-            "mpiexec and use --workers, or add --set simulation.engine=pyuvsim"
-        )
-    if scheduler is not None or workers not in (None, 1):
-        raise InputError(
-            "--workers and --scheduler: under mpiexec the ranks are the workers; leave both out and choose the number "
-            "of ranks with -n"
         )
 
 

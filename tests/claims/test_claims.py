@@ -355,7 +355,7 @@ def test_what_no_run_can_tell_has_a_reason(make_study):
     claims = {claim.name: claim for claim in alone(make_study())}
     for name, reason in (
         ("one-complex-degeneracy", "step 2.1 of the validation ladder"),
-        ("artefacts-at-minus-45-db", "'calstudy check floor' measures it"),
+        ("artefacts-at-minus-45-db", "the figure 'delay-floor' measures it"),
         ("average-loses-nothing", "needs realizations"),
         ("leakage-is-not-corrected", "the simulated sky is not polarized"),
         ("filter-rescues-coupling", "no filter in fringe rate"),
@@ -636,6 +636,6 @@ def test_folders_that_cannot_be_evaluated_are_told(make_study, tmp_path):
     assert evaluate_folder(folder, ["calamity2022"]).claims
     with pytest.raises(InputError, match="'calamity' is not a paper"):
         evaluate_folder(folder, ["calamity"])
-    (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "points": []}))
-    with pytest.raises(InputError, match="is the folder of a sweep; give that of one of its points"):
+    (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "parts": {"a": "points/a"}}))
+    with pytest.raises(InputError, match="is the folder of several runs; give that of one of them"):
         evaluate_folder(folder)

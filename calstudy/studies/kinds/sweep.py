@@ -1,0 +1,201 @@
+"""Sweeps: a family of experiments made from one file by varying some of its fields."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from calstudy.base.errors import ExperimentError, InputError, nearest
+from calstudy.claims.paper import stand_ins
+from calstudy.experiment.files import StudyFile, override, short_names, validate
+from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment
+from calstudy.figures.sweep import SUMMARY
+from calstudy.run.task import Task
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, content_of
+from calstudy.studies.study import RunProducts
+
+SWEPT = ("instrument", "sky", "simulation", "corruption", "calibration", "power", "variants")
+"""Sections whose fields can be varied."""
+LONGEST_LABEL = 72
+MOST_POINTS = 250
+POINTS = "points"
+"""Folder of the points in the run folder."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One experiment of a sweep.
+
+    The label, which names its folder, has its number and the changes: the varied fields (dotted path) and their
+    values as text, as written in the file.
+    """
+
+    label: str
+    changes: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep(Family):
+    """A family of experiments that differ in a few fields of `file`; members have the labels of the points.
+
+    A block of the file's `sweep` has all combinations of its values as points, with the last field varying fastest.
+    """
+
+    key = "sweep"
+    model = Experiment
+    subfolders = (POINTS,)
+    has_reference = False
+
+    blocks: Sequence[Sequence[Point]]
+
+    @classmethod
+    def load(cls, file: StudyFile) -> Sweep:
+        """Return the sweep of a file."""
+        return expand(file.experiment())
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Sweep:
+        """Return the family of an experiment; errors as for `expand`."""
+        return expand(experiment)
+
+    @property
+    def points(self) -> tuple[Point, ...]:
+        """The points of all blocks."""
+        return tuple(point for block in self.blocks for point in block)
+
+    def member(self, label: str) -> ExperimentStudy:
+        """Return the study of a point, with a folder under ``points``."""
+        return ExperimentStudy(self.members[label], self.folder / POINTS / label)
+
+    @property
+    def parts(self) -> Mapping[str, ExperimentStudy]:
+        """The points."""
+        return self.studies
+
+    @property
+    def content(self) -> Any:
+        """The varied experiment."""
+        return content_of(self.file)
+
+    @cached_property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Substitutions of the varied experiment for the papers' own ingredients."""
+        return stand_ins(self.file)
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The signal loss of all points: a figure, and a table beside it."""
+        blocks = [[{"label": point.label, "changes": dict(point.changes)} for point in block] for block in self.blocks]
+        return [self.draw(FIGURES.make("sweep"), {"blocks": blocks})]
+
+    @property
+    def entries(self) -> Mapping[str, Any]:
+        """The folder and the changes of every point."""
+        return {
+            POINTS: [{"folder": f"{POINTS}/{point.label}", "changes": dict(point.changes)} for point in self.points]
+        }
+
+    def write_results(self, made: RunProducts) -> None:
+        """Write the comparison of all points, with its table in the folder of tables."""
+        super().write_results(made)
+        (self.folder / "tables").mkdir(exist_ok=True)
+        (self.folder / "figures" / SUMMARY).replace(self.folder / "tables" / SUMMARY)
+
+
+def expand(experiment: Experiment) -> Sweep:
+    """Return the family of an experiment with a `sweep`.
+
+    Raises
+    ------
+    ExperimentError
+        With one sentence per fault: a field that cannot be varied, is unknown, or does not take a value, or a point
+        whose fields do not go together.
+    """
+    if not experiment.sweep:
+        raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")
+    faults = _faults_of_fields(experiment.sweep)
+    count = sum(math.prod(len(values) for values in block.values()) for block in experiment.sweep)
+    if count > MOST_POINTS:
+        faults.append(
+            f"sweep: has {count} points, all combinations of the values, and at most {MOST_POINTS} are allowed; give "
+            "fewer values, or a list of blocks that vary one field each"
+        )
+    if not experiment.measures_signal_loss:
+        faults.append(
+            f"sweep: compares the signal loss of its points, which needs the variants {', '.join(SIGNAL_LOSS_VARIANTS)}"
+        )
+    if faults:
+        raise ExperimentError(faults)
+    plain = experiment.model_dump(mode="json", exclude_unset=True, exclude={"sweep", "scales"})
+    numbers = itertools.count(1)
+    members, blocks = {}, []
+    for block in experiment.sweep:
+        points = []
+        for values in itertools.product(*block.values()):
+            changes = dict(zip(block, values, strict=True))
+            named = {path: changes[path] for path in varied_fields(block)}
+            texts = {path: text_of(value) for path, value in changes.items()}
+            points.append(Point(_label(next(numbers), named), texts))
+            words = ", ".join(f"{path} = {text}" for path, text in texts.items())
+            try:
+                members[points[-1].label] = _varied(plain, changes, words)
+            except ExperimentError as error:
+                found = [f"sweep ({words}): {fault}" for fault in error.faults]
+                faults += [fault for fault in found if fault not in faults]
+            except InputError as error:
+                faults.append(f"sweep ({words}): {error}")
+        blocks.append(tuple(points))
+    if faults:
+        raise ExperimentError(faults)
+    return Sweep(experiment, members, blocks)
+
+
+def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str]:
+    faults = []
+    for path, values in ((path, values) for block in blocks for path, values in block.items()):
+        section = path.partition(".")[0]
+        if section not in SWEPT or section == path:
+            faults.append(
+                f"sweep.{path}: cannot be varied{nearest(section, list(SWEPT))} (a dotted path to a field of: "
+                f"{', '.join(SWEPT)})"
+            )
+        texts = [text_of(value) for value in values]
+        faults += [
+            f"sweep.{path}: names the value {text} twice" for text in dict.fromkeys(texts) if texts.count(text) > 1
+        ]
+    return faults
+
+
+def _varied(plain: Mapping[str, Any], changes: Mapping[str, Any], words: str) -> Experiment:
+    """Return the experiment of one point."""
+    data = dict(plain)
+    for path, value in changes.items():
+        data = override(data, path, value)
+    data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
+    # The paths of input files were made absolute when the file was read.
+    return validate(data, Path("/"))
+
+
+def text_of(value: Any) -> str:
+    """Write a value of a sweep for people: text unchanged, blocks as ``key value``."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {text_of(item)}" for key, item in value.items())
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def varied_fields(block: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Return the fields of a block that have several values; the first if none has."""
+    return [path for path, values in block.items() if len(values) > 1] or list(block)[:1]
+
+
+def _label(number: int, changes: Mapping[str, Any]) -> str:
+    names = short_names(list(changes))
+    words = "-".join(f"{names[path]}={text_of(value)}" for path, value in changes.items())
+    return f"{number:02d}-{re.sub(r'[^A-Za-z0-9_.=+-]+', '', words)}"[:LONGEST_LABEL]
