@@ -17,9 +17,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from calstudy.base.resources import cpu_time
 from calstudy.calibrate.problem import CalibrationProblem
-from calstudy.calibrate.solution import Solution
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
-from calstudy.calibrate.solvers.interface import WarmStart, solve_warm
+from calstudy.calibrate.solvers.interface import Solution, WarmStart, solve_warm
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Layout
@@ -54,8 +53,8 @@ def solve_all(series: list[CalibrationProblem]) -> list[Solution]:
 
 def note(benchmark: BenchmarkFixture, solutions: list[Solution]) -> None:
     """Save steps and statuses with the times: a solver may be slower by more steps, or by longer ones."""
-    benchmark.extra_info["steps"] = [solution.n_steps for solution in solutions]
-    benchmark.extra_info["status"] = [solution.status for solution in solutions]
+    benchmark.extra_info["steps"] = [solution.record.steps for solution in solutions]
+    benchmark.extra_info["status"] = [solution.record.status for solution in solutions]
 
 
 def measure_chunk(benchmark: BenchmarkFixture, label: str, folder: Path) -> None:

@@ -6,7 +6,7 @@ from astropy.coordinates import SkyCoord
 from pydantic import Field
 from pyradiosky import SkyModel
 
-from calstudy.calibrate.interface import Calibration, Calibrator, Outcome
+from calstudy.calibrate.interface import Calibration, Calibrator, Solve
 
 
 class StefCal(Calibrator):
@@ -51,7 +51,7 @@ class StefCal(Calibrator):
             gains=found,
             gain_flags=found == 0,
             model=sky,
-            outcomes=Outcome(status=status, message=message, steps=self.rounds),
+            outcomes=Solve(status=status, message=message, steps=self.rounds),
         )
 
 

@@ -131,7 +131,7 @@ def test_an_experiment_with_every_field_follows_the_schema(schema, tmp_path):
         ("sky.eor.nside", 65),
         ("corruption.effects", [{"kind": "reflection-gain"}]),
         ("calibration", {"calibrator": "sky-based", "basis": {}}),
-        ("calibration.solver", {"name": "adam", "max_step": 3}),
+        ("calibration.solver", {"name": "adamax", "max_step": 3}),
         ("outputs.figures", ["wegde"]),
         ("sweep", {"sky.eor.seed": 3}),
         ("realizations", {"draw": ["foregrounds"]}),

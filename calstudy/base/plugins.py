@@ -1,7 +1,7 @@
 """Kinds of plug-ins: calibrators, effects, layouts, beams, estimators, figures, papers, engines.
 
-A plug-in is a class: its fields are its settings, and its methods are its behaviour. The built-in ones are modules of
-one package, a file each. Others are found by an entry point of an installed package, or by the path of a Python file,
+A plug-in is a class: its fields are its settings, and its methods are its behaviour. The built-in ones are in the
+modules of one package. Others are found by an entry point of an installed package, or by the path of a Python file,
 which an experiment file may give wherever it may give a name: ``calibrator: mean-gain``, ``calibrator: mine.py`` or, if
 a file has several, ``calibrator: mine.py:MeanGain``.
 """
@@ -85,7 +85,7 @@ class Plugin(Section):
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """Return the names of a built-in class that has several; empty for one that is named after its module."""
+        """Return the names of a built-in class; empty for one that is named after its module."""
         return ()
 
     @property
@@ -145,7 +145,8 @@ class Registry(Generic[P]):
     tag
         The field of an experiment file that contains the name.
     families
-        Whether a class may have several names (`Plugin.names`). Its modules are then imported to know them.
+        Whether a module may have several classes, and a class several names (`Plugin.names`). The modules are then
+        imported to know them.
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:
@@ -172,8 +173,11 @@ class Registry(Generic[P]):
         names = {name.replace("_", "-"): f"{self.package}.{name}" for name in found if not name.startswith("_")}
         if not self.families:
             return dict(sorted(names.items()))
-        classes = {name: (module, self._in(import_module(module), name)) for name, module in names.items()}
-        return {name: module for own, (module, found) in classes.items() for name in found.names() or (own,)}
+        for own, module in names.items():
+            for thing in self._things(import_module(module)).values():
+                self._found |= dict.fromkeys(thing.names() or (own,), thing)
+        ordered = sorted(self._found, key=lambda name: next(iter(self._found[name].names()), name))
+        return {name: self._found[name].__module__ for name in ordered}
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""
@@ -217,13 +221,17 @@ class Registry(Generic[P]):
 
     def _in(self, module: ModuleType, reference: str, name: str | None = None) -> type[P]:
         """Return the only class that a module defines, or the one of this name."""
-        found = {key: value for key, value in vars(module).items() if self._is_thing(value, module)}
+        found = self._things(module)
         if name is not None and name not in found:
             raise InputError(f"{reference!r} holds no {self.noun} of this name (it has: {', '.join(found) or 'none'})")
         if name is None and len(found) != 1:
             listed = ", ".join(found) if found else f"no subclass of {self.base.__module__}.{self.base.__name__}"
             raise InputError(f"{reference!r} must hold one {self.noun}, or be followed by ':Class' (it has: {listed})")
         return found[name or next(iter(found))]
+
+    def _things(self, module: ModuleType) -> dict[str, type[P]]:
+        """Return the classes that a module defines, by name."""
+        return {key: value for key, value in vars(module).items() if self._is_thing(value, module)}
 
     def _is_thing(self, value: Any, module: ModuleType) -> bool:
         if not (inspect.isclass(value) and issubclass(value, self.base)) or inspect.isabstract(value):

@@ -28,7 +28,7 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
-    def reset(self, *names: str) -> Self:
+    def with_defaults(self, *names: str) -> Self:
         """Return a copy in which the named fields have their defaults, for code that does not read them."""
         found = defaults(type(self))
         return self.model_copy(update={name: found[name] for name in names})

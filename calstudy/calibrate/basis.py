@@ -16,6 +16,8 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.calibrate.settings import BasisSettings
 
+# Sequences with a smaller spectral concentration are left out.
+EIGENVALUE_CUTOFF = 1e-12
 # Sequences computed beyond the Shannon number 2NW; concentrations fall to 1e-14 well within these.
 EXTRA_SEQUENCES = 40
 # How far channels may be off their grid, in units of its spacing.
@@ -24,41 +26,33 @@ GRID_TOLERANCE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Bucket:
-    """Models that share one basis or, in a joint bucket, one set of coefficients.
+    """Models that share one basis.
 
     Attributes
     ----------
     half_width
-        Largest modelled delay, in s; None for a joint bucket.
+        Largest modelled delay, in s.
     members
         Indices of the models in this bucket, shape (Nmembers,).
     vectors
-        Orthonormal sequences, shape (Nfreqs, Nvec), float64, for which every member has its own coefficients; with a
-        prior, a root of the covariance of the foregrounds. In a joint bucket, (Nmembers, Nfreqs, Nvec), orthonormal
-        over all members together, with coefficients that the members share.
+        Orthonormal sequences, shape (Nfreqs, Nvec), float64; with a prior, a root of the covariance of the foregrounds.
     """
 
-    half_width: float | None
+    half_width: float
     members: np.ndarray
     vectors: np.ndarray
 
     @property
-    def joint(self) -> bool:
-        """Whether the members share their coefficients."""
-        return self.vectors.ndim == 3
-
-    @property
     def n_coefficients(self) -> int:
         """Number of complex coefficients of all members together."""
-        return self.vectors.shape[-1] * (1 if self.joint else self.members.size)
+        return self.vectors.shape[1] * self.members.size
 
 
 @dataclass(frozen=True, eq=False)
 class ForegroundBasis:
     """The bases of all foreground models (one model per baseline, or one per redundant group).
 
-    A model is one spectrum, and belongs to exactly one bucket; models with common coefficients are the members of a
-    joint bucket.
+    A model is one spectrum, and belongs to exactly one bucket.
     """
 
     buckets: tuple[Bucket, ...]
@@ -102,7 +96,7 @@ def _sequences(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: flo
     return basis, concentrations[:n_kept]
 
 
-def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> np.ndarray:
+def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float = EIGENVALUE_CUTOFF) -> np.ndarray:
     """Compute the DPSS whose concentration is above the cutoff, shape (n_frequencies, Nvec).
 
     `half_bandwidth` is NW, the product of the number of channels, the channel width and the delay half-width.
@@ -110,14 +104,14 @@ def dpss_vectors(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: f
     return _sequences(n_frequencies, half_bandwidth, eigenvalue_cutoff)[0]
 
 
-def flat_wedge_root(n_frequencies: int, half_bandwidth: float, eigenvalue_cutoff: float) -> np.ndarray:
+def flat_wedge_root(n_frequencies: int, half_bandwidth: float) -> np.ndarray:
     """Return a root B of the covariance B B^T of a signal, white up to a delay, that has variance one per channel.
 
     The covariance is sin(2 pi W (i - j)) / (2 pi W (i - j)) with the half-bandwidth N W of N channels; its eigenvectors
     are the DPSS, its eigenvalues their concentrations over 2 W (Slepian 1978). The root is float64, (n_frequencies,
     Nvec); parameters are as for `dpss_vectors`.
     """
-    vectors, concentrations = _sequences(n_frequencies, half_bandwidth, eigenvalue_cutoff)
+    vectors, concentrations = _sequences(n_frequencies, half_bandwidth, EIGENVALUE_CUTOFF)
     return vectors * np.sqrt(concentrations * n_frequencies / (2 * half_bandwidth))
 
 
@@ -149,7 +143,7 @@ def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
     return ChannelGrid(float(width), round(positions[-1]) + 1, np.round(positions).astype(int))
 
 
-def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -> np.ndarray:
+def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float = EIGENVALUE_CUTOFF) -> np.ndarray:
     """Return an orthonormal basis of sequences restricted to the channels that exist, float64, (Nfreqs, at most Nvec).
 
     `vectors` are orthonormal on the whole grid, (n_channels, Nvec). Combinations with less than the fraction
@@ -161,17 +155,24 @@ def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float) -
     return np.ascontiguousarray(left[:, singular**2 > eigenvalue_cutoff])
 
 
-def gain_vectors(frequencies: np.ndarray, delay: float, eigenvalue_cutoff: float) -> np.ndarray:
+def gain_vectors(frequencies: np.ndarray, delay: float) -> np.ndarray:
     """Compute orthonormal sequences for gains with delays up to `delay` s, shape (Nfreqs, Ngain).
 
     Channel centres are in Hz on an even grid, gaps allowed. If the channels do not resolve the delay, the basis spans
-    all of them. Sequences with a spectral concentration below the cutoff are left out.
+    all of them.
     """
     grid = channel_grid(frequencies)
     if delay * grid.width >= 0.5:
         return np.eye(len(frequencies))
-    vectors = dpss_vectors(grid.n_channels, grid.n_channels * grid.width * delay, eigenvalue_cutoff)
-    return restrict(vectors, grid, eigenvalue_cutoff)
+    vectors = dpss_vectors(grid.n_channels, grid.n_channels * grid.width * delay)
+    return restrict(vectors, grid)
+
+
+def _model_vectors(grid: ChannelGrid, half_bandwidth: float, prior: bool) -> np.ndarray:
+    """Return the vectors of foreground models on the channels that exist; see `make_basis`."""
+    if prior:
+        return flat_wedge_root(grid.n_channels, half_bandwidth)[grid.positions]
+    return restrict(dpss_vectors(grid.n_channels, half_bandwidth), grid)
 
 
 def make_basis(
@@ -204,13 +205,7 @@ def make_basis(
         if half_width <= 0:
             raise InputError("calibration.basis: the delay half-width is 0 s; set min_delay or buffer above zero")
         product = half_width * width
-        vectors = None
-        if product < 0.5:
-            arguments = grid.n_channels, grid.n_channels * product, settings.eigenvalue_cutoff
-            if prior:
-                vectors = flat_wedge_root(*arguments)[grid.positions]
-            else:
-                vectors = restrict(dpss_vectors(*arguments), grid, settings.eigenvalue_cutoff)
+        vectors = _model_vectors(grid, grid.n_channels * product, prior) if product < 0.5 else None
         if vectors is None or vectors.shape[1] >= n_frequencies:
             raise InputError(
                 f"calibration.basis: a delay half-width of {half_width * 1e9:.0f} ns fills all {n_frequencies} "

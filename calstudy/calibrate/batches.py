@@ -41,8 +41,7 @@ class Batch(NamedTuple):
     models, baselines
         First one and one past the last, in the solvers' order.
     bases
-        The different bases of these models, (Nfreqs, Nvec) each, float64; a single one of (Nmodels, Nfreqs, Nvec) if
-        the models share their coefficients.
+        The different bases of these models, (Nfreqs, Nvec) each, float64.
     basis_index
         Index of the basis of each model, (Nmodels,), ascending.
     """
@@ -52,32 +51,25 @@ class Batch(NamedTuple):
     bases: tuple[np.ndarray, ...]
     basis_index: np.ndarray
 
-    @property
-    def joint(self) -> bool:
-        """Whether the models share their coefficients."""
-        return self.bases[0].ndim == 3
-
 
 def make_batches(bases: Sequence[np.ndarray], sizes: Sequence[int], edges: np.ndarray, most: int) -> list[Batch]:
     """Divide models into batches of at most `most` baselines, with similar numbers of vectors.
 
-    A model with more baselines than that, or models with common coefficients, still form one batch. `bases` and `sizes`
-    (numbers of models) are those of consecutive buckets; `edges` are the first baseline of each model and one past the
-    last, (Nmodels + 1,).
+    A model with more baselines than that still forms one batch. `bases` and `sizes` (numbers of models) are those of
+    consecutive buckets; `edges` are the first baseline of each model and one past the last, (Nmodels + 1,).
     """
-    joint = np.repeat([basis.ndim == 3 for basis in bases], sizes)
     bucket_of = np.repeat(np.arange(len(bases)), sizes)
     # Few bases are better kept apart, because none is padded then.
-    apart = len(bases) - np.unique(bucket_of[joint]).size <= BATCHES
+    apart = len(bases) <= BATCHES
     if not apart:
         most = min(most, max(-(-int(edges[-1]) // BATCHES), LEAST_BATCH))
     n_models, cuts = len(bucket_of), [0]
     widths = np.array([basis.shape[-1] for basis in bases])[bucket_of]
     for model in range(1, n_models):
         wider = widths[model] > WIDEST * widths[cuts[-1]]
-        full = not joint[model] and (edges[model + 1] - edges[cuts[-1]] > most or wider)
+        full = edges[model + 1] - edges[cuts[-1]] > most or wider
         other = bucket_of[model] != bucket_of[model - 1]
-        if full or (other and (apart or joint[model] or joint[model - 1])):
+        if full or (other and apart):
             cuts.append(model)
     batches = []
     for start, end in pairwise([*cuts, n_models]):
@@ -219,9 +211,9 @@ def make_piece(batch: Batch, span: np.ndarray, owner: np.ndarray | None, with_ow
 def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
     """Return an orthonormal basis of the joint span of several bases, (Nfreqs, rank), float64.
 
-    Bases are (Nfreqs, Nvec), or (Nmembers, Nfreqs, Nvec) for the members of a joint batch. `dtype` sets the precision.
+    Bases are (Nfreqs, Nvec). `dtype` sets the precision.
     """
-    vectors = np.concatenate([_side_by_side(basis) for basis in bases], axis=1)
+    vectors = np.concatenate([_normalized(basis) for basis in bases], axis=1)
     # R of a QR decomposition has the same left singular vectors; the right ones, of no use, would take most time.
     triangle = np.asarray(np.linalg.qr(vectors.T, mode="r"))
     left, singular, _ = np.linalg.svd(triangle.T, full_matrices=False)
@@ -265,28 +257,15 @@ def column_products(rows: tf.Tensor, left: tf.Tensor, right: tf.Tensor, span: tf
 def batch_vectors(batch: Batch, span: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
     """Build the vectors of the models of a batch or, with `owner`, of its baselines.
 
-    Models with common coefficients are one row, with the channels of all of them in sequence. `span` is Q, (Nfreqs,
-    rank). `owner` is the position in the batch of the model of each baseline, ascending, (Nbls,). `dtype` is that of
-    the overlaps.
+    `span` is Q, (Nfreqs, rank). `owner` is the position in the batch of the model of each baseline, ascending, (Nbls,).
+    `dtype` is that of the overlaps.
     """
-    if batch.joint:
-        (basis,) = batch.bases
-        whole = basis.reshape(-1, basis.shape[-1]).T[None]
-        overlap = np.moveaxis(basis.transpose(0, 2, 1) @ span, 0, 1).reshape(1, basis.shape[-1], -1)
-        return Vectors(whole, overlap.astype(dtype), np.array([basis.shape[-1]]), np.zeros(1, int))
     widths = np.array([basis.shape[1] for basis in batch.bases])
     stack = np.zeros((len(widths), widths.max(), len(span)))
     for row, basis in zip(stack, batch.bases, strict=True):
         row[: basis.shape[1]] = basis.T
     index = batch.basis_index if owner is None else batch.basis_index[owner]
     return Vectors(stack, (stack @ span).astype(dtype), widths, index)
-
-
-def _side_by_side(basis: np.ndarray) -> np.ndarray:
-    """Return a normalized basis (Nfreqs, Nvec), or those of all members of a joint batch, (Nfreqs, Nmembers * Nvec)."""
-    if basis.ndim == 2:
-        return _normalized(basis)
-    return np.moveaxis(basis, 0, 1).reshape(basis.shape[1], -1)
 
 
 def _normalized(columns: np.ndarray) -> np.ndarray:

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from calstudy.base.observation import Observation
 from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import sky_model_slope
-from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
+from calstudy.calibrate.interface import Assumed, Calibration, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure, weight_change
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, repeat_structure, weight_change
+from calstudy.calibrate.records import Solve
 from calstudy.calibrate.settings import (
     RUNAWAY,
     GainFit,
     GainWeights,
     GaussNewtonSettings,
-    LbfgsSettings,
     unsettled_message,
 )
-from calstudy.calibrate.solution import Solution
-from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
+from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
-from calstudy.calibrate.solvers.interface import Solver, WarmStart, solve_warm
-from calstudy.calibrate.solvers.lbfgs import Lbfgs
-from calstudy.calibrate.structure import repeat_structure
+from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, solve_warm
 
 
 def make_solver(settings: GainFit) -> Solver:
@@ -35,24 +31,7 @@ def make_solver(settings: GainFit) -> Solver:
     solver = settings.solver
     if isinstance(solver, GaussNewtonSettings):
         return GaussNewton(solver.tolerance, solver.max_steps, solver.precision)
-    if isinstance(solver, LbfgsSettings):
-        return Lbfgs(solver.tolerance, solver.max_steps, solver.memory)
-    optimizer = Optimizer(solver.name, solver.learning_rate, solver.schedule, solver.final_rate, solver.max_steps)
-    return FirstOrder(optimizer, solver.tolerance, solver.precision, solver.stop, solver.keep)
-
-
-class Solve(NamedTuple):
-    """One solve: its integrations, its polarization, its solution and diagnostics.
-
-    With a sky model, the diagnostics are the slope of the calibrated data on it and the rms of the band shape; with
-    weights from the gains, the number of passes and the last change of the weights.
-    """
-
-    times: slice
-    polarization: int
-    solution: Solution
-    peak_memory: int
-    diagnostics: Mapping[str, float]
+    return Adamax(**solver.model_dump(exclude={"name", "warm_start"}))
 
 
 def fit(
@@ -87,10 +66,9 @@ def fit(
     gains, gain_flags = np.ones(prepared.start.shape, complex), np.ones(prepared.start.shape, bool)
     model = np.zeros(shape, complex)
     outcomes = []
-    for solve in _solve_all(settings, prepared, progress):
-        times, p, solution = solve.times, solve.polarization, solve.solution
-        outcomes.append(_outcome(solve))
-        if not solution.usable:
+    for times, p, solution in _solve_all(settings, prepared, progress):
+        outcomes.append(solution.record)
+        if not solution.record.usable:
             continue
         model[times, :, :, p] = solution.model.reshape(-1, *shape[1:3])
         for t in range(times.start, times.stop):
@@ -107,8 +85,10 @@ def fit(
     )
 
 
-def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | None) -> Iterator[Solve]:
-    """Yield every solve, polarization by polarization, each in the order of time."""
+def _solve_all(
+    settings: GainFit, prepared: PreparedFit, progress: Progress | None
+) -> Iterator[tuple[slice, int, Solution]]:
+    """Yield the integrations, the polarization and the solution of every solve, in the order of `Calibration`."""
     solver = make_solver(settings)
     groups = settings.solves(prepared.data.n_times)
     n_polarizations = prepared.data.n_polarizations
@@ -116,7 +96,6 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
         warm: WarmStart | None = None
         anew = True
         for index, times in enumerate(groups):
-            diagnostics: dict[str, float] = {}
             with Usage() as usage:
                 problem = make_problem(prepared, settings, times, p)
                 if isinstance(problem, str):
@@ -124,11 +103,11 @@ def _solve_all(settings: GainFit, prepared: PreparedFit, progress: Progress | No
                 else:
                     start = warm if settings.solver.warm_start else None
                     if isinstance(settings.weights, GainWeights):
-                        solution, warm, diagnostics = _solve_in_passes(problem, solver, start, settings.weights)
+                        solution, warm = _solve_in_passes(problem, solver, start, settings.weights)
                     else:
                         solution, warm, anew = _solve(problem, solver, start, anew)
-                    diagnostics |= _diagnostics(solution, problem)
-            yield Solve(times, p, solution, usage.peak_memory, diagnostics)
+                    solution = _noted(solution, **_scale(solution, problem))
+            yield times, p, solution._replace(record=replace(solution.record, peak_memory=usage.peak_memory))
             if progress is not None:
                 progress(p * len(groups) + index + 1, len(groups) * n_polarizations)
 
@@ -142,24 +121,25 @@ def _solve(
     that will happen again for the next integration.
     """
     solution, next_warm = solve_warm(problem, solver, warm)
-    stuck = solution.status == "failed" or (solution.status == "stalled" and anew)
+    first = solution.record
+    stuck = first.status == "failed" or (first.status == "stalled" and anew)
     if warm is None or not stuck:
         return solution, next_warm, anew
     again, again_warm = solve_warm(problem, solver)
-    anew = again.status != "stalled"
-    if not again.usable or (solution.usable and again.loss_history[-1] > solution.loss_history[-1]):
+    anew = again.record.status != "stalled"
+    if not again.record.usable or (first.usable and again.record.loss_history[-1] > first.loss_history[-1]):
         return solution, next_warm, anew
     return again, again_warm, anew
 
 
 def _solve_in_passes(
     problem: CalibrationProblem, solver: Solver, warm: WarmStart | None, settings: GainWeights
-) -> tuple[Solution, WarmStart | None, dict[str, float]]:
+) -> tuple[Solution, WarmStart | None]:
     """Solve with the weights of the gains of the previous pass, until the weights settle.
 
     The problem has the weights of unity gains. The first weights are from the gains of the warm start, or of the
-    problem if it is None. Returns the last solution with the times of all passes, the warm start of the next solve, and
-    the number of passes and the last relative change of the weights by name.
+    problem if it is None. Returns the last solution, whose record has the times of all passes, their number and the
+    last relative change of the weights, and the warm start of the next solve.
     """
     weighted = problem.weighted_by(problem.initial_gains if warm is None else warm.gains)
     solutions: list[Solution] = []
@@ -167,67 +147,57 @@ def _solve_in_passes(
     change, anew = 0.0, True
     while len(solutions) < settings.passes:
         solution, warm, anew = _solve(weighted, solver, warm, anew)
-        if solutions and not solution.usable:
+        if solutions and not solution.record.usable:
             break
         solutions.append(solution)
         starts.append(warm)
-        if not solution.usable:
+        if not solution.record.usable:
             break
         before, weighted = weighted.weights, problem.weighted_by(solution.gains)
         change = weight_change(weighted.weights, before)
         # Weights of gains that are far from the solution lead away from it.
-        if change < settings.tolerance or solution.status == "max-steps":
+        if change < settings.tolerance or solution.record.status == "max-steps":
             break
-    found, kept = _together(solutions), -1
-    if settings.passes > 1 and change > RUNAWAY:
-        found, kept = replace(found, gains=solutions[0].gains, model=solutions[0].model), 0
-    if settings.unsettled(change) and found.status == "converged":
-        found = replace(found, status="max-steps", message=unsettled_message(change, len(solutions)))
-    return found, starts[kept], {"passes": len(solutions), "weight_change": change}
+    kept = 0 if settings.passes > 1 and change > RUNAWAY else -1
+    record = _together([solution.record for solution in solutions])
+    if settings.unsettled(change) and record.status == "converged":
+        record = replace(record, status="max-steps", message=unsettled_message(change, len(solutions)))
+    found = solutions[kept]._replace(record=record)
+    return _noted(found, passes=len(solutions), weight_change=change), starts[kept]
 
 
-def _together(solutions: Sequence[Solution]) -> Solution:
-    """Return the last of consecutive solutions, with the steps and times of all of them."""
-    first, *others = [solution.loss_history for solution in solutions]
+def _together(records: Sequence[Solve]) -> Solve:
+    """Return the last record of consecutive solves, with the steps and times of all of them."""
+    first, *others = [record.loss_history for record in records]
     return replace(
-        solutions[-1],
+        records[-1],
         loss_history=np.concatenate([first, *(history[1:] for history in others)]),
-        n_steps=sum(solution.n_steps for solution in solutions),
-        seconds=sum(solution.seconds for solution in solutions),
-        cpu_seconds=sum(solution.cpu_seconds for solution in solutions),
+        steps=sum(record.steps or 0 for record in records),
+        seconds=sum(record.seconds or 0 for record in records),
+        cpu_seconds=sum(record.cpu_seconds or 0 for record in records),
     )
 
 
 def _skipped(structure: FitStructure, message: str) -> Solution:
     gains = np.ones((structure.n_antennas, structure.n_frequencies), complex)
     model = np.zeros((structure.n_baselines, structure.n_frequencies), complex)
-    return Solution(gains, model, np.empty(0), "skipped", message, 0, 0.0, 0.0)
+    return Solution(gains, model, Solve("skipped", message, steps=0, seconds=0.0, cpu_seconds=0.0))
 
 
-def _diagnostics(solution: Solution, problem: CalibrationProblem) -> dict[str, float]:
+def _noted(solution: Solution, **diagnostics: float) -> Solution:
+    """Return a solution with further diagnostics in its record."""
+    record = solution.record
+    return solution._replace(record=replace(record, diagnostics={**record.diagnostics, **diagnostics}))
+
+
+def _scale(solution: Solution, problem: CalibrationProblem) -> dict[str, float]:
     """Return the scale and the rms band shape of g_a g_b* relative to the sky model, if there is one."""
-    if problem.sky_model is None or not solution.usable:
+    if problem.sky_model is None or not solution.record.usable:
         return {}
     slope, shape = sky_model_slope(solution.gains, problem)
     if slope == 0:
         return {}
     return {"sky_model_slope": slope, "band_shape_rms": float(np.sqrt(np.nanmean((shape - 1) ** 2)))}
-
-
-def _outcome(solve: Solve) -> Outcome:
-    solution = solve.solution
-    return Outcome(
-        status=solution.status,
-        message=solution.message,
-        steps=solution.n_steps,
-        loss_history=solution.loss_history,
-        seconds=solution.seconds,
-        cpu_seconds=solution.cpu_seconds,
-        newton_decrement=solution.newton_decrement,
-        decrement_rms=solution.decrement_rms,
-        peak_memory=solve.peak_memory,
-        diagnostics=solve.diagnostics,
-    )
 
 
 def _has_data(structure: FitStructure, used: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ from calstudy.calibrate.settings import (
     ForegroundFit,
     GainFit,
     GaussNewtonSettings,
-    LbfgsSettings,
 )
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 SINGLE, DOUBLE = 4, 8
 # Python with TensorFlow and pyuvdata, and the compiled graphs.
 TENSORFLOW_MEMORY = 1.2e9
-# What the allocators keep besides what is in use, measured for 128 and 350 antennas.
+# Memory that allocators hold over memory in use, measured for 128 and 350 antennas.
 RETAINED = 1.6
 LEAST_MODELS = 32
 # The common basis spans the edges of all bases besides the widest.
@@ -41,9 +40,7 @@ FREE_TOLERANCE, FREE_POWER = 1e-3, -0.6
 FINITE_DEVIATION = 0.1
 # Compilation takes 3 s and more; pieces with the same baselines in one process share it, so that most have none.
 START_SECONDS = 1.5
-# A step, and how many it takes to the minimum.
-LBFGS_STEP, LBFGS_STEPS = 0.06, 180
-FIRST_ORDER_STEP = 4e-3
+ADAMAX_STEP = 4e-3
 
 
 @dataclass(frozen=True)
@@ -123,8 +120,6 @@ def _unknowns(dimensions: Dimensions, settings: GainFit) -> float:
         # The matrix that couples smooth gains of all antennas, its factor, and a copy.
         coupled = solver.precision == "double" and isinstance(settings, ForegroundFit) and rows <= MOST_COUPLED
         return 10 * SINGLE * gains + (3 * DOUBLE * rows**2 if coupled else 0)
-    if isinstance(solver, LbfgsSettings):
-        return (2 * solver.memory + 10) * DOUBLE * gains
     word = SINGLE if solver.precision == "single" else DOUBLE
     # Parameters, moments, best and gradient; visibilities, model and residual.
     return 8 * word * (gains + 2 * dimensions.coefficients) + 10 * word * dimensions.samples
@@ -146,7 +141,7 @@ def dimensions_of(size: Size, settings: GainFit) -> Dimensions:
 
 
 def solve_cost(settings: GainFit, size: Size) -> Cost:
-    """Return what consecutive solves of data of this size take, compilation included: seconds of one core, and bytes.
+    """Return the cost of consecutive solves of data of this size, compilation included: seconds of one core, and bytes.
 
     The constants were measured on one core of a 2020s server; they serve to plan, within a factor of about two.
     """
@@ -163,9 +158,7 @@ def _seconds(settings: GainFit, solves: float, samples: int) -> float:
         seconds = _warm_seconds(settings, solver.tolerance)
         # Cost of the normal matrices, baselines x channels x vectors^2, dominates.
         return START_SECONDS + ((solves - warm) * max(COLD_SECONDS, seconds) + warm * seconds) * work
-    if isinstance(solver, LbfgsSettings):
-        return 6 + LBFGS_STEP * work * solves * min(LBFGS_STEPS, solver.max_steps)
-    return 6 + FIRST_ORDER_STEP * work * solves * solver.max_steps
+    return 6 + ADAMAX_STEP * work * solves * solver.max_steps
 
 
 def _warm_seconds(settings: GainFit, tolerance: float) -> float:

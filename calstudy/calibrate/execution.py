@@ -5,6 +5,7 @@ Mistakes of a user's own calibrator are reported as InputError with its name; th
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -14,16 +15,8 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import FILE_REFERENCE, guarded
 from calstudy.base.resources import Cost, Usage
-from calstudy.calibrate.interface import (
-    USABLE,
-    Assumed,
-    Calibration,
-    Calibrator,
-    Outcome,
-    Progress,
-    Status,
-)
-from calstudy.calibrate.records import CalibrationResult, SolveRecord
+from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress
+from calstudy.calibrate.records import CalibrationResult, Solve, Status, make_gains, make_visibilities
 from calstudy.calibrate.smoothing import smooth
 from calstudy.instrument.size import Size
 
@@ -210,9 +203,9 @@ class _Returned:
         self._require(finite, "returns a model that is not finite for unflagged data")
         return model
 
-    def _outcomes(self) -> list[Outcome]:
+    def _outcomes(self) -> list[Solve]:
         outcomes, count = self.returned.outcomes, len(self.groups) * self.fitted.n_polarizations
-        outcomes = [outcomes] * count if isinstance(outcomes, Outcome) else list(outcomes)
+        outcomes = [outcomes] * count if isinstance(outcomes, Solve) else list(outcomes)
         self._require(
             len(outcomes) == count,
             f"returns {len(outcomes)} outcomes for {count} solves (one for each polarization and each "
@@ -220,17 +213,14 @@ class _Returned:
         )
         for outcome in outcomes:
             self._require(
-                isinstance(outcome, Outcome) and outcome.status in get_args(Status) and bool(outcome.message),
-                f"returns an outcome {outcome!r}; it must be an Outcome with a message, and its status one of "
+                isinstance(outcome, Solve) and outcome.status in get_args(Status) and bool(outcome.message),
+                f"returns an outcome {outcome!r}; it must be a Solve with a message, and its status one of "
                 f"{', '.join(get_args(Status))}",
             )
         return outcomes
 
     def result(self, usage: Usage) -> CalibrationResult:
         """Return gains, model and residual as standard objects, with the records of all solves."""
-        # pyuvdata takes long to import, and plans need other parts of this module.
-        from calstudy.calibrate.standard_formats import make_gains, make_visibilities
-
         flags = np.array(self.fitted.flags)
         if self.returned.flags is not None:
             excluded = np.asarray(self.returned.flags)
@@ -241,7 +231,7 @@ class _Returned:
             )
             flags |= excluded
         for index, outcome in enumerate(self.outcomes):
-            if outcome.status not in USABLE:
+            if not outcome.usable:
                 p, group = divmod(index, len(self.groups))
                 flags[self.groups[group], :, :, p] = True
                 self.gain_flags[:, :, self.groups[group], p] = True
@@ -271,28 +261,23 @@ class _Returned:
                 residual[t, :, :, p] = np.where(unused, 0, calibrated - self.model[t, :, :, p])
         return residual
 
-    def _records(self, usage: Usage) -> list[SolveRecord]:
+    def _records(self, usage: Usage) -> list[Solve]:
         share, cpu_share = (value / len(self.outcomes) for value in (usage.seconds, usage.cpu_seconds))
         found = []
         for index, outcome in enumerate(self.outcomes):
             p, group = divmod(index, len(self.groups))
             times = self.groups[group]
             found.append(
-                SolveRecord(
+                replace(
+                    outcome,
+                    loss_history=np.asarray(outcome.loss_history, float),
+                    seconds=share if outcome.seconds is None else outcome.seconds,
+                    cpu_seconds=cpu_share if outcome.cpu_seconds is None else outcome.cpu_seconds,
+                    peak_memory=usage.peak_memory if outcome.peak_memory is None else outcome.peak_memory,
                     integration=times.start,
                     n_integrations=times.stop - times.start,
                     time=float(self.fitted.times[times.start]),
                     polarization=int(self.fitted.polarizations[p]),
-                    status=outcome.status,
-                    message=outcome.message,
-                    n_steps=outcome.steps,
-                    loss_history=np.asarray(outcome.loss_history, float),
-                    seconds=share if outcome.seconds is None else outcome.seconds,
-                    cpu_seconds=cpu_share if outcome.cpu_seconds is None else outcome.cpu_seconds,
-                    newton_decrement=outcome.newton_decrement,
-                    decrement_rms=outcome.decrement_rms,
-                    peak_memory=usage.peak_memory if outcome.peak_memory is None else outcome.peak_memory,
-                    diagnostics=outcome.diagnostics,
                 )
             )
         return found

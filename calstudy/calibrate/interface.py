@@ -1,14 +1,14 @@
 """Interface of calibrators: settings, refusals, cost, and the calibration of visibilities.
 
-Built-in calibrators are the modules of `calstudy.calibrate.calibrators`. Your own is a subclass of `Calibrator` in a
+Built-in calibrators are in the modules of `calstudy.calibrate.calibrators`. Your own is a subclass of `Calibrator` in a
 file or an installed package (docs/extending.md). `calstudy.calibrate.execution` calls either.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -19,16 +19,12 @@ from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Frequency, Time
+from calstudy.calibrate.records import Solve
 from calstudy.instrument.size import Size
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal
 
-Status = Literal["converged", "max-steps", "stalled", "failed", "skipped", "by-file"]
-USABLE: tuple[Status, ...] = ("converged", "max-steps", "stalled", "by-file")
-"""Statuses of solves that gave gains; samples of other solves are flagged."""
-SETTLED: tuple[Status, ...] = ("converged", "by-file")
-"""Statuses that need no warning."""
 Progress = Callable[[int, int], None]
 """Called after each solve with the number done and the total."""
 
@@ -54,44 +50,8 @@ class Assumed:
     noise: float | None = None
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Outcome:
-    """How a solve ended.
-
-    Attributes
-    ----------
-    status
-        ``converged``; ``max-steps`` or ``stalled`` for gains that are usable but short of the minimum; ``failed`` for
-        none; ``skipped`` if there were no data to fit; ``by-file`` for gains of another program, of which nothing else
-        is known.
-    message
-        One sentence on why it stopped.
-    steps
-        Steps taken; None if the calibrator does not iterate.
-    loss_history
-        The minimized quantity, before the first step and after each.
-    seconds
-        Wall time; None for an equal share of the whole.
-    cpu_seconds
-        Processor time, also of programs that the calibrator starts; None for an equal share of the whole.
-    newton_decrement, decrement_rms
-        As in `calstudy.calibrate.solution.Solution`; NaN if unknown.
-    peak_memory
-        Bytes; None for that of the whole.
-    diagnostics
-        Any other numbers and texts that are worth keeping, by name.
-    """
-
-    status: Status
-    message: str
-    steps: int | None = None
-    loss_history: np.ndarray = field(default_factory=lambda: np.empty(0))
-    seconds: float | None = None
-    cpu_seconds: float | None = None
-    newton_decrement: float = np.nan
-    decrement_rms: float = np.nan
-    peak_memory: int | None = None
-    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+Outcome = Solve
+"""The former name of `Solve`, for existing plug-ins."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,7 +79,7 @@ class Calibration:
     """
 
     gains: np.ndarray | UVCal
-    outcomes: Outcome | Sequence[Outcome]
+    outcomes: Solve | Sequence[Solve]
     gain_flags: np.ndarray | None = None
     model: np.ndarray | None = None
     flags: np.ndarray | None = None
@@ -127,7 +87,7 @@ class Calibration:
 
 
 @dataclass(frozen=True)
-class Outline:
+class SolvePlan:
     """Properties of a calibration that are known before it starts.
 
     Attributes
@@ -229,6 +189,7 @@ class Calibrator(Plugin):
         "calstudy.calibrate.calibrators",
         "calstudy.calibrate.interface:Calibrator",
         tag="calibrator",
+        families=True,
     )
 
     calibrator: str = Field("", description="Its name, or the path of a Python file that defines it.")
@@ -251,6 +212,11 @@ class Calibrator(Plugin):
     smooth_gains: SmoothGains | None = Field(
         None, description="Smooth the gains once they are found, and calibrate with those; the model stays as it is."
     )
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the name of a built-in calibrator."""
+        return (cls.model_fields["calibrator"].default,)
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return in one sentence why data cannot be calibrated, or None if they can.
@@ -282,11 +248,11 @@ class Calibrator(Plugin):
         """Return the cost of calibrating data of this size; by default little beyond the data themselves."""
         return Cost(5.0 + 1e-6 * size.samples, LIBRARIES_MEMORY + 6 * COMPLEX128 * size.samples)
 
-    def outline(self, frame: Frame) -> Outline:
+    def plan(self, frame: Frame) -> SolvePlan:
         """Return the properties of a calibration of data with these baselines; by default the cost of their size."""
-        return Outline(self.cost(Size.of_frame(frame)))
+        return SolvePlan(self.cost(Size.of_frame(frame)))
 
-    def leaner(self) -> Self | None:
+    def with_less_memory(self) -> Self | None:
         """Return a calibrator with the same results that needs less memory; None if there is none."""
         return None
 

@@ -1,23 +1,30 @@
-"""Prepare the calibration problems of an observation for the settings of a fit."""
+"""Prepare the calibration problems of an observation for the settings of a fit, and the gains that they start from."""
 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import read_gains
+from calstudy.base.gains import gains_for, read_gains
 from calstudy.base.observation import Observation
 from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.interface import Assumed
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure, fitted_baselines
-from calstudy.calibrate.settings import ForegroundFit, GainFit, GainWeights
-from calstudy.calibrate.standard_formats import require_parallel_hands
-from calstudy.calibrate.starts import redundant_start, starting_gains
-from calstudy.calibrate.structure import make_structure, repeat_structure
+from calstudy.calibrate.problem import (
+    CalibrationProblem,
+    FitStructure,
+    fitted_baselines,
+    make_structure,
+    repeat_structure,
+)
+from calstudy.calibrate.records import require_parallel_hands
+from calstudy.calibrate.settings import ForegroundFit, GainFit, GainWeights, RedundantStart
 from calstudy.calibrate.weights import inverse_variances, make_weights
+from calstudy.instrument.layouts import redundant_groups
 
 NOTHING = Assumed()
 
@@ -60,7 +67,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     """Check data and settings, and compute the arrays of a fit.
 
     Raises InputError if there are polarizations that are not parallel hands, or unflagged data that are not finite, or
-    if weights, gains or joint groups do not fit the data.
+    if weights or gains do not fit the data.
     """
     require_parallel_hands(observation.uvd)
     fitted = fitted_baselines(observation, settings.autos)
@@ -106,11 +113,8 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         return cube[times, :, :, polarization].reshape(structure.n_baselines, structure.n_frequencies)
 
     weights, visibilities = rows(prepared.weights), rows(prepared.data.visibilities)
-    flagged = 1 - float(np.mean(rows(prepared.used)))
     if not weights.any():
         return "every sample is flagged or has no weight"
-    if flagged >= settings.skip_flagged:
-        return f"{100 * flagged:.0f} % of the samples are flagged, which skip_flagged excludes"
     if not np.any(visibilities, where=weights > 0):
         return "the data are zero"
     sky = None if prepared.sky is None else rows(prepared.sky)
@@ -151,3 +155,96 @@ def _require_finite(data: Observation) -> None:
             f"{bad.sum()} unflagged visibilities are not finite, the first on baseline ({a}, {b}), integration {t}, "
             f"channel {channel}; flag them"
         )
+
+
+# hera_cal wants a name for the polarization; solves are one polarization at a time.
+POL = "nn"
+
+
+def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
+    """Return the gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols); unity if `gains` is None.
+
+    Of several integrations the closest in time is used; flagged, zero and infinite gains are replaced by unity. Raises
+    InputError if an antenna, channel or polarization of the data has no gain, or if the gains are delays.
+    """
+    if gains is None:
+        return np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
+    values = gains_for(gains, data.uvd)
+    rows = {int(number): row for row, number in enumerate(data.uvd.telescope.antenna_numbers)}
+    values = values[[rows[int(number)] for number in data.numbers]]
+    centres = gains.time_array if gains.time_array is not None else np.mean(gains.time_range, axis=1)
+    closest = np.abs(centres[None] - data.times[:, None]).argmin(axis=1)
+    values = values[:, :, closest]
+    return np.where(np.isfinite(values) & (values != 0), values, 1)
+
+
+def redundant_start(data: Observation, weights: np.ndarray, settings: RedundantStart, tolerance: float) -> np.ndarray:
+    """Solve redundant baselines for gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
+
+    Redundant baselines measure the same sky, so that the ratios of their visibilities are ratios of gains (Liu et al.
+    2010). A delay and a phase for each antenna (firstcal) bring phases within reach of the logarithm, in which the
+    equations are linear (logcal). Redundancy does not determine amplitude, phase and phase gradients of the whole
+    array. These are set to unity, or stay as firstcal has them.
+
+    Autocorrelations and samples of weight zero, (Ntimes, Nbls, Nfreqs, Npols), have no influence. Baselines that differ
+    by less than `tolerance`, in m, are redundant. Gains are unity for antennas without redundant baselines, and where
+    the solution is not finite. Raises InputError if no two baselines are redundant.
+    """
+    pairs, cube = data.pairs, data.visibilities
+    groups = redundant_groups(data.vectors, tolerance)
+    members = [np.flatnonzero(groups.index == group) for group in range(groups.index.max() + 1)]
+    members = [rows for rows in members if rows.size > 1 and pairs[rows[0], 0] != pairs[rows[0], 1]]
+    if not members:
+        raise InputError(
+            "calibration.initial_gains: 'redundant' needs redundant baselines, and no two differ by less than "
+            f"redundancy_tolerance = {tolerance:g} m; start from unity or a file"
+        )
+    turned = {row: groups.conjugated[row] for rows in members for row in rows}
+    ends = {row: pairs[row][::-1] if back else pairs[row] for row, back in turned.items()}
+    keys = {row: (int(first), int(second), POL) for row, (first, second) in ends.items()}
+    reds = [[keys[row] for row in rows] for rows in members]
+    gains = np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
+    for p in range(data.n_polarizations):
+        used = {keys[row]: weights[:, row, :, p] for row in keys}
+        # The logarithm must not be taken of zeros, even where the weight is zero.
+        visibilities = {
+            keys[row]: np.where(used[keys[row]] > 0, np.conj(cube[:, row, :, p]) if back else cube[:, row, :, p], 1)
+            for row, back in turned.items()
+        }
+        solved = _solve(reds, visibilities, used, data.frequencies, settings.delays)
+        for row, number in enumerate(data.numbers):
+            if int(number) in solved:
+                gains[row, :, :, p] = solved[int(number)].T
+    return np.where(np.isfinite(gains) & (gains != 0), gains, 1)
+
+
+def _solve(
+    reds: list[list[tuple[int, int, str]]],
+    visibilities: dict[tuple[int, int, str], np.ndarray],
+    weights: dict[tuple[int, int, str], np.ndarray],
+    frequency: np.ndarray,
+    delays: bool,
+) -> dict[int, np.ndarray]:
+    """Solve for the gains (Ntimes, Nfreqs) of every antenna with redundant baselines."""
+    from hera_cal.datacontainer import DataContainer
+    from hera_cal.redcal import RedundantCalibrator
+
+    calibrator = RedundantCalibrator(reds)
+    data = DataContainer(visibilities)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # Channels without data make singular equations; their gains are replaced by unity.
+        warnings.simplefilter("ignore")
+        first = calibrator.firstcal(data, frequency)[1].gains if delays else {}
+        # Degeneracies are fixed where phases are small: elsewhere they may jump by a lattice's worth between channels.
+        rest = {key: values / _product(first, key, values) for key, values in data.items()}
+        _, solution = calibrator.logcal(DataContainer(rest), wgts=DataContainer(weights))
+        solution.remove_degen(degen_sol={antenna: np.ones_like(gain) for antenna, gain in solution.gains.items()})
+    return {key[0]: np.asarray(gain * first.get(key, 1), complex) for key, gain in solution.gains.items()}
+
+
+def _product(gains: dict[tuple[int, str], np.ndarray], key: tuple[int, int, str], like: np.ndarray) -> np.ndarray:
+    """Return g_a g_b* of a baseline; unity if there are no gains."""
+    from hera_cal.utils import split_bl
+
+    first, second = split_bl(key)
+    return gains.get(first, np.ones_like(like)) * np.conj(gains.get(second, np.ones_like(like)))

@@ -14,9 +14,6 @@ coefficients have the normal matrix t^2 N_p + 1. Inserting their solution replac
 + 1)^-1 A^T D_p for the shared ones, whose normal matrix is s^2 sum_p A^T P_p A + 1. Inserting their solution in the
 same way replaces P by K for the gains. The gradient and the Gauss-Newton matrix for a relative change eta of the gains,
 g (1 + eta), are those of a fit with fixed foregrounds, with K in place of D in the matrix.
-
-Models m with common coefficients are treated as one, whose channels are those of all of them in sequence: N = sum_m
-A_m^T D_m A_m.
 """
 
 from __future__ import annotations
@@ -30,9 +27,8 @@ import numpy as np
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.batches import Piece, joined, make_piece, product_span, span_of
-from calstudy.calibrate.elementwise import BaselineProducts
 from calstudy.calibrate.problem import FitStructure
-from calstudy.calibrate.tensors import Ends, FitTensors
+from calstudy.calibrate.tensors import BaselineProducts, Ends, FitTensors
 
 # Regularizes N relative to its mean diagonal: far below any signal, enough for models with most channels flagged.
 RIDGE = 1e-12
@@ -51,7 +47,7 @@ class Roots(NamedTuple):
     ----------
     first
         S of the models of a batch, or of its baselines if they have their own coefficients besides the shared ones,
-        (N, Nvec, rank). Of a joint batch that of all members together, (1, Nvec, Nmembers * rank).
+        (N, Nvec, rank).
     shared
         S of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise.
     """
@@ -263,9 +259,6 @@ class Projector:
         owner, vectors = piece.owner, piece.vectors
         if owner is not None:
             curvature, matched = tf.math.segment_sum(curvature, owner), piece.to_models(matched)
-        if piece.batch.joint:
-            # All members are one model with the channels of all of them.
-            curvature, matched = tf.reshape(curvature, [1, -1]), tf.reshape(matched, [2, 1, -1])
         normal, projected = vectors.normal(curvature), vectors.reduce(matched)
         scale = tf.constant(1.0, tf.float64)
         if deviations is not None:
@@ -277,7 +270,7 @@ class Projector:
             # One step of iterative refinement: the ridge would be an error of the gradient.
             coefficients += tf.linalg.cholesky_solve(factor, projected - normal @ coefficients)
         penalty = tf.constant(0.0, tf.float64) if deviations is None else tf.reduce_sum(tf.square(coefficients))
-        model = tf.reshape(vectors.expand(scale * coefficients), [2, -1, self.tensors.n_frequencies])
+        model = vectors.expand(scale * coefficients)
         return piece.to_baselines(model), penalty, Roots(vectors.overlap(tf.cast(scale * root, self.dtype)), None)
 
     def _eliminate_both(
@@ -325,8 +318,6 @@ class Projector:
     def baseline_roots(self, piece: Piece, roots: Roots) -> tf.Tensor:
         """Return S of each baseline of a batch by itself, (Nbls, Nvec, rank)."""
         root = roots.first
-        if piece.batch.joint:
-            root = tf.transpose(tf.reshape(root, [root.shape[1], -1, piece.span.shape[1]]), [1, 0, 2])
         owned = self._two_levels or not self.tensors.shared
         return root if owned else tf.gather(root, piece.owner)
 

@@ -1,57 +1,94 @@
-"""Results of a calibration: gains, model and residual in standard formats, and a record of every solve."""
+"""Results of a calibration: the record of every solve, and gains, model and residual as UVCal and UVData."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import KW_ONLY, dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
-from calstudy.calibrate.interface import SETTLED
+from calstudy.base.errors import InputError
+from calstudy.base.gains import make_uvcal
+from calstudy.base.visibilities import from_cube
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
 
+Status = Literal["converged", "max-steps", "stalled", "failed", "skipped", "by-file"]
+USABLE: tuple[Status, ...] = ("converged", "max-steps", "stalled", "by-file")
+"""Statuses of solves that gave gains; samples of other solves are flagged."""
+SETTLED: tuple[Status, ...] = ("converged", "by-file")
+"""Statuses that need no warning."""
+# The AIPS convention, which UVCal's Jones numbers share.
+PARALLEL_HANDS = {-5: "xx", -6: "yy", -1: "rr", -2: "ll"}
+NOT_FINITE = ("newton_decrement", "decrement_rms")
+"""Numbers of a solve that are null in JSON where they are NaN."""
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SolveRecord:
-    """The record of one solve; other fields are as in `calstudy.calibrate.solution.Solution`.
+
+@dataclass(frozen=True, eq=False)
+class Solve:
+    """How a solve ended: what a calibrator returns, and the record in ``solution.json``.
 
     Attributes
     ----------
-    integration
-        Index of the first integration.
-    n_integrations
-        Number of consecutive integrations that were solved together.
+    status
+        ``converged``; ``max-steps`` or ``stalled`` for gains that are usable but short of the minimum; ``failed`` for
+        none; ``skipped`` if there were no data to fit; ``by-file`` for gains of another program, of which nothing else
+        is known.
+    message
+        One sentence on why it stopped.
+    steps
+        Steps taken; None if the calibrator does not iterate.
+    loss_history
+        The minimized quantity, before the first step and after each.
+    seconds
+        Wall time; None for an equal share of the whole.
+    cpu_seconds
+        Processor time, all threads together, also of programs that the calibrator starts; None for an equal share of
+        the whole.
+    newton_decrement
+        Relative Newton decrement, a measure of the distance from the minimum: the decrease of the loss that one more
+        Gauss-Newton step is predicted to bring, d^T H^-1 d with the descent direction d and the Gauss-Newton matrix H
+        (lambda^2 / 2 of Boyd & Vandenberghe 2004, section 9.5), over the loss. NaN if unknown. To first order, this
+        fraction of the power of the residual is due to the early end of the iteration, and orthogonal to the residual
+        at the minimum.
+    decrement_rms
+        Root mean square of that part of the calibrated residual R, in the unit of the data; NaN likewise. Two solves
+        that stop at the same point have it in common, and their cross power rises by up to its square.
+    peak_memory
+        Largest resident memory of the process during the solve, bytes; None for that of the whole.
+    diagnostics
+        Any other numbers and texts that are worth keeping, JSON-able, by name.
+    integration, n_integrations
+        Index of the first integration, and the number that were solved together. These and the next two are set by
+        `calstudy.calibrate.execution.run_calibrator`.
     time
-        Julian date of the first.
+        Julian date of the first integration.
     polarization
         Polarization number of the AIPS convention, such as -5 for XX.
-    n_steps
-        None if the calibrator does not iterate.
-    cpu_seconds
-        None if unknown: records of earlier versions lack it.
-    peak_memory
-        Largest resident memory of the process during the solve, bytes.
-    diagnostics
-        Further diagnostics of the calibrator, JSON-able, by name.
     """
 
-    integration: int
-    n_integrations: int
-    time: float
-    polarization: int
-    status: str
+    status: Status
     message: str
-    n_steps: int | None
-    loss_history: np.ndarray
-    seconds: float
-    cpu_seconds: float | None
-    newton_decrement: float
-    decrement_rms: float
-    peak_memory: int
+    _: KW_ONLY
+    steps: int | None = None
+    loss_history: np.ndarray = field(default_factory=lambda: np.empty(0))
+    seconds: float | None = None
+    cpu_seconds: float | None = None
+    newton_decrement: float = np.nan
+    decrement_rms: float = np.nan
+    peak_memory: int | None = None
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
+    integration: int = 0
+    n_integrations: int = 1
+    time: float = np.nan
+    polarization: int = 0
+
+    @property
+    def usable(self) -> bool:
+        """Whether the solve gave gains."""
+        return self.status in USABLE
 
     def summary(self) -> dict[str, Any]:
         """Return all fields but the full loss history, as plain JSON types."""
@@ -63,7 +100,7 @@ class SolveRecord:
             "polarization": self.polarization,
             "status": self.status,
             "message": self.message,
-            "n_steps": self.n_steps,
+            "n_steps": self.steps,
             "first_loss": _number(losses[0]) if losses.size else None,
             "last_loss": _number(losses[-1]) if losses.size else None,
             "seconds": self.seconds,
@@ -77,6 +114,15 @@ class SolveRecord:
     def detail(self) -> dict[str, Any]:
         """Return the summary with the full loss history."""
         return {**self.summary(), "loss_history": [_number(loss) for loss in self.loss_history]}
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Self:
+        """Return the record of a summary, with the first and the last loss, or of a detail, with all losses."""
+        fields = dict(content)
+        ends = [fields.pop("first_loss"), fields.pop("last_loss")]
+        losses = np.array(fields.pop("loss_history", ends), float)
+        numbers = {name: np.nan if fields[name] is None else fields[name] for name in NOT_FINITE}
+        return cls(steps=fields.pop("n_steps"), loss_history=losses, **{**fields, **numbers})
 
 
 def _number(value: float) -> float | None:
@@ -104,10 +150,10 @@ class CalibrationResult:
     gains: UVCal
     model: UVData
     residual: UVData
-    solutions: tuple[SolveRecord, ...]
+    solutions: tuple[Solve, ...]
 
     @property
-    def unconverged(self) -> tuple[SolveRecord, ...]:
+    def unconverged(self) -> tuple[Solve, ...]:
         """The solves that did not reach the minimum."""
         return tuple(record for record in self.solutions if record.status not in SETTLED)
 
@@ -120,3 +166,32 @@ class CalibrationResult:
             "seconds": sum(record.seconds for record in self.solutions),
             "records": [record.summary() for record in self.solutions],
         }
+
+
+def require_parallel_hands(data: UVData) -> None:
+    """Raise InputError unless all polarizations are xx, yy, rr or ll."""
+    if not np.isin(data.polarization_array, list(PARALLEL_HANDS)).all():
+        raise InputError(
+            f"polarizations: {', '.join(data.get_pols())}; calibration takes {', '.join(PARALLEL_HANDS.values())} only"
+        )
+
+
+def make_gains(data: UVData, numbers: np.ndarray, gains: np.ndarray, flags: np.ndarray) -> UVCal:
+    """Return gains as a UVCal object for the whole telescope; antennas without data are flagged, with unit gains.
+
+    `numbers` are the antenna numbers of the rows, (Nants,). Gains and flags are (Nants, Nfreqs, Ntimes, Npols).
+    """
+    known = data.telescope.antenna_numbers
+    rows = {int(number): row for row, number in enumerate(known)}
+    places = [rows[int(number)] for number in numbers]
+    everywhere = np.ones((len(known), *gains.shape[1:]), complex)
+    nowhere = np.ones(everywhere.shape, bool)
+    everywhere[places], nowhere[places] = gains, flags
+    return make_uvcal(data, everywhere, nowhere)
+
+
+def make_visibilities(data: UVData, cube: np.ndarray, flags: np.ndarray) -> UVData:
+    """Return a copy of `data` with other visibilities and flags, (Ntimes, Nbls, Nfreqs, Npols)."""
+    result = from_cube(data, cube)
+    result.flag_array = flags.reshape(result.data_array.shape)
+    return result

@@ -20,7 +20,7 @@ MODELS_AT_ONCE = 1024
 # precision: a matrix of 0.5 GB, and some ten seconds to factorize it.
 MOST_COUPLED = 8192
 NOISE_UNKNOWN = (
-    "calibration.foreground_prior.noise: a finite deviation is weighed against the noise, and nothing says what it is; "
+    "calibration.foreground_prior.noise: a finite deviation is weighed against the noise, which is not known; "
     "give the standard deviation of a sample, such as '1 Jy', or use `weights: autos`"
 )
 
@@ -33,9 +33,6 @@ class BasisSettings(Section):
     )
     buffer: Delay = Field(50e-9, ge=0, description="Added to the half-width.")
     min_delay: Delay = Field(100e-9, ge=0, description="The half-width before the buffer is at least this.")
-    eigenvalue_cutoff: float = Field(
-        1e-12, gt=0, lt=1, description="Keep sequences with a larger spectral concentration."
-    )
     delay_step: Delay = Field(
         10e-9, gt=0, description="Half-widths are rounded up to a multiple of this, so that baselines share bases."
     )
@@ -58,17 +55,11 @@ class GaussNewtonSettings(Section):
     warm_start: bool = Field(True, description="Start each integration from the solution of the one before.")
 
 
-class FirstOrderSettings(Section):
-    """Joint gradient descent on gains and foregrounds; Adamax at 0.01 is the paper's solver."""
+class AdamaxSettings(Section):
+    """Adamax on gains and foregrounds together; a learning rate of 0.01 is the paper's solver."""
 
-    name: Literal["adamax", "adam", "sgd"]
+    name: Literal["adamax"]
     learning_rate: float = Field(0.01, gt=0)
-    schedule: Literal["constant", "cosine", "exponential"] = Field(
-        "constant", description="How the learning rate falls from the first step to the last of max_steps."
-    )
-    final_rate: float = Field(
-        0.01, gt=0, le=1, description="Learning rate at the last step over that at the first, unless constant."
-    )
     stop: Literal["best-loss", "published"] = Field(
         "best-loss",
         description="Stop when the best loss falls by less than `tolerance` over 50 steps; `published`, as the code of "
@@ -85,20 +76,8 @@ class FirstOrderSettings(Section):
     warm_start: bool = False
 
 
-class LbfgsSettings(Section):
-    """L-BFGS on the gains, with the foregrounds eliminated exactly."""
-
-    name: Literal["lbfgs"]
-    tolerance: float = Field(
-        1e-3, gt=0, lt=1, description="Stop when the predicted relative decrease of the loss is smaller."
-    )
-    max_steps: int = Field(2000, ge=1)
-    memory: int = Field(20, ge=1, description="Pairs of steps and gradients that stand for the curvature.")
-    warm_start: bool = True
-
-
 Solver = Annotated[
-    GaussNewtonSettings | LbfgsSettings | FirstOrderSettings,
+    GaussNewtonSettings | AdamaxSettings,
     Field(discriminator="name"),
     choice("name", "gauss-newton"),
 ]
@@ -234,12 +213,6 @@ InitialGains = Annotated[
 ]
 
 
-class JointBasisSettings(Section):
-    """Foreground models of several baselines at once, from an .npz file (see the page on calibration)."""
-
-    path: Path = Field(strict=False)
-
-
 def _deviation(value: Any) -> Any:
     """Refuse an invalid deviation in one sentence, where a union of types would have one for each."""
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
@@ -336,9 +309,6 @@ class GainFit(WeightedFit):
         None, gt=0, description="Restrict gains to a DPSS basis up to this delay; null: any gain in any channel."
     )
     autos: bool = Field(False, description="Include autocorrelations in the fit.")
-    skip_flagged: float = Field(
-        1.0, gt=0, le=1, description="Skip a solve when at least this fraction of its samples is flagged."
-    )
     models_at_once: int = Field(
         MODELS_AT_ONCE,
         ge=16,
@@ -383,11 +353,6 @@ class ForegroundFit(GainFit):
 
     foreground_prior: ForegroundPrior = ForegroundPrior()
     basis: BasisSettings = BasisSettings()
-    joint_basis: JointBasisSettings | None = Field(
-        None,
-        description="Groups of baselines with common coefficients and vectors of your own, in place of the DPSS basis; "
-        "other baselines keep theirs.",
-    )
     prior: ScalePrior = "sum"
 
     @model_validator(mode="before")
@@ -403,10 +368,8 @@ class ForegroundFit(GainFit):
     @model_validator(mode="after")
     def _possible(self) -> Self:
         prior = self.foreground_prior
-        if prior.finite and self.joint_basis is not None:
-            raise fault("joint_basis", "has no finite prior; leave it out, or make `deviation` infinite")
-        if prior.finite and isinstance(self.solver, FirstOrderSettings):
-            raise fault("solver", f"{self.solver.name} cannot fit a finite prior; use gauss-newton or lbfgs")
+        if prior.finite and isinstance(self.solver, AdamaxSettings):
+            raise fault("solver", f"{self.solver.name} cannot fit a finite prior; use gauss-newton")
         if self.baselines is not None and not self.frozen:
             raise fault("baselines", "must be null where foregrounds are fitted, which takes data of every baseline")
         return self

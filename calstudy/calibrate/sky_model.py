@@ -74,9 +74,7 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
     modelled = np.array([frozenset(pair) in known for pair in pairs])
     are_autos = np.array([a == b for a, b in pairs])
     if not (modelled & ~are_autos).any():
-        raise InputError(
-            "sky model: has none of the cross-correlations of the data (antennas are told by their numbers)"
-        )
+        raise InputError("sky model: has none of the cross-correlations of the data (antennas are matched by number)")
     kept, notes = modelled | (are_autos & (not autos)), []
     if not kept.all():
         lost = sorted({pair for pair, keep in zip(pairs, kept, strict=True) if not keep})

@@ -58,7 +58,7 @@ class TangentSpace:
     conjugated
         Baselines that have the conjugate of their model, (Nbls,) bool.
     responses
-        Responses of the foregrounds, one for each model or joint bucket of models.
+        Responses of the foregrounds, one for each model.
     finite
         Whether the foregrounds have a finite prior.
     """
@@ -77,10 +77,6 @@ class TangentSpace:
         roots = np.sqrt(curvature)
         responses = []
         for bucket in () if problem.frozen else structure.basis.buckets:
-            if bucket.joint:
-                row, members = np.nonzero(structure.groups == bucket.members[:, None])
-                responses.append(Response(members, _orthonormal(roots[members], bucket.vectors[row])))
-                continue
             for index in bucket.members:
                 members = np.flatnonzero(structure.groups == index)
                 responses.append(_response(problem, members, roots[members], bucket.vectors))
@@ -122,10 +118,7 @@ def _smoothing(sequences: np.ndarray, left: np.ndarray) -> np.ndarray:
 
 
 def _orthonormal(roots: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of the sequences, weighted by `roots` (Nmembers, Nfreqs).
-
-    The sequences are (Nfreqs, Nvec), the same on all members, or (Nmembers, Nfreqs, Nvec).
-    """
+    """Return an orthonormal basis of the sequences (Nfreqs, Nvec), weighted by `roots` (Nmembers, Nfreqs)."""
     weighted = (roots[:, :, None] * vectors).reshape(-1, vectors.shape[-1])
     left, singular, _ = np.linalg.svd(weighted, full_matrices=False)
     kept = singular > SPAN_CUTOFF * max(singular[0], np.finfo(float).tiny)

@@ -1,4 +1,4 @@
-"""Index tensors of the structure of a fit, and sums and copies between antennas, baselines and models.
+"""Tensors of a fit: their order, sums and copies between antennas, baselines and models, products, and gains.
 
 Inside the solvers, baselines are sorted by foreground model and models by bucket, so that each bucket is a slice. A
 baseline that has the conjugate of its model is reversed: its antennas are swapped and its visibility is conjugated.
@@ -75,12 +75,10 @@ class FitTensors:
         Whether any baselines share a model.
     model_index
         Model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model.
-    coupled
-        Whether any baselines share a model or coefficients.
     slices
         Range of models of each bucket.
     bases
-        Basis of each bucket, shape (Nfreqs, Nvec), or (Nmodels, Nfreqs, Nvec) if it is joint, float64 arrays.
+        Basis of each bucket, shape (Nfreqs, Nvec), float64 arrays.
     batches
         Batches of models that are processed one after the other: the temporary arrays of one batch bound the memory,
         and the size of compiled graphs grows with the number of batches.
@@ -110,7 +108,6 @@ class FitTensors:
         self.bases = [bucket.vectors for bucket in buckets]
         # The first baseline of each model, and one past the last of all.
         self._baseline_edges = np.searchsorted(position[self._order], np.arange(self.n_models + 1))
-        self.coupled = self.shared or any(bucket.joint for bucket in buckets)
         sizes = [bucket.members.size for bucket in buckets]
         self.batches = make_batches(self.bases, sizes, self._baseline_edges, structure.models_at_once)
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
@@ -170,3 +167,108 @@ class FitTensors:
         if self.model_index is None:
             return values
         return tf.stack([self.sum_over_group(part) for part in tf.unstack(values)])
+
+
+# From this many visibilities on, the elementwise products of a fit are compiled (XLA): one pass over the memory in
+# place of a dozen, for a second of compilation.
+LEAST_FUSED = 1_000_000
+
+
+class BaselineProducts:
+    """The products of the elimination and of its Gauss-Newton matrix on some baselines.
+
+    They are compiled if `fused`; batches with equal numbers of baselines share one compilation.
+    """
+
+    def __init__(self, tensors: FitTensors) -> None:
+        self._n_antennas = tensors.n_antennas
+        self.fused = tensors.n_baselines * tensors.n_frequencies >= LEAST_FUSED
+        self.curvature, self.match, self.residual, self.unmatched, self.change, self.pull = (
+            tf.function(function, jit_compile=self.fused, autograph=False)
+            for function in (self._curvature, self._match, self._residual, self._unmatched, self._change, self._pull)
+        )
+
+    def _curvature(self, gains: tf.Tensor, ends: Ends, weights: tf.Tensor) -> tf.Tensor:
+        """Return D, (Nbls, Nfreqs), for gains (2, Nants, Nfreqs)."""
+        return weights * pairs.squared_modulus(ends.gain_products(gains))
+
+    def _match(
+        self, gains: tf.Tensor, ends: Ends, visibilities: tf.Tensor, weights: tf.Tensor, mean: tf.Tensor | None
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return D, (Nbls, Nfreqs), and G* w V, less D m if there is a mean m, (2, Nbls, Nfreqs)."""
+        products = ends.gain_products(gains)
+        curvature = weights * pairs.squared_modulus(products)
+        matched = pairs.conjugate_multiply(products, weights * visibilities)
+        return curvature, matched if mean is None else matched - curvature * mean
+
+    def _residual(
+        self, gains: tf.Tensor, ends: Ends, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor
+    ) -> tuple[tf.Tensor, tf.Tensor]:
+        """Return sum w |V - G F|^2, and minus half its gradient in eta with F fixed, (2, Nants, Nfreqs)."""
+        products = ends.gain_products(gains)
+        residual = visibilities - pairs.multiply(products, model)
+        pull = pairs.conjugate_multiply(model, weights * pairs.conjugate_multiply(products, residual))
+        loss = tf.reduce_sum(weights * pairs.squared_modulus(residual))
+        return loss, ends.sum_over_antenna(pull, self._n_antennas)
+
+    def _unmatched(
+        self, gains: tf.Tensor, ends: Ends, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor
+    ) -> tf.Tensor:
+        """Return G* w (V - G F), (2, Nbls, Nfreqs)."""
+        products = ends.gain_products(gains)
+        return pairs.conjugate_multiply(products, weights * (visibilities - pairs.multiply(products, model)))
+
+    def _change(self, eta: tf.Tensor, ends: Ends, curvature: tf.Tensor, model: tf.Tensor) -> tf.Tensor:
+        """Return D F (eta_a + eta_b*), (2, Nbls, Nfreqs)."""
+        return curvature * pairs.multiply(model, ends.relative_change(eta))
+
+    def _pull(
+        self, change: tf.Tensor, answer: tf.Tensor | None, ends: Ends, curvature: tf.Tensor, model: tf.Tensor
+    ) -> tf.Tensor:
+        """Return F* (y - D x) summed by antenna, (2, Nants, Nfreqs).
+
+        y is a weighted change, and x the response of the foregrounds.
+        """
+        left = change if answer is None else change - curvature * answer
+        return ends.sum_over_antenna(pairs.conjugate_multiply(model, left), self._n_antennas)
+
+
+class GainSpace:
+    """Coordinates of the gains: pairs (2, Nants, Nfreqs) themselves, or coefficients (2, Nants, Ngain) of a basis.
+
+    Solvers iterate on relative changes eta of the gains, g (1 + eta). A basis B is a change of coordinates, eta =
+    (c B^T) / g.
+
+    The basis is orthonormal, (Nfreqs, Ngain), as from `calstudy.calibrate.basis.gain_vectors`, or None for no
+    restriction. `dtype` is that of all tensors.
+    """
+
+    def __init__(self, vectors: np.ndarray | None, dtype: tf.DType) -> None:
+        self.vectors = None if vectors is None else tf.constant(vectors, dtype)
+
+    def expand(self, coordinates: tf.Tensor) -> tf.Tensor:
+        """Return the gains with these coordinates, (2, Nants, Nfreqs)."""
+        if self.vectors is None:
+            return coordinates
+        return tf.einsum("pac,fc->paf", coordinates, self.vectors)
+
+    def reduce(self, values: tf.Tensor) -> tf.Tensor:
+        """Return the coordinates of the closest gains in least squares; the transpose of `expand`."""
+        return values if self.vectors is None else tf.einsum("paf,fc->pac", values, self.vectors)
+
+    def expand_relative(self, coordinates: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
+        """Return eta for a change of the gains with these coordinates."""
+        if self.vectors is None:
+            return coordinates
+        return pairs.conjugate_multiply(gains, self.expand(coordinates)) / pairs.squared_modulus(gains)
+
+    def reduce_relative(self, values: tf.Tensor, gains: tf.Tensor) -> tf.Tensor:
+        """Apply the transpose of `expand_relative`."""
+        if self.vectors is None:
+            return values
+        return self.reduce(pairs.multiply(gains, values) / pairs.squared_modulus(gains))
+
+    def columns(self, gains: tf.Tensor) -> tf.Tensor:
+        """Return eta of each antenna for a unit of each coefficient of a basis, (Nants, Nfreqs, Ngain), complex."""
+        inverse = 1 / tf.complex(gains[0], gains[1])
+        return inverse[:, :, None] * tf.cast(self.vectors, inverse.dtype)

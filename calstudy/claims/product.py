@@ -25,7 +25,7 @@ TABLES = ("spectra", "agreement", "transfer", "score", "sky_model")
 
 def _facts(experiment: Experiment) -> Experiment:
     """Return the experiment without settings that no statement reads, to keep them out of the key of the claims."""
-    return experiment.reset("description", "sweep", "scales", "outputs")
+    return experiment.with_defaults("description", "sweep", "scales", "outputs")
 
 
 def _inputs(graph: Graph) -> dict[str, Task]:

@@ -34,7 +34,7 @@ Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format tha
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
 Gains = Annotated[Path | None, typer.Option(help="CalH5 or calfits file to start from; by default unity.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="YAML file: a `calibration` section.")]
-SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default), lbfgs, adamax, adam or sgd.")]
+SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default) or adamax.")]
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
 Redundant = Annotated[bool, typer.Option("--redundant", help="One foreground model per redundant group.")]
 GainsOnly = Annotated[bool, typer.Option("--gains-only", help="Freeze the sky model and solve for gains alone.")]
@@ -225,19 +225,19 @@ def _plan(
     from calstudy.base.observation import Observation
     from calstudy.base.plugins import guarded
     from calstudy.base.resources import free_memory
-    from calstudy.calibrate.amplitudes import conspicuous
     from calstudy.calibrate.execution import require_calibratable
+    from calstudy.calibrate.weights import conspicuous
 
     frame = Observation(data)
     require_calibratable(calibrator, frame, has_sky_model)
     results, available = 6 * data.data_array.nbytes, free_memory() if budget is None else budget
     with guarded(calibrator):
-        outline = calibrator.outline(frame)
-        while outline.cost.memory + results > available and (leaner := calibrator.leaner()) is not None:
-            calibrator, outline = leaner, leaner.outline(frame)
-    notes += [*conspicuous(frame), *outline.notes]
+        plan = calibrator.plan(frame)
+        while plan.cost.memory + results > available and (leaner := calibrator.with_less_memory()) is not None:
+            calibrator, plan = leaner, leaner.plan(frame)
+    notes += [*conspicuous(frame), *plan.notes]
     cross = frame.n_baselines - int(frame.autos.sum())
-    needed = outline.cost.memory + results
+    needed = plan.cost.memory + results
     if needed > available:
         raise InputError(
             f"{frame.n_antennas} antennas, {cross} baselines and {frame.n_channels} channels need about "
@@ -245,7 +245,7 @@ def _plan(
             f"{'free' if budget is None else 'allowed by --max-memory'}; --select fewer of them"
         )
     solves = len(calibrator.solves(frame.n_times)) * frame.n_polarizations
-    details = "".join(f", {part}" for part in (outline.details, f"about {needed / 1e9:.1f} GB") if part)
+    details = "".join(f", {part}" for part in (plan.details, f"about {needed / 1e9:.1f} GB") if part)
     return calibrator, (
         f"{frame.n_antennas} antennas, {cross} baselines, {frame.n_channels} channels, {frame.n_times} integrations, "
         f"{frame.n_polarizations} polarizations: {solves} solves{details}"

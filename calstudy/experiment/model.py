@@ -12,9 +12,9 @@ from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.schema import Section, fault
-from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
-from calstudy.calibrate.settings import FirstOrderSettings, GaussNewtonSettings, Solver
+from calstudy.calibrate.settings import AdamaxSettings, GaussNewtonSettings, Solver
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.corrupt.temperature import Autocorrelations
 from calstudy.instrument.settings import InstrumentSettings
@@ -107,7 +107,7 @@ class Inspection(Section):
 def _followed_solvers() -> dict[str, Solver]:
     return {
         "Gauss-Newton (default)": GaussNewtonSettings(),
-        "Adamax 0.01": FirstOrderSettings(name="adamax", tolerance=0.0, max_steps=16_000),
+        "Adamax 0.01": AdamaxSettings(name="adamax", tolerance=0.0, max_steps=16_000),
     }
 
 

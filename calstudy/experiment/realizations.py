@@ -46,7 +46,7 @@ def expand_realizations(experiment: Experiment) -> list[Realization]:
     faults = _faults(experiment)
     if faults:
         raise ExperimentError(faults)
-    base = experiment.reset("realizations", "scales")
+    base = experiment.with_defaults("realizations", "scales")
     found = [Realization(dict.fromkeys(PARTS, 0), base)]
     # Besides the experiment itself, only the variants of the pooled quantities are needed.
     lean = base.model_copy(update={"variants": {name: base.variants[name] for name in SIGNAL_LOSS_VARIANTS}})

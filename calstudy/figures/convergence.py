@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.calibrate.bias import ratio_over_antennas
+from calstudy.calibrate.agreement import ratio_over_antennas
 from calstudy.calibrate.settings import GainFit, GainWeights
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.figures import Drawing, StudyFigure

@@ -120,11 +120,11 @@ class InstrumentSettings(Section):
 
     def nominal(self) -> InstrumentSettings:
         """Return the instrument as designed, which calibrators and figures assume."""
-        return self.reset("as_built")
+        return self.with_defaults("as_built")
 
     def without_beams(self) -> InstrumentSettings:
         """Return the nominal instrument with the default beam, for code that reads antennas, channels and times."""
-        return self.reset("beam", "antenna_beams", "as_built")
+        return self.with_defaults("beam", "antenna_beams", "as_built")
 
     @model_validator(mode="after")
     def _positions_of_a_file_have_a_place(self) -> InstrumentSettings:

@@ -15,7 +15,7 @@ from calstudy.calibrate.expected_loss import (
     expected_transfer,
     jacobian_size,
 )
-from calstudy.calibrate.interface import USABLE, Assumed
+from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.preparation import prepare, problem_at
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import GainFit
@@ -40,7 +40,7 @@ def expect(
     gave a solution.
     """
     number = int(result.model.polarization_array[polarization])
-    usable = [record for record in result.solutions if record.polarization == number and record.status in USABLE]
+    usable = [record for record in result.solutions if record.polarization == number and record.usable]
     if not usable:
         return None
     record = usable[len(usable) // 2]

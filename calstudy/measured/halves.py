@@ -149,7 +149,7 @@ def read_facts(
     baselines, or `even` is not satisfied.
     """
     # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
-    from calstudy.calibrate.standard_formats import PARALLEL_HANDS
+    from calstudy.calibrate.records import PARALLEL_HANDS
     from calstudy.measured.positions import place_antennas
     from calstudy.measured.reading import read_metadata
 

@@ -20,7 +20,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gains import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata
-from calstudy.calibrate.standard_formats import PARALLEL_HANDS
+from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.measured.selection import Selection, select
 
 logger = logging.getLogger(__name__)

@@ -17,13 +17,11 @@ from calstudy import __version__
 from calstudy.base.identity import digest_json
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator, Progress
-from calstudy.calibrate.records import CalibrationResult, SolveRecord
+from calstudy.calibrate.records import CalibrationResult, Solve
 from calstudy.observed.output import writing_to
 from calstudy.products.files import GAINS, MODEL, RESIDUAL
 
 RECORDS = "records.json"
-NOT_FINITE = ("newton_decrement", "decrement_rms")
-"""Numbers of a record that are null in JSON where they are NaN."""
 
 
 @dataclass(frozen=True)
@@ -124,12 +122,4 @@ def _read(place: Path) -> CalibrationResult | None:
         records = json.loads((place / RECORDS).read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError):
         return None
-    return CalibrationResult(gains, model, residual, tuple(map(_record, records)))
-
-
-def _record(content: Mapping[str, Any]) -> SolveRecord:
-    fields = {name: value for name, value in content.items() if name not in ("first_loss", "last_loss")}
-    losses = [np.nan if loss is None else loss for loss in fields.pop("loss_history")]
-    numbers = {name: np.nan if fields[name] is None else fields[name] for name in NOT_FINITE}
-    # Pieces of earlier versions lack it.
-    return SolveRecord(**{"cpu_seconds": None, **fields, **numbers, "loss_history": np.array(losses, float)})
+    return CalibrationResult(gains, model, residual, tuple(map(Solve.from_json, records)))

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of
-from calstudy.calibrate.interface import SETTLED, Calibrator
+from calstudy.calibrate.interface import Calibrator
+from calstudy.calibrate.records import SETTLED
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import LEVELS
@@ -42,7 +43,7 @@ def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     inputs = calibration_inputs(graph, variant, parity)
     model = inputs.get("sky_model")
     calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model.key if model else None)
-    return calibration_of(calibrator.reset("assumed"), inputs, temporary=not graph.keep_visibilities)
+    return calibration_of(calibrator.with_defaults("assumed"), inputs, temporary=not graph.keep_visibilities)
 
 
 def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str, Task]:
@@ -127,8 +128,8 @@ def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
 def calibrate_chunk(job: Job) -> Mapping[str, Any]:
     """Calibrate a run of consecutive integrations."""
     from calstudy.base.observation import Observation
-    from calstudy.calibrate.amplitudes import conspicuous
     from calstudy.calibrate.execution import run_calibrator
+    from calstudy.calibrate.weights import conspicuous
 
     index, count, settings = (job.settings[name] for name in ("index", "count", "calibration"))
     times = _times_of_chunk(job.inputs["data"] / DATA, index, count, settings.integrations_per_solve)

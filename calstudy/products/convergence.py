@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
-from calstudy.calibrate.cost import FIRST_ORDER_STEP, PAPER_SAMPLES
+from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import PARITIES
@@ -18,10 +18,9 @@ from calstudy.run.task import Job, Stage, Task
 if TYPE_CHECKING:
     import numpy as np
 
-    from calstudy.calibrate.agreement import Baselines
-    from calstudy.calibrate.bias import Realization
+    from calstudy.calibrate.agreement import Baselines, Realization
     from calstudy.calibrate.settings import Solver
-    from calstudy.calibrate.trace import Checkpoint
+    from calstudy.calibrate.solvers.interface import Checkpoint
 
 PATHS = "convergence.json"
 
@@ -43,7 +42,7 @@ def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
     if (model := sky_model.sky_model(graph)) is not None:
         inputs["sky_model"] = model
     settings = {
-        "calibration": experiment.calibration.reset("assumed").model_copy(update={"solver": solver}),
+        "calibration": experiment.calibration.with_defaults("assumed").model_copy(update={"solver": solver}),
         "integration": integration,
         "steps": list(experiment.outputs.convergence.steps),
         "buffer": experiment.power.wedge_buffer,
@@ -58,7 +57,7 @@ def follow(job: Job) -> Mapping[str, Any]:
     """
     import numpy as np
 
-    from calstudy.calibrate.bias import cross_power
+    from calstudy.calibrate.agreement import cross_power
     from calstudy.calibrate.problem import gain_products
 
     paths, realizations = {}, {}
@@ -117,13 +116,12 @@ def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Basel
     import numpy as np
 
     from calstudy.base.observation import Observation
-    from calstudy.calibrate.agreement import Baselines
-    from calstudy.calibrate.bias import Realization
+    from calstudy.calibrate.agreement import Baselines, Realization
     from calstudy.calibrate.calamity import make_solver
     from calstudy.calibrate.interface import Assumed
     from calstudy.calibrate.preparation import make_problem, prepare
     from calstudy.calibrate.problem import gain_products
-    from calstudy.calibrate.trace import trace
+    from calstudy.calibrate.solvers.interface import trace
     from calstudy.products.selection import read_gains
 
     settings = job.settings["calibration"]
@@ -159,7 +157,7 @@ def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Basel
 def _cost(task: Task) -> Cost:
     size, solver = size_of(task), task.settings["calibration"].solver
     work = size.baselines * size.channels.count / PAPER_SAMPLES
-    step = 0.3 if solver.name == "gauss-newton" else FIRST_ORDER_STEP
+    step = 0.3 if solver.name == "gauss-newton" else ADAMAX_STEP
     steps = 10 if solver.name == "gauss-newton" else min(solver.max_steps, max(task.settings["steps"]))
     data = 4 * size.samples * 8
     return Cost(20 + 2 * steps * step * work, LIBRARIES_MEMORY + 1.5e9 * work + data, 1e6)

@@ -75,8 +75,8 @@ def levels(graph: Graph) -> Task:
     inputs = {"eor": simulation.eor(graph)}
     if (foregrounds := simulation.foregrounds(graph)) is not None:
         inputs["foregrounds"] = foregrounds
-    corruption = graph.experiment.corruption.reset("effects")
-    noise = corruption.noise if corruption.noise.kind == "none" else corruption.noise.reset("seeds")
+    corruption = graph.experiment.corruption.with_defaults("effects")
+    noise = corruption.noise if corruption.noise.kind == "none" else corruption.noise.with_defaults("seeds")
     settings: dict[str, Any] = {"corruption": corruption.model_copy(update={"noise": noise})}
     if isinstance(noise, RadiometerNoise):
         settings["instrument"] = graph.experiment.instrument

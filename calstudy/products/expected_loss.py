@@ -56,7 +56,7 @@ def linear_response(graph: Graph) -> Task | None:
         return None
     inputs = _inputs(graph) | {"signal": corruption.data(graph, Variant(components=("eor",)), "even")}
     settings = _settings(graph)
-    settings["power"] = settings["power"].reset("bins", "length_bin")
+    settings["power"] = settings["power"].with_defaults("bins", "length_bin")
     return Task(LINEAR_RESPONSE, "linear response to the EoR", settings, inputs)
 
 
@@ -68,8 +68,8 @@ def _inputs(graph: Graph) -> dict[str, Task]:
 
 def _settings(graph: Graph) -> dict[str, Any]:
     return {
-        "calibration": graph.experiment.calibration.reset("assumed"),
-        "power": graph.experiment.power.reset("pairs", "redundancy_tolerance", "coherent_time"),
+        "calibration": graph.experiment.calibration.with_defaults("assumed"),
+        "power": graph.experiment.power.with_defaults("pairs", "redundancy_tolerance", "coherent_time"),
         "integration": graph.experiment.instrument.times.count // 2,
     }
 

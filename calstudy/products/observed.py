@@ -107,7 +107,7 @@ def calibration_inputs(graph: ObservedGraph, data: Task, parity: str) -> dict[st
 def calibrated(graph: ObservedGraph, parity: str) -> Task:
     """Return the task of the calibration of one half."""
     data = observed(graph, parity)
-    return calibration_of(graph.calibration.reset("assumed"), calibration_inputs(graph, data, parity))
+    return calibration_of(graph.calibration.with_defaults("assumed"), calibration_inputs(graph, data, parity))
 
 
 @once
@@ -119,7 +119,7 @@ def average(graph: ObservedGraph, what: str, parity: str) -> Task:
 
 def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: PowerSettings | None = None) -> Task:
     """Return the task of the delay power spectra of two averages; `power` replaces the study's own settings."""
-    settings = {**graph.beam_settings, "power": (power or graph.power).reset(*NOT_OF_DELAY_SPECTRA)}
+    settings = {**graph.beam_settings, "power": (power or graph.power).with_defaults(*NOT_OF_DELAY_SPECTRA)}
     return Task(POWER, label, settings, {"even": even, "odd": odd})
 
 
@@ -135,7 +135,7 @@ def noise_power(graph: ObservedGraph, what: str, source: str) -> Task:
     inputs = {parity: average(graph, what, parity) for parity in PARITIES}
     label = f"noise of {what} from {source}"
     noise = Task(NOISE_STAGE, label, {"source": source}, inputs)
-    own = graph.power.model_copy(update={"pairs": "same-baseline"}).reset("redundancy_tolerance")
+    own = graph.power.model_copy(update={"pairs": "same-baseline"}).with_defaults("redundancy_tolerance")
     return crossed(graph, label, noise, noise, own)
 
 

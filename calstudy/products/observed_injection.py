@@ -87,7 +87,7 @@ def injected(graph: ObservedGraph, parity: str) -> Task:
 def response(graph: ObservedGraph, parity: str) -> Task:
     """Return the task of the averaged response of the residual of one half to the EoR."""
     data = injected(graph, parity)
-    again = calibration_of(graph.calibration.reset("assumed"), calibration_inputs(graph, data, parity))
+    again = calibration_of(graph.calibration.with_defaults("assumed"), calibration_inputs(graph, data, parity))
     own = average(graph, "residual", parity)
     with_signal = Task(own.stage, f"residual + eor {parity}", own.settings, {"data": data, "calibration": again})
     inputs = {"with_signal": with_signal, "without_signal": own}
@@ -123,8 +123,8 @@ def expected(graph: ObservedGraph) -> Task | None:
         return None
     inputs = {"data": observed(graph, "even"), "calibration": calibrated(graph, "even")}
     settings = {
-        "calibration": graph.calibration.reset("assumed"),
-        "power": graph.power.reset("pairs", "redundancy_tolerance", "coherent_time"),
+        "calibration": graph.calibration.with_defaults("assumed"),
+        "power": graph.power.with_defaults("pairs", "redundancy_tolerance", "coherent_time"),
         "sky_model": graph.observed.sky_model is not None,
         "probes": PROBES,
     }

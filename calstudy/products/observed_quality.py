@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
     from calstudy.calibrate.records import CalibrationResult
 
 QUALITY = "quality.json"
-NUMBERS = ("newton_decrement", "decrement_rms", "first_loss", "last_loss")
-"""Fields of a record that are null in JSON if they are not known."""
 
 
 @once
@@ -41,7 +38,7 @@ def quality(graph: ObservedGraph) -> Task:
     for parity in PARITIES:
         inputs |= {f"data:{parity}": observed(graph, parity), f"calibration:{parity}": calibrated(graph, parity)}
     settings = {
-        "calibration": graph.calibration.reset("assumed"),
+        "calibration": graph.calibration.with_defaults("assumed"),
         "autos": all(facts.autos for facts in graph.halves.facts.values()),
         "interleaved": graph.halves.interleaved,
         "sky_model": graph.observed.sky_model is not None,
@@ -51,23 +48,13 @@ def quality(graph: ObservedGraph) -> Task:
 
 def read_result(folder: Path) -> CalibrationResult:
     """Read a product of stage `calibrate`, whose records have only the first and the last loss."""
-    import numpy as np
     from pyuvdata import UVCal
 
-    from calstudy.calibrate.records import CalibrationResult, SolveRecord
+    from calstudy.calibrate.records import CalibrationResult, Solve
 
     model, residual = (read_visibilities(folder / name) for name in (MODEL, RESIDUAL))
-    records = []
-    for summary in read_json(folder / SOLUTION)["records"]:
-        known: dict[str, Any] = {
-            name: math.nan if value is None and name in NUMBERS else value for name, value in summary.items()
-        }
-        losses = np.array([known.pop("first_loss"), known.pop("last_loss")], dtype=float)
-        # Products of earlier versions lack this field.
-        records.append(SolveRecord(**{"cpu_seconds": None, **known}, loss_history=losses))
-    return CalibrationResult(
-        gains=UVCal.from_file(folder / GAINS), model=model, residual=residual, solutions=tuple(records)
-    )
+    records = tuple(map(Solve.from_json, read_json(folder / SOLUTION)["records"]))
+    return CalibrationResult(gains=UVCal.from_file(folder / GAINS), model=model, residual=residual, solutions=records)
 
 
 def assess(job: Job) -> Mapping[str, Any]:
@@ -130,8 +117,9 @@ def _chi_squared(
 def _unknowns(job: Job, parity: str, data: Any) -> float | None:
     """Return the number of complex unknowns of all solves of one half; None for a calibration without least squares."""
     from calstudy.base.observation import Observation
-    from calstudy.calibrate.interface import USABLE, Assumed
+    from calstudy.calibrate.interface import Assumed
     from calstudy.calibrate.preparation import make_problem, prepare
+    from calstudy.calibrate.records import USABLE
     from calstudy.measured.goodness import count_unknowns
 
     settings = job.settings["calibration"]

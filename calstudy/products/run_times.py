@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
 from calstudy.base.schema import Section
-from calstudy.calibrate.calibrators.calamity import Calamity
-from calstudy.calibrate.cost import FIRST_ORDER_STEP, PAPER_SAMPLES, Dimensions, basis_vectors, solve_memory
+from calstudy.calibrate.calibrators.least_squares import Calamity
+from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES, Dimensions, basis_vectors, solve_memory
 from calstudy.calibrate.settings import BasisSettings
 from calstudy.instrument.settings import Channels, Layout
 from calstudy.instrument.size import antenna_count
@@ -135,7 +135,7 @@ def _cost_of_timing(task: Task) -> Cost:
     padded = 4 * vectors * baselines * channels.count
     work = baselines * channels.count / PAPER_SAMPLES
     solves = samples["solves"] * (0.4 + 1.3 * work)
-    steps = PADDED_SECONDS * padded * samples["steps"] + 50 * FIRST_ORDER_STEP * work * samples["calls"]
+    steps = PADDED_SECONDS * padded * samples["steps"] + 50 * ADAMAX_STEP * work * samples["calls"]
     dimensions = Dimensions(antennas, baselines, baselines, channels.count, vectors, baselines * vectors)
     memory = solve_memory(dimensions, Calamity()) + PADDED_COPIES * padded
     return Cost(30 + steps + solves, memory, 1e5)
@@ -149,7 +149,7 @@ def _cost_of_descent(task: Task) -> Cost:
     vectors = basis_vectors(task.settings["longest"], array.channels, array.basis)
     dimensions = Dimensions(antennas, baselines, baselines, array.channels.count, vectors, baselines * vectors)
     memory = solve_memory(dimensions, Calamity())
-    return Cost(20 + FIRST_ORDER_STEP * work * task.settings["max_steps"], memory, 1e6)
+    return Cost(20 + ADAMAX_STEP * work * task.settings["max_steps"], memory, 1e6)
 
 
 TIME_STEPS = Stage(name="step-times", version=4, make=time_steps, cost=_cost_of_timing)

@@ -194,7 +194,7 @@ def _solves(job: Job) -> dict[str, Any]:
 
 
 def cpu_seconds_per_integration(records: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the processor seconds per integration, with all of its polarizations, from summaries of `SolveRecord`.
+    """Return the processor seconds per integration, with all of its polarizations, from summaries of `Solve`.
 
     It is the median over solves, because the first in a process also compiles, without skipped solves. It is None if a
     record has no time, or if nothing was solved.

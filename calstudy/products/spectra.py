@@ -62,7 +62,7 @@ def crossed(graph: Graph, label: str, averages: Mapping[str, Task]) -> Task:
     settings = {
         "beam": instrument.beam,
         "channels": instrument.channels,
-        "power": graph.experiment.power.reset(*NOT_OF_DELAY_SPECTRA),
+        "power": graph.experiment.power.with_defaults(*NOT_OF_DELAY_SPECTRA),
     }
     return Task(POWER, label, settings, averages)
 

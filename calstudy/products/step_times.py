@@ -23,7 +23,7 @@ from calstudy.base.resources import Usage, resident_memory
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.settings import BasisSettings
-from calstudy.calibrate.solvers.first_order import STEPS_PER_CALL, FirstOrder, Optimizer
+from calstudy.calibrate.solvers.adamax import STEPS_PER_CALL, Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
@@ -194,7 +194,7 @@ def _all_samples(
     """Yield samples by name, without compilation, in rounds that contain all kinds."""
     problem = simulation.problem(0, structure)
     solver = GaussNewton()
-    adamax = FirstOrder(Optimizer(max_steps=10**6), tolerance=0.0)
+    adamax = Adamax(max_steps=10**6, tolerance=0.0)
     state = adamax.init(problem)
     for call in (paper.model_sum, lambda: adamax.step(state), lambda: solve(problem, solver)):
         call()
@@ -238,8 +238,8 @@ def descend(layout: Layout, channels: Channels, basis: BasisSettings, max_steps:
     simulation = make_simulation(layout, channels)
     structure = simulation.structure(basis)
     problem = simulation.problem(0, structure)
-    floor = min(solve(problem, GaussNewton(FLOOR_TOLERANCE, FLOOR_STEPS)).loss_history)
-    history = solve(problem, FirstOrder(Optimizer(max_steps=max_steps), tolerance=0.0)).loss_history
+    floor = min(solve(problem, GaussNewton(FLOOR_TOLERANCE, FLOOR_STEPS)).record.loss_history)
+    history = solve(problem, Adamax(max_steps=max_steps, tolerance=0.0)).record.loss_history
     return Descent(structure.n_antennas, float(floor), history)
 
 

@@ -151,7 +151,7 @@ def _stream(work: _Work, share: float) -> _Work:
     while work.largest(CALIBRATE_CHUNK) > share:
         calibration = work.experiment.calibration
         with guarded(calibration):
-            leaner = calibration.leaner()
+            leaner = calibration.with_less_memory()
         if leaner is None:
             break
         work = work.changed(calibration=leaner)

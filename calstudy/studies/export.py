@@ -15,8 +15,8 @@ from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.gains import CASACORE
 from calstudy.base.identity import digest_json
-from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest, salted
-from calstudy.calibrate.standard_formats import PARALLEL_HANDS
+from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
+from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.products import corruption, sky_model

@@ -18,7 +18,7 @@ from calstudy.base.files import sha256
 from calstudy.base.identity import digest_json, identity
 from calstudy.base.schema import Section
 from calstudy.base.table import Table, one_line, plain_text
-from calstudy.calibrate.interface import Status
+from calstudy.calibrate.records import Status
 from calstudy.experiment.model import Experiment
 from calstudy.power.score import BANDS
 from calstudy.products.comparison import score_table

@@ -52,7 +52,7 @@ class SingleIntegration:
     @classmethod
     def of(cls, run: StepInput) -> SingleIntegration:
         """Return the first integration of an experiment, from its products "foregrounds", "gains" and "levels"."""
-        from calstudy.calibrate.structure import make_structure
+        from calstudy.calibrate.problem import make_structure
 
         foregrounds = first_integrations(read_visibilities(run.products["foregrounds"] / VISIBILITIES))
         settings, frame = run.experiment.calibration, Observation(foregrounds)
@@ -70,7 +70,7 @@ class SingleIntegration:
 
     def first(self, antennas: int | None, channels: int | None) -> SingleIntegration:
         """Return the first antennas and channels only; all if None."""
-        from calstudy.calibrate.structure import make_structure
+        from calstudy.calibrate.problem import make_structure
 
         if antennas is None and channels is None:
             return self

@@ -10,10 +10,9 @@ import pytest
 import tensorflow as tf
 from test_calibration_loss import redundant_structure
 from test_foreground_prior import prior_structure
-from test_joint_basis import block_diagonal
 from toy import HEX, complex_normal, make_toy
 
-from calstudy.calibrate import elementwise, pairs
+from calstudy.calibrate import pairs, tensors
 from calstudy.calibrate.basis import dpss_vectors
 from calstudy.calibrate.batches import ALIKE, Vectors, column_products, product_span
 from calstudy.calibrate.solvers.reduced import ReducedKernels
@@ -67,7 +66,6 @@ def make_problem(toy, case):
         "per-baseline": lambda: toy.structure,
         "frozen": lambda: toy.structure,
         "turned-and-shared": lambda: redundant_structure(toy),
-        "joint": lambda: block_diagonal(toy.structure),
         "prior": lambda: prior_structure(toy, "both"),
     }[case]()
     rng, shape = np.random.default_rng(2), toy.foregrounds.shape
@@ -76,7 +74,7 @@ def make_problem(toy, case):
     return toy.problem(structure, weights=weights, sky_model=toy.foregrounds, **more)
 
 
-@pytest.mark.parametrize("case", ["per-baseline", "frozen", "turned-and-shared", "joint", "prior"])
+@pytest.mark.parametrize("case", ["per-baseline", "frozen", "turned-and-shared", "prior"])
 @pytest.mark.parametrize("dtype", [tf.float64, tf.float32])
 def test_fused_products_are_the_plain_ones(toy, case, dtype, monkeypatch):
     problem = make_problem(toy, case)
@@ -96,7 +94,7 @@ def test_fused_products_are_the_plain_ones(toy, case, dtype, monkeypatch):
         return (found.loss, tf.concat(found.model, 1), found.descent), (found.power(), *images, *blocks)
 
     plain = results()
-    monkeypatch.setattr(elementwise, "LEAST_FUSED", 1)
+    monkeypatch.setattr(tensors, "LEAST_FUSED", 1)
     # Loss, model and gradient are float64 always. They are made of 21 baselines and 64 channels.
     for ones, others, rounding in zip(plain, results(), (1e-10, 1e-10 if dtype == tf.float64 else 1e-4), strict=True):
         for one, other in zip(ones, others, strict=True):

@@ -12,11 +12,10 @@ from pyuvdata.utils import ECEF_from_ENU, uvcalibrate
 from toy import FREQUENCIES, HEX, make_toy, scattered
 
 from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
-from calstudy.calibrate.calibrators.calamity import Calamity
-from calstudy.calibrate.calibrators.calamity_redundant import CalamityRedundant
+from calstudy.calibrate.calibrators.least_squares import Calamity, CalamityRedundant
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import gain_products
-from calstudy.calibrate.settings import BasisSettings, FirstOrderSettings, FlagWeights, GaussNewtonSettings
+from calstudy.calibrate.settings import AdamaxSettings, BasisSettings, FlagWeights, GaussNewtonSettings
 
 SETTINGS = Calamity(basis=BasisSettings(min_delay="50 ns", buffer="50 ns"))
 # Weights that need no second pass.
@@ -218,11 +217,11 @@ def test_not_converging_is_recorded_not_raised(data):
 
 
 def test_adamax_is_one_setting_away(data):
-    settings = ONE_SOLVE.model_copy(update={"solver": FirstOrderSettings(name="adamax", max_steps=100)})
+    settings = ONE_SOLVE.model_copy(update={"solver": AdamaxSettings(name="adamax", max_steps=100)})
     ticks = []
     result = run_calibrator(settings, data, progress=lambda done, total: ticks.append((done, total)))
     assert ticks == [(1, 3), (2, 3), (3, 3)]
-    assert all(record.n_steps == 100 for record in result.solutions)
+    assert all(record.steps == 100 for record in result.solutions)
 
 
 def test_bad_data_are_refused_in_one_sentence(toy, data):

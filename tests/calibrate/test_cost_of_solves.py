@@ -11,9 +11,9 @@ from test_calamity import SETTINGS, make_uvdata
 from test_hera_cal_calibrators import sky_of
 
 from calstudy.base.resources import Usage
-from calstudy.calibrate.calibrators.skycal import Skycal
+from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.execution import run_calibrator
-from calstudy.calibrate.interface import Calibration, Calibrator, Outcome
+from calstudy.calibrate.interface import Calibration, Calibrator, Solve
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.observed import pieces
@@ -55,7 +55,7 @@ class Idle(Calibrator):
         time.sleep(PAUSE)
         subprocess.run([sys.executable, "-c", BUSY.format(0.3)], check=True)
         shape = (observation.n_antennas, observation.n_channels, observation.n_times, observation.n_polarizations)
-        outcome = Outcome(status="converged", message="nothing was fitted", cpu_seconds=self.own)
+        outcome = Solve(status="converged", message="nothing was fitted", cpu_seconds=self.own)
         return Calibration(gains=np.ones(shape, complex), outcomes=outcome)
 
 
@@ -81,9 +81,9 @@ def test_the_processor_does_not_work_while_a_solver_waits(toy):
     problem = toy.problem()
     solve(problem, GaussNewton())  # Compiles.
     solution = solve(problem, Pausing())
-    assert solution.n_steps > 0
-    assert solution.seconds >= PAUSE * solution.n_steps
-    assert 0 < solution.cpu_seconds < solution.seconds / 2
+    assert solution.record.steps > 0
+    assert solution.record.seconds >= PAUSE * solution.record.steps
+    assert 0 < solution.record.cpu_seconds < solution.record.seconds / 2
 
 
 @pytest.mark.parametrize("calibrator", [SETTINGS, Skycal()], ids=["calamity", "skycal"])

@@ -13,7 +13,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.visibilities import to_cube
 from calstudy.calibrate.calibrators import ddecal
 from calstudy.calibrate.calibrators.ddecal import Ddecal
-from calstudy.calibrate.calibrators.skycal import Skycal
+from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.execution import run_calibrator
 
 SINGLE = 1e-5

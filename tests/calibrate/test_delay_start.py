@@ -14,7 +14,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube
-from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.calibrators.least_squares import SkyBased
 from calstudy.calibrate.delay_start import _DelaySearch, delay_start
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Assumed

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from test_calibration_loss import redundant_structure
 from test_foreground_prior import dense_covariance, prior_structure, turned
-from test_joint_basis import joined
 from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
 from calstudy.calibrate.basis import gain_vectors
@@ -38,14 +37,11 @@ def brute_force(problem, gains, model):
                 moved = change[first] * gains[second].conj() + gains[first] * change[second].conj()
                 tangents.append(roots * moved * model)
         for bucket in structure.basis.buckets:
-            # Each member has coefficients of its own, or all of them together.
-            for members in [bucket.members] if bucket.joint else bucket.members[:, None]:
-                sequences = bucket.vectors if bucket.joint else bucket.vectors[None]
-                for column in range(sequences.shape[2]):
+            for index in bucket.members:
+                for vector in bucket.vectors.T:
                     moved = np.zeros(shape, complex)
-                    for index, vector in zip(members, sequences[:, :, column], strict=True):
-                        for p in np.flatnonzero(structure.groups == index):
-                            moved[p] = (np.conj(unit) if structure.conjugated[p] else unit) * vector
+                    for p in np.flatnonzero(structure.groups == index):
+                        moved[p] = (np.conj(unit) if structure.conjugated[p] else unit) * vector
                     tangents.append(roots * products * moved)
     # The phases of g_a g_b* turn the plane of each sample, which isotropic signals do not see.
     turned = np.array(tangents) * (np.abs(products) / products)
@@ -64,12 +60,8 @@ def in_the_basis(toy, structure, seed=2):
     rng = np.random.default_rng(seed)
     model = np.empty(toy.foregrounds.shape, complex)
     for bucket in structure.basis.buckets:
-        common = complex_normal(rng, (bucket.vectors.shape[-1],)) if bucket.joint else None
-        for row, index in enumerate(bucket.members):
-            if common is not None:
-                spectrum = bucket.vectors[row] @ common
-            else:
-                spectrum = bucket.vectors @ complex_normal(rng, (bucket.vectors.shape[1],))
+        for index in bucket.members:
+            spectrum = bucket.vectors @ complex_normal(rng, (bucket.vectors.shape[1],))
             for p in np.flatnonzero(structure.groups == index):
                 model[p] = spectrum.conj() if structure.conjugated[p] else spectrum
     return model
@@ -83,10 +75,8 @@ def case(kind):
     gains = toy.gains
     if kind == "flags":
         flags[2, 10:14] = flags[4] = flags[:, 40] = True
-    if kind.startswith("joint"):
-        structure = joined(structure)
     if kind.endswith("smooth gains"):
-        vectors = gain_vectors(FREQUENCIES, 400e-9, 1e-12)
+        vectors = gain_vectors(FREQUENCIES, 400e-9)
         structure = replace(structure, gain_vectors=vectors)
         gains = 1 + 0.3 * complex_normal(np.random.default_rng(1), (5, vectors.shape[1])) @ vectors.T
     model = in_the_basis(toy, structure)
@@ -94,7 +84,7 @@ def case(kind):
     return toy.problem(structure, visibilities=data, weights=flag_weights(flags)), gains, model
 
 
-KINDS = ["any gains", "flags", "smooth gains", "redundant", "joint", "joint, smooth gains"]
+KINDS = ["any gains", "flags", "smooth gains", "redundant"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -17,10 +17,7 @@ from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis
-from calstudy.calibrate.calibrators.calamity import Calamity
-from calstudy.calibrate.calibrators.delay_weighted import DelayWeighted
-from calstudy.calibrate.calibrators.sky_based import SkyBased
-from calstudy.calibrate.calibrators.unified import Unified
+from calstudy.calibrate.calibrators.least_squares import Calamity, DelayWeighted, SkyBased, Unified
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
@@ -111,7 +108,7 @@ def gains(problem):
 
 def test_the_root_has_the_covariance_of_a_flat_wedge():
     channels, width = 64, 5.3
-    covariance = flat_wedge_root(channels, width, 1e-13) @ flat_wedge_root(channels, width, 1e-13).T
+    covariance = flat_wedge_root(channels, width) @ flat_wedge_root(channels, width).T
     lag = np.subtract.outer(np.arange(channels), np.arange(channels))
     assert np.abs(covariance - np.sinc(2 * width / channels * lag)).max() < 1e-6
 
@@ -195,7 +192,7 @@ def test_a_vanishing_deviation_is_sky_based_calibration_by_hera_cal(toy):
     sky = spoiled(toy)
     problem = noisy(toy, free_structure(toy), sky, (1e-7, 1e-7))
     found = solved(problem)
-    assert found.status == "converged", found.message
+    assert found.record.status == "converged", found.record.message
     ratio, weights, start = {}, {}, {}
     for row, (a, b) in enumerate(toy.antennas.tolist()):
         ratio[a, b, "nn"] = (problem.visibilities[row] / sky[row])[None]
@@ -316,9 +313,9 @@ def test_wide_priors_converge_to_the_minimum(hexagon, prior, own, shared):
     sky = turned_foregrounds + 0.06 * rms * complex_normal(rng, (len(data), 1))
     problem = CalibrationProblem(structure, data, weights, start, sky, deviations=(own * rms, shared * rms))
     found = solve(problem, GaussNewton(tolerance=1e-5))
-    assert found.status == "converged", found.message
+    assert found.record.status == "converged", found.record.message
     further = solve(problem, GaussNewton(tolerance=1e-8, max_steps=300, precision="double"))
-    assert found.loss_history[-1] < 1.01 * further.loss_history[-1]
+    assert found.record.loss_history[-1] < 1.01 * further.record.loss_history[-1]
 
 
 def test_refused_steps_are_the_exception_in_curved_valleys():
@@ -333,8 +330,8 @@ def test_refused_steps_are_the_exception_in_curved_valleys():
     weights, start = np.full(data.shape, (NOISE * rms) ** -2), np.ones(simulation.gains.shape, complex)
     problem = CalibrationProblem(structure, data, weights, start, sky, deviations=(rms, np.inf))
     found = solve(problem, GaussNewton(tolerance=1e-5))
-    assert found.status == "converged", found.message
-    refused = np.diff(found.loss_history) == 0
+    assert found.record.status == "converged", found.record.message
+    refused = np.diff(found.record.loss_history) == 0
     assert refused.mean() < 0.15
 
 
@@ -377,7 +374,6 @@ def test_a_partial_solver_block_keeps_what_the_calibrator_has_of_its_own():
     assert (
         DelayWeighted.model_validate({"solver": {"name": "gauss-newton", "tolerance": 1e-6}}).solver.tolerance == 1e-6
     )
-    assert DelayWeighted.model_validate({"solver": "lbfgs"}).solver.tolerance == 1e-3
 
 
 def test_a_solve_whose_sky_model_is_zero_is_skipped_with_the_reason():

@@ -18,9 +18,9 @@ from toy import FREQUENCIES, complex_normal, make_toy, point_source_visibilities
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import to_cube
 from calstudy.calibrate.basis import dpss_vectors
+from calstudy.calibrate.calibrators.least_squares import SkyBased
+from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.calibrators.redcal import Redcal
-from calstudy.calibrate.calibrators.sky_based import SkyBased
-from calstudy.calibrate.calibrators.skycal import Skycal
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import make_problem, prepare, problem_at

@@ -128,7 +128,7 @@ def floors():
         if name not in found:
             simulation, problem = hard.simulate()
             solution = solve(replace(problem, initial_gains=simulation.gains), SOLVER)
-            found[name] = simulation, problem, float(solution.loss_history[-1])
+            found[name] = simulation, problem, float(solution.record.loss_history[-1])
         return found[name]
 
     return floor
@@ -142,15 +142,15 @@ def test_the_minimum_is_found_from_delays(name, with_sky, floors):
     simulation, problem, floor = floors(name, CASES[name])
     sky = simulation.foregrounds(0) if with_sky else None
     solution = fitted(simulation, problem, DelayStart(kind="delays"), sky)
-    limit = AT_THE_MINIMUM if solution.status == "converged" else NEAR
-    assert solution.loss_history[-1] < limit * floor
+    limit = AT_THE_MINIMUM if solution.record.status == "converged" else NEAR
+    assert solution.record.loss_history[-1] < limit * floor
 
 
 def test_from_unity_cables_are_out_of_reach_and_the_status_says_so(floors):
     _, problem, floor = floors("random, 300 ns", CASES["random, 300 ns"])
     solution = solve(problem, SOLVER)
-    assert solution.loss_history[-1] > NEAR * floor
-    assert solution.status != "converged"
+    assert solution.record.loss_history[-1] > NEAR * floor
+    assert solution.record.status != "converged"
 
 
 def test_interference_that_is_not_flagged_is_not_said_to_have_converged():
@@ -159,5 +159,5 @@ def test_interference_that_is_not_flagged_is_not_said_to_have_converged():
     noise = simulation.case.noise * np.sqrt(np.mean(np.abs(simulation.foregrounds(0)) ** 2))
     for sky in (simulation.foregrounds(0), None):
         solution = fitted(simulation, problem, DelayStart(kind="delays"), sky)
-        assert solution.loss_history[-1] > 100 * noise**2
-        assert solution.status != "converged"
+        assert solution.record.loss_history[-1] > 100 * noise**2
+        assert solution.record.status != "converged"

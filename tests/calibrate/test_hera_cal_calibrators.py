@@ -14,9 +14,9 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.calibrators import redcal
+from calstudy.calibrate.calibrators.least_squares import SkyBased
+from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.calibrators.redcal import Redcal
-from calstudy.calibrate.calibrators.sky_based import SkyBased
-from calstudy.calibrate.calibrators.skycal import Skycal
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.settings import FlagWeights

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calstudy.calibrate.basis import make_basis
-from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.cost import (
     LEAST_MODELS,
     TENSORFLOW_MEMORY,
@@ -30,7 +30,7 @@ def test_fewer_models_at_a_time_take_less_memory():
     sizes, fit = [], DEFAULT
     while fit is not None:
         sizes.append((fit.models_at_once, solve_memory(LARGE, fit)))
-        fit = fit.leaner()
+        fit = fit.with_less_memory()
     assert [count for count, _ in sizes] == [1024, 512, 256, 128, 64, LEAST_MODELS]
     memory = [size for _, size in sizes]
     assert memory == sorted(memory, reverse=True)
@@ -41,7 +41,7 @@ def test_350_antennas_are_planned_within_16_gb():
     assert solve_memory(LARGE, DEFAULT) < 16e9
 
 
-@pytest.mark.parametrize("solver", ["gauss-newton", "lbfgs", "adamax"])
+@pytest.mark.parametrize("solver", ["gauss-newton", "adamax"])
 def test_memory_grows_with_the_number_of_visibilities(solver):
     settings = Calamity.model_validate({"solver": solver})
     sizes = [Dimensions(n, n * (n - 1) // 2, n * (n - 1) // 2, 384, 53, 16 * n * (n - 1)) for n in (100, 200, 400)]
@@ -84,8 +84,8 @@ def test_every_solver_has_its_own_time():
     def seconds(solver) -> float:
         return Calamity.model_validate({"solver": solver}).cost(size).seconds
 
-    found = {name: seconds(name) for name in ("gauss-newton", "lbfgs", "adamax")}
-    assert found["gauss-newton"] < found["lbfgs"] < found["adamax"]
+    found = {name: seconds(name) for name in ("gauss-newton", "adamax")}
+    assert found["gauss-newton"] < found["adamax"]
     cold = {"name": "gauss-newton", "warm_start": False, "max_steps": 100}
     assert seconds(cold) > 3 * found["gauss-newton"]
 

@@ -1,4 +1,4 @@
-"""Other solvers, schedules, smooth gains, frozen skies and joint solves reach the minima they must."""
+"""Both solvers, smooth gains, frozen skies and solves of several integrations reach the minima they must."""
 
 from __future__ import annotations
 
@@ -12,39 +12,12 @@ from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import dpss_vectors, gain_vectors
-from calstudy.calibrate.gain_space import GainSpace
-from calstudy.calibrate.problem import flag_weights, gain_products
+from calstudy.calibrate.problem import flag_weights, gain_products, repeat_structure
 from calstudy.calibrate.projection import Projector
-from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
+from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
-from calstudy.calibrate.solvers.interface import WarmStart, solve, solve_warm
-from calstudy.calibrate.solvers.lbfgs import Lbfgs
-from calstudy.calibrate.structure import repeat_structure
-from calstudy.calibrate.tensors import FitTensors
-
-
-@pytest.fixture(scope="module")
-def converged(toy):
-    problem = toy.problem()
-    return problem, solve(problem, GaussNewton(tolerance=3e-4))
-
-
-def test_lbfgs_reaches_the_minimum_of_gauss_newton(converged):
-    """Both stop where 1e-3 of the loss is predicted to go, but at ends of slow valleys that hold more than that.
-
-    The toy has few channels for its bases: directions of next to no curvature take 5 % of its noise. Where along them a
-    solver stops is decided by rounding, and differs between processors.
-    """
-    problem, best = converged
-    # Without curvature L-BFGS crawls: 1400 steps or more than 2000, as rounding decides.
-    found = solve(problem, Lbfgs(tolerance=1e-3, max_steps=10_000))
-    same = solve(problem, GaussNewton(tolerance=1e-3))
-    assert found.status == "converged", found.message
-    assert found.newton_decrement < 1e-3
-    assert found.loss_history[-1] == pytest.approx(same.loss_history[-1], rel=0.05)
-    onwards = solve_warm(problem, GaussNewton(tolerance=3e-4), WarmStart(found.gains, None))[0]
-    assert onwards.status == "converged", onwards.message
-    assert onwards.loss_history[-1] == pytest.approx(best.loss_history[-1], rel=0.05)
+from calstudy.calibrate.solvers.interface import solve, solve_warm
+from calstudy.calibrate.tensors import FitTensors, GainSpace
 
 
 def test_solvers_meet_where_no_direction_is_flat():
@@ -57,46 +30,24 @@ def test_solvers_meet_where_no_direction_is_flat():
         foregrounds[bucket.members] = complex_normal(rng, shape) @ bucket.vectors.T
     noise = 1e-3 * np.sqrt(np.mean(np.abs(foregrounds) ** 2)) * complex_normal(rng, foregrounds.shape)
     flat = replace(toy, foregrounds=foregrounds, noise=noise)
-    losses = [
-        solve(flat.problem(prior="none"), solver).loss_history.min()
-        for solver in (
-            GaussNewton(tolerance=1e-5),
-            Lbfgs(tolerance=1e-5),
-            FirstOrder(Optimizer("adamax", 0.02, "cosine", 1e-3, 6000), tolerance=0.0, precision="double"),
-        )
-    ]
-    assert losses == pytest.approx([losses[0]] * 3, rel=2e-4)
+    problem = flat.problem(prior="none")
+    best, other = solve(problem, GaussNewton(tolerance=1e-5)), descended(problem, 2000)
+    assert other.record.loss_history.min() == pytest.approx(best.record.loss_history.min(), rel=2e-4)
 
 
-def test_lbfgs_says_when_it_ran_out_of_steps(toy):
-    solution = solve(toy.problem(), Lbfgs(max_steps=3))
-    assert (solution.status, solution.n_steps) == ("max-steps", 3)
-    assert solution.loss_history[-1] < solution.loss_history[0]
-
-
-@pytest.mark.parametrize("schedule", ["constant", "cosine", "exponential"])
-def test_schedules_start_and_end_where_they_should(schedule):
-    optimizer = Optimizer(learning_rate=0.02, schedule=schedule, final_rate=0.1, max_steps=101)
-    rates = [float(optimizer.rate(tf.constant(step, tf.float64))) for step in (1.0, 51.0, 101.0)]
-    middle = {"constant": 0.02, "cosine": 0.02 * 0.55, "exponential": 0.02 * np.sqrt(0.1)}[schedule]
-    last = 0.02 if schedule == "constant" else 0.002
-    assert rates == pytest.approx([0.02, middle, last], rel=1e-9)
-
-
-def test_falling_rates_reach_the_minimum_where_the_constant_one_jitters(converged):
-    problem, best = converged
-    losses = {}
-    for name in ("cosine", "exponential", "constant"):
-        optimizer = Optimizer(learning_rate=0.03, schedule=name, final_rate=1e-3, max_steps=8000)
-        solution = solve(problem, FirstOrder(optimizer, precision="double", tolerance=0.0))
-        losses[name] = np.median(solution.loss_history[-50:])
-    assert max(losses["cosine"], losses["exponential"]) < 1.2 * best.loss_history[-1] < losses["constant"]
+def descended(problem, steps, precision="double"):
+    """Adamax at falling rates, each from where the one before ended: at a constant one it jitters."""
+    warm = None
+    for rate in (2e-2, 2e-3, 2e-4):
+        solver = Adamax(learning_rate=rate, max_steps=steps, tolerance=0.0, precision=precision)
+        solution, warm = solve_warm(problem, solver, warm)
+    return solution
 
 
 def smooth_toy(delay=400e-9):
     """Gains in the span of sequences up to a delay."""
     toy = make_toy(scattered(8))
-    vectors = gain_vectors(FREQUENCIES, delay, 1e-12)
+    vectors = gain_vectors(FREQUENCIES, delay)
     rng = np.random.default_rng(21)
     gains = 1 + 0.3 * complex_normal(rng, (8, vectors.shape[1])) @ vectors.T
     return replace(toy, gains=gains), vectors
@@ -114,34 +65,24 @@ def test_coordinates_of_smooth_gains_are_adjoint():
     assert np.abs(change - pairs.to_complex(c) @ vectors.T).max() < 1e-12
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [
-        GaussNewton(tolerance=1e-4),
-        # It takes many steps to the minimum.
-        pytest.param(Lbfgs(tolerance=3e-4), marks=pytest.mark.slow),
-        FirstOrder(Optimizer("adamax", 0.02, "cosine", 1e-3, 8000)),
-    ],
-    ids=lambda solver: type(solver).__name__,
-)
+@pytest.mark.parametrize("solver", ["gauss-newton", "adamax"])
 def test_smooth_gains_stay_smooth_and_fit_as_well(solver):
     toy, vectors = smooth_toy()
     problem = toy.problem(replace(toy.structure, gain_vectors=vectors), prior="none")
-    solution = solve(problem, solver)
+    adamax = solver == "adamax"
+    solution = descended(problem, 2500, "single") if adamax else solve(problem, GaussNewton(tolerance=1e-4))
     outside = solution.gains - solution.gains @ vectors @ vectors.T
     assert np.abs(outside).max() < 1e-5
-    used = solve(toy.problem(), GaussNewton()).loss_history[-1]
+    used = solve(toy.problem(), GaussNewton()).record.loss_history[-1]
     noise = np.sum(problem.weights * np.abs(gain_products(toy.gains, toy.antennas) * toy.noise) ** 2)
-    assert used < solution.loss_history.min() < 1.1 * noise
+    assert used < solution.record.loss_history.min() < 1.1 * noise
 
 
 def test_a_frozen_sky_gives_the_true_gains(quiet):
     sky = in_the_span(quiet)
     data = gain_products(quiet.gains, quiet.antennas) * sky
-    adamax = FirstOrder(Optimizer("adamax", 0.01, "cosine", 1e-4, 2000), precision="double")
-    for solver, limit in ((GaussNewton(), 1e-5), (Lbfgs(tolerance=1e-9), 1e-3), (adamax, 1e-3)):
-        problem = quiet.problem(visibilities=data, sky_model=sky, frozen=True)
-        solution = solve(problem, solver)
+    problem = quiet.problem(visibilities=data, sky_model=sky, frozen=True)
+    for solution, limit in ((solve(problem, GaussNewton()), 1e-5), (descended(problem, 1000), 1e-3)):
         assert product_error(problem, solution) < limit
         assert np.abs(solution.model - sky).max() < 1e-12 * np.abs(sky).max()
         turned = solution.gains * np.exp(-1j * np.angle(np.sum(solution.gains * quiet.gains.conj(), axis=0)))
@@ -166,7 +107,7 @@ def test_joint_solves_share_gains_and_lose_less_of_the_noise():
     toys = [make_toy(positions, seed=seed) for seed in (1, 2, 3)]
     toys = [replace(toy, gains=toys[0].gains) for toy in toys]
     solution = solve(joint_problem(toys), GaussNewton())
-    assert solution.status == "converged", solution.message
+    assert solution.record.status == "converged", solution.record.message
     assert solution.gains.shape == toys[0].gains.shape
     products = np.tile(gain_products(solution.gains, toys[0].antennas), (3, 1))
     true = np.tile(gain_products(toys[0].gains, toys[0].antennas), (3, 1))
@@ -224,9 +165,9 @@ def test_gaps_in_frequency_are_flagged_channels(toy):
         initial_gains=np.ones((8, present.sum()), complex),
     )
     part = solve(problem, GaussNewton(tolerance=1e-4))
-    assert part.status == whole.status == "converged", (part.message, whole.message)
+    assert part.record.status == whole.record.status == "converged", (part.record.message, whole.record.message)
     # Sixty steps that bring 1e-4 each end at losses that differ by up to 1e-3, as rounding decides.
-    assert part.loss_history[-1] == pytest.approx(whole.loss_history[-1], rel=1e-2)
+    assert part.record.loss_history[-1] == pytest.approx(whole.record.loss_history[-1], rel=1e-2)
     product = gain_products(part.gains, toy.antennas) * part.model
     expected = (gain_products(whole.gains, toy.antennas) * whole.model)[:, present]
     # A tenth of the noise, which is 1e-3 of the foregrounds.
@@ -239,19 +180,10 @@ def test_gains_prior_keeps_the_size_of_the_first_gains(toy):
     assert np.exp(np.mean(np.log(np.abs(solution.gains)))) == pytest.approx(1.7, rel=1e-9)
 
 
-def test_warm_start_of_lbfgs(converged):
-    """It begins where it is told to, and does not leave the minimum."""
-    problem, best = converged
-    again = solve_warm(problem, Lbfgs(), WarmStart(best.gains, None))[0]
-    assert again.status == "converged"
-    assert again.loss_history[0] == pytest.approx(best.loss_history[-1], rel=1e-6)
-    assert 0.95 * best.loss_history[-1] < again.loss_history[-1] <= again.loss_history[0]
-
-
 def test_wide_delays_leave_gains_free():
-    assert gain_vectors(FREQUENCIES, 2e-6, 1e-12).shape == (64, 64)
-    assert gain_vectors(FREQUENCIES, 200e-9, 1e-12).shape[1] < 40
-    assert dpss_vectors(64, 64 * 400e3 * 200e-9, 1e-12).shape[0] == 64
+    assert gain_vectors(FREQUENCIES, 2e-6).shape == (64, 64)
+    assert gain_vectors(FREQUENCIES, 200e-9).shape[1] < 40
+    assert dpss_vectors(64, 64 * 400e3 * 200e-9).shape[0] == 64
 
 
 def test_a_partly_flagged_baseline_does_not_slow_the_default_solver(toy):
@@ -265,11 +197,11 @@ def test_a_partly_flagged_baseline_does_not_slow_the_default_solver(toy):
     flags[11, 50:] = True
     problem = toy.problem(weights=flag_weights(flags))
     solution = solve(problem, GaussNewton())
-    assert solution.status == "converged", solution.message
-    assert solution.newton_decrement < GaussNewton().tolerance
+    assert solution.record.status == "converged", solution.record.message
+    assert solution.record.newton_decrement < GaussNewton().tolerance
     products = gain_products(toy.gains, toy.antennas)
-    assert solution.loss_history[-1] < np.sum(problem.weights * np.abs(products * toy.noise) ** 2)
+    assert solution.record.loss_history[-1] < np.sum(problem.weights * np.abs(products * toy.noise) ** 2)
     # All that many more steps bring is the 5 % of the noise that such directions hold.
     patient = solve(problem, GaussNewton(tolerance=1e-4, max_steps=500))
-    assert patient.status == "converged", patient.message
-    assert solution.loss_history[-1] < 1.05 * patient.loss_history[-1]
+    assert patient.record.status == "converged", patient.record.message
+    assert solution.record.loss_history[-1] < 1.05 * patient.record.loss_history[-1]

@@ -8,24 +8,22 @@ import numpy as np
 import pytest
 import tensorflow as tf
 from test_calibration_loss import redundant_structure
-from test_joint_basis import block_diagonal
 from toy import FREQUENCIES, HEX, complex_normal, make_toy
 
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import gain_vectors
-from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import flag_weights
 from calstudy.calibrate.projection import Projector
-from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.preconditioners import (
     antenna_blocks,
     antenna_inverse,
     channel_inverse,
+    conjugate_gradients,
     coordinate_inverse,
     coupled_blocks,
     coupled_inverse,
 )
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.tensors import FitTensors, GainSpace
 
 DAMPING = 1e-4
 
@@ -59,11 +57,9 @@ def dense_preconditioner(blocks, antenna):
     return np.diag((1 + DAMPING) * degrees) - lift @ absorbed @ lift.T
 
 
-@pytest.fixture(scope="module", params=["per-baseline", "joint", "few-at-once", "flagged"])
+@pytest.fixture(scope="module", params=["per-baseline", "few-at-once", "flagged"])
 def blocks(request, toy):
     problem = toy.problem()
-    if request.param == "joint":
-        problem = toy.problem(block_diagonal(toy.structure))
     if request.param == "few-at-once":
         problem = toy.problem(replace(toy.structure, models_at_once=5))
     if request.param == "flagged":
@@ -112,7 +108,7 @@ def test_preconditioned_blocks_are_nearly_one(blocks):
 
 def test_inverse_for_smooth_gains_is_that_of_the_reduced_matrix(blocks):
     _, _, gains, found = blocks
-    space = GainSpace(gain_vectors(FREQUENCIES, 100e-9, 1e-9), tf.float32)
+    space = GainSpace(gain_vectors(FREQUENCIES, 100e-9), tf.float32)
     columns = space.columns(pairs.to_pair(gains, tf.float32))
     values = complex_normal(np.random.default_rng(5), (gains.shape[0], columns.shape[-1]))
     inverse = coordinate_inverse(found, columns, tf.constant(DAMPING))

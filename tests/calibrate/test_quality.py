@@ -13,9 +13,8 @@ from toy import make_toy, scattered
 
 from calstudy.base.errors import InputError
 from calstudy.calibrate import execution
-from calstudy.calibrate.records import CalibrationResult
+from calstudy.calibrate.records import CalibrationResult, make_gains, make_visibilities
 from calstudy.calibrate.sky_model import common_baselines
-from calstudy.calibrate.standard_formats import make_gains, make_visibilities
 from calstudy.measured.quality import assess
 from calstudy.measured.reading import prepare
 from calstudy.measured.selection import Selection, select

@@ -11,7 +11,7 @@ from toy import FREQUENCIES, complex_normal, make_toy, scattered
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube, to_cube
-from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.calibrators.least_squares import SkyBased
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import DpssSmoothing, PolynomialSmoothing, SmoothCal
 from calstudy.calibrate.smoothing import smooth

@@ -6,9 +6,9 @@ from test_calamity import make_uvdata
 from toy import make_toy, scattered
 
 from calstudy.base.observation import Observation
-from calstudy.calibrate.amplitudes import conspicuous, dead_samples
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
+from calstudy.calibrate.weights import conspicuous, dead_samples
 
 LOUD = 14
 

@@ -11,11 +11,10 @@ from toy import make_toy, scattered
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_pairs, to_cube
-from calstudy.calibrate.calibrators.delay_weighted import DelayWeighted
-from calstudy.calibrate.calibrators.sky_based import SkyBased
+from calstudy.calibrate.calibrators.least_squares import DelayWeighted, SkyBased
 from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.preparation import starting_gains
 from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, FlagWeights, ForegroundPrior, SampleWeights
-from calstudy.calibrate.starts import starting_gains
 from calstudy.calibrate.weights import inverse_variances, make_weights
 from calstudy.measured.noise import radiometer_variance, sample_noise
 
@@ -158,22 +157,13 @@ def test_zero_weights_everywhere_are_skipped_solves(toy):
     assert (result.gains.gain_array == 1).all()
 
 
-def test_mostly_flagged_integrations_are_skipped_where_asked(toy):
-    data = make_uvdata(toy, 2)
-    data.flag_array[:20] = True
-    settings = SETTINGS.model_copy(update={"skip_flagged": 0.5})
-    first, second = run_calibrator(settings, data).solutions
-    assert (first.status, second.status) == ("skipped", "converged")
-    assert first.message == "71 % of the samples are flagged, which skip_flagged excludes"
-
-
 def test_starting_at_the_solution_takes_fewer_steps(toy, tmp_path):
     data = make_uvdata(toy, 2)
     result = run_calibrator(ONE_SOLVE, data)
     result.gains.write_calh5(str(tmp_path / "g.calh5"))
     settings = ONE_SOLVE.model_copy(update={"initial_gains": FileStart(kind="file", path=tmp_path / "g.calh5")})
     again = run_calibrator(settings, data)
-    assert again.solutions[0].n_steps < result.solutions[0].n_steps
+    assert again.solutions[0].steps < result.solutions[0].steps
     assert again.solutions[0].loss_history[0] < 1.01 * result.solutions[0].loss_history[-1]
 
 

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from calstudy.base.resources import Cost
 from calstudy.base.units import Length
-from calstudy.calibrate.interface import Calibration, Calibrator, Outcome
+from calstudy.calibrate.interface import Calibration, Calibrator, Solve
 
 
 class KnownGains(Calibrator):
@@ -35,7 +35,7 @@ class KnownGains(Calibrator):
         shape = (observation.n_antennas, observation.n_channels, observation.n_times, observation.n_polarizations)
         channel = np.arange(1, observation.n_channels + 1)[:, None, None]
         gains = np.broadcast_to(self.factor * channel + 0j, shape).copy()
-        outcome = Outcome(status=self.status, message="these are the gains that are known")
+        outcome = Solve(status=self.status, message="these are the gains that are known")
         if self.fault:
             return spoiled(self.fault, observation, assumed, gains, outcome)
         return Calibration(gains=gains, outcomes=outcome)
@@ -62,7 +62,7 @@ def spoiled(fault, observation, assumed, gains, outcome):
     if fault == "model":
         return Calibration(gains=gains, outcomes=outcome, model=assumed.sky_model.visibilities[..., :-1, :])
     if fault == "status":
-        return Calibration(gains=gains, outcomes=Outcome(status="fine", message="all is well"))
+        return Calibration(gains=gains, outcomes=Solve(status="fine", message="all is well"))
     if fault == "outcomes":
         return Calibration(gains=gains, outcomes=[outcome] * 3)
     if fault == "flagged":

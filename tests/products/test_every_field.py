@@ -77,7 +77,6 @@ SAME: dict[str, str] = {
     "PyuvsimEngine.precision": "has one value",
     "MwaEmbeddedBeam.path": "a file, which counts by its content",
     "ForegroundPrior.mean": "follows from the deviations",
-    "ForegroundFit.joint_basis": "a file, which counts by its content",
 }
 """Fields that change no key here, and why."""
 NOT_TRIED = {

@@ -12,7 +12,7 @@ import tensorflow as tf
 
 from calstudy.base.errors import InputError
 from calstudy.calibrate.settings import BasisSettings
-from calstudy.calibrate.solvers.first_order import FirstOrder, Optimizer
+from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.array_layouts.linear import LinearLayout
@@ -48,7 +48,7 @@ def test_the_papers_step_and_ours_descend_alike(realization):
     problem = simulation.problem(0, simulation.structure(), realization)
     step = PaperStep(problem).step
     paper = [float(step()) for _ in range(41)]
-    ours = solve(problem, FirstOrder(Optimizer(max_steps=50), tolerance=0.0)).loss_history
+    ours = solve(problem, Adamax(max_steps=50, tolerance=0.0)).record.loss_history
     ours = ours[:41] / np.mean(np.abs(problem.visibilities) ** 2)
     assert paper[0] == pytest.approx(ours[0], rel=1e-5)
     # The first step goes by the signs of gradients that are rounding, for the start is a minimum in the foregrounds.

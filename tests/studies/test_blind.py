@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from calstudy.base.errors import InputError
-from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest, find_returned, salted
+from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, find_returned, salted
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.studies.blind import BITS, write_recipe

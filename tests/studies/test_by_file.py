@@ -16,8 +16,7 @@ from test_signal_loss import small
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import to_cube
-from calstudy.calibrate.calibrators.by_file import ByFile
-from calstudy.calibrate.exchange import MANIFEST, find_returned, read_manifest
+from calstudy.calibrate.calibrators.given_gains import MANIFEST, ByFile, find_returned, read_manifest
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.assumed import assumed_world

@@ -16,7 +16,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal, read_gains
 from calstudy.base.table import Table, one_line
 from calstudy.base.visibilities import from_cube
-from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest, find_returned, read_manifest
+from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, find_returned, read_manifest
 from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.instrument.telescope import make_template
 from calstudy.measured.reading import read_metadata, read_visibilities

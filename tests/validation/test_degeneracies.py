@@ -10,8 +10,8 @@ from observations import small_instrument
 
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube
-from calstudy.calibrate.calibrators.calamity import Calamity
-from calstudy.calibrate.structure import make_structure
+from calstudy.calibrate.calibrators.least_squares import Calamity
+from calstudy.calibrate.problem import make_structure
 from calstudy.corrupt.levels import rms
 from calstudy.instrument.telescope import make_template
 from calstudy.validation.single_integration import SingleIntegration

@@ -19,8 +19,8 @@ from pydantic import Field
 from calstudy.base.observation import Frame
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.units import Frequency
-from calstudy.calibrate.calibrators._other_packages import Measured, OtherPackage
-from calstudy.calibrate.interface import Outcome
+from calstudy.calibrate.calibrators.other_packages import Measured, OtherPackage
+from calstudy.calibrate.interface import Solve
 from calstudy.instrument.size import Size
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Ddecal(OtherPackage):
 
     def solve(
         self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Outcome]]:
+    ) -> tuple[np.ndarray, list[Solve]]:
         """Solve every group of integrations."""
         if start is not None:
             measured = measured.weighted_by(start, groups)
@@ -82,7 +82,7 @@ class Ddecal(OtherPackage):
             shape = (measured.frame.n_antennas, measured.frame.n_channels, len(groups))
             if ended.returncode != 0:
                 last = (ended.stdout.strip().splitlines() or ["it said nothing"])[-1]
-                outcome = Outcome(status="failed", message=f"DP3 ended with exit code {ended.returncode}: {last}")
+                outcome = Solve(status="failed", message=f"DP3 ended with exit code {ended.returncode}: {last}")
                 return np.full(shape, np.nan, complex), [outcome] * len(groups)
             gains = _read_gains(folder / "gains.h5")[..., : len(groups)]
         # A solution without data is one, NaN, or a copy of the previous solution.
@@ -124,7 +124,7 @@ class Ddecal(OtherPackage):
             cwd=folder,
         )
 
-    def _outcomes(self, output: str, n_groups: int) -> list[Outcome]:
+    def _outcomes(self, output: str, n_groups: int) -> list[Solve]:
         """Read from DP3's output how the solves ended."""
         found = re.search(r"Iterations taken: \[([\d,]+)\]", output)
         if found is None:
@@ -133,10 +133,10 @@ class Ddecal(OtherPackage):
         for steps in [int(text) for text in found[1].split(",")][:n_groups]:
             if steps > self.max_steps:
                 message = f"not converged after {self.max_steps} steps"
-                outcomes.append(Outcome(status="max-steps", message=message, steps=self.max_steps))
+                outcomes.append(Solve(status="max-steps", message=message, steps=self.max_steps))
             else:
                 message = f"gains changed by less than {self.tolerance:g}"
-                outcomes.append(Outcome(status="converged", message=message, steps=steps))
+                outcomes.append(Solve(status="converged", message=message, steps=steps))
         return outcomes
 
 

@@ -12,9 +12,9 @@ from calstudy.base.observation import Frame
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import fault
 from calstudy.base.units import Length
-from calstudy.calibrate.calibrators._other_packages import FEED, POL, Measured, OtherPackage, patterns
+from calstudy.calibrate.calibrators.other_packages import FEED, POL, Measured, OtherPackage, patterns
 from calstudy.calibrate.degeneracy import fix_phase
-from calstudy.calibrate.interface import Outcome
+from calstudy.calibrate.interface import Solve
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.settings import FlagWeights, GainWeights
 from calstudy.instrument.layouts import RedundantGroups, redundant_groups
@@ -88,7 +88,7 @@ class Redcal(OtherPackage):
 
     def solve(
         self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Outcome]]:
+    ) -> tuple[np.ndarray, list[Solve]]:
         """Solve every integration by itself, and average gains that integrations share, with aligned phases."""
         if start is not None:
             return self._solve_again(measured, groups, start)
@@ -105,7 +105,7 @@ class Redcal(OtherPackage):
 
     def _solve_again(
         self, measured: Measured, groups: list[slice], start: np.ndarray
-    ) -> tuple[np.ndarray, list[Outcome]]:
+    ) -> tuple[np.ndarray, list[Solve]]:
         """Solve data divided by the gains of the previous pass, with the weights of unity gains.
 
         These weights are equal if nothing is flagged, which logcal needs for its speed.
@@ -117,25 +117,25 @@ class Redcal(OtherPackage):
         gains, outcomes = self.solve(replace(measured, visibilities=visibilities), groups)
         return gains * known, outcomes
 
-    def _outcome(self, status: np.ndarray, steps: np.ndarray) -> Outcome:
+    def _outcome(self, status: np.ndarray, steps: np.ndarray) -> Solve:
         """Return how a solve ended, from the status of its channels in `_Redundant.solve`."""
         marks, longest = set(status.ravel()), int(steps.max())
         count = {mark: int(np.sum(status == mark)) for mark in ("max-steps", "stalled", "failed")}
         if not marks & {"converged", "max-steps", "stalled"}:
             message = "redundant baselines that are not flagged do not tie the antennas to each other in any channel"
-            return Outcome(status="failed", message=message)
+            return Solve(status="failed", message=message)
         if count["max-steps"]:
             message = f"omnical did not converge within {self.max_steps} steps in {count['max-steps']} channels"
-            return Outcome(status="max-steps", message=message, steps=longest)
+            return Solve(status="max-steps", message=message, steps=longest)
         if count["stalled"] or count["failed"]:
             message = (
                 f"omnical found nothing better in {count['stalled']} channels before it converged, and "
                 f"{count['failed']} without a solution are flagged"
             )
-            return Outcome(status="stalled", message=message, steps=longest)
+            return Solve(status="stalled", message=message, steps=longest)
         if "omnical" not in self.steps:
-            return Outcome(status="converged", message=f"{', '.join(self.steps)}: linear fits, without iteration")
-        return Outcome(status="converged", message=f"omnical changed by less than {self.tolerance:g}", steps=longest)
+            return Solve(status="converged", message=f"{', '.join(self.steps)}: linear fits, without iteration")
+        return Solve(status="converged", message=f"omnical changed by less than {self.tolerance:g}", steps=longest)
 
 
 def _average(gains: np.ndarray) -> np.ndarray:

@@ -26,11 +26,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.projection import Projection
-from calstudy.calibrate.solvers.interface import Estimate, Verdict, WarmStart
+from calstudy.calibrate.records import Solve
+from calstudy.calibrate.solvers.interface import WarmStart
 from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, CoupledBlocks, Inverse
 from calstudy.calibrate.solvers.reduced import (
     ROUNDING_LOSS,
@@ -45,17 +48,17 @@ CHANNEL_STEPS = 2
 # With a larger damping, no step is small enough to lower the loss.
 MAX_DAMPING = 1e4
 # Factor on the damping once eigenvalues below it matter.
-CHECK = 1e-2
-# In the curved valleys that follow: what the damping is raised and lowered by; the length of an acceleration, relative
-# to its step, with which a step is too long; what a step gains of what it promises if the next is to be shorter, or may
-# be longer.
-RAISE = 3.0
-LOWER = 1.5
+CHECK_DAMPING = 1e-2
+# In the curved valleys that follow: factors by which the damping is raised and lowered; the length of an acceleration,
+# relative to its step, above which the step is too long; and the decrease of the loss, relative to the predicted one,
+# below which the next step is to be shorter, and above which it may be longer.
+RAISE_DAMPING = 3.0
+LOWER_DAMPING = 1.5
 TOO_CURVED = 0.6
-POOR, GOOD = 0.25, 0.75
-# What of the loss may be predicted to go in directions that single precision does not resolve: small arrays with little
-# noise often stop some parts in a thousand above the minimum.
-UNRESOLVED = 1e-2
+POOR_STEP, GOOD_STEP = 0.25, 0.75
+# Relative decrease of the loss that may be predicted in directions that single precision does not resolve: small arrays
+# with little noise often stop some parts in a thousand above the minimum.
+UNRESOLVED_DECREASE = 1e-2
 # Antenna blocks that need more iterations than this are out of date.
 CG_REFRESH = 15
 
@@ -84,7 +87,7 @@ class GaussNewtonState:
     boost
         Factor on the damping; grows whenever a step did not lower the loss.
     relief
-        Another factor, of one or of `CHECK`.
+        Another factor, of one or of `CHECK_DAMPING`.
     checked
         Whether the prediction comes from a check of convergence.
     preconditioner
@@ -215,27 +218,27 @@ class GaussNewton:
         # small does not predict the next.
         return state if boosted else replace(state, predicted=step.promised)
 
-    def terminate(self, state: GaussNewtonState) -> Verdict | None:
+    def terminate(self, state: GaussNewtonState) -> Solve | None:
         """Decide by the predicted decrease of the loss in the next step."""
         loss, n_steps = state.history[-1], len(state.history) - 1
         if not math.isfinite(loss):
-            return Verdict("failed", "the loss at the first gains is not finite")
+            return Solve("failed", "the loss at the first gains is not finite")
         if loss < self._rounding:
-            return Verdict("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
+            return Solve("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
         if self._settled(state) and (state.checked or not (state.beyond_single or state.curved)):
-            return Verdict("converged", f"the next step would lower the loss by {fall:.1e} of itself")
+            return Solve("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.checked and self.precision == "single":
-            return Verdict(
+            return Solve(
                 "stalled",
                 f"{fall:.1e} of the loss is predicted to go, in directions that single precision does not resolve "
                 "(a solver with 'precision: double' goes on)",
             )
         hint = f"{fall:.1e} of {{}} is predicted to go" if math.isfinite(fall) else ""
         if state.damping > MAX_DAMPING:
-            return Verdict("stalled", f"no step lowers the loss{', though ' + hint.format('it') if hint else ''}")
+            return Solve("stalled", f"no step lowers the loss{', though ' + hint.format('it') if hint else ''}")
         if n_steps >= self.max_steps:
-            return Verdict(
+            return Solve(
                 "max-steps", f"not converged after {n_steps} steps{': ' + hint.format('the loss') if hint else ''}"
             )
         return None
@@ -249,7 +252,7 @@ class GaussNewton:
         """Whether the predicted decrease of the loss, at this damping, is below the tolerance."""
         loss = state.history[-1]
         if state.checked:
-            most = self.tolerance if self.precision == "double" else max(self.tolerance, UNRESOLVED)
+            most = self.tolerance if self.precision == "double" else max(self.tolerance, UNRESOLVED_DECREASE)
             return state.predicted / loss < most
         falling = min(state.decrease_to_come, state.gained / loss)
         return state.predicted / loss < self.tolerance and falling < self.tolerance
@@ -262,7 +265,7 @@ class GaussNewton:
         """Predict the decrease of the loss with a hundredth of the damping, from a solution of the normal equations."""
         if state.kernels.dtype == tf.float32:
             state = _in_double(state, self.precision == "double")
-        state = self._prepared(replace(state, relief=CHECK, boost=1.0))
+        state = self._prepared(replace(state, relief=CHECK_DAMPING, boost=1.0))
         promised = self._plain_step(state).promised
         # A preconditioner that rounding has spoiled predicts no decrease, and is not evidence of convergence.
         return replace(state, predicted=promised if promised > 0 else math.inf, checked=True)
@@ -288,23 +291,24 @@ class GaussNewton:
             # Written so that NaN counts as curved.
             if relative < TOO_CURVED or state.damping > MAX_DAMPING:
                 return state, step._replace(eta=step.eta + 0.5 * acceleration)
-            state = self._prepared(replace(state, boost=RAISE * state.boost))
+            state = self._prepared(replace(state, boost=RAISE_DAMPING * state.boost))
 
     def _refused(self, state: GaussNewtonState, promised: float) -> GaussNewtonState:
         # At the minimum itself no step lowers the loss.
         if state.kernels.by_channel and state.boost == 1 and promised > 0:
             state = replace(state, predicted=promised)
         history = (*state.history, state.history[-1])
-        return self._prepared(replace(state, history=history, boost=(RAISE if state.curved else 10) * state.boost))
+        boost = (RAISE_DAMPING if state.curved else 10) * state.boost
+        return self._prepared(replace(state, history=history, boost=boost))
 
     def losses(self, state: GaussNewtonState) -> Sequence[float]:
         """Return the loss history in the unit of the data squared."""
         return [loss * state.loss_unit for loss in state.history]
 
-    def estimate(self, state: GaussNewtonState) -> Estimate:
+    def estimate(self, state: GaussNewtonState) -> tuple[np.ndarray, np.ndarray]:
         """Return the current gains and their best-fitting foregrounds."""
         model = state.kernels.tensors.unload(state.projection.model, state.scale)
-        return Estimate(pairs.to_complex(state.gains), model)
+        return pairs.to_complex(state.gains), model
 
     def newton_decrement(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
         """Return the predicted relative decrease of the loss; computed anew if the iteration has no prediction."""
@@ -363,9 +367,9 @@ def _one_plus(values: tf.Tensor) -> tf.Tensor:
 
 def _next_boost(boost: float, gain: float) -> float:
     """Return the factor on the damping after a step with `gain` times the predicted decrease of the loss."""
-    if gain < POOR:
-        return RAISE * boost
-    return max(1.0, boost / LOWER) if gain > GOOD else boost
+    if gain < POOR_STEP:
+        return RAISE_DAMPING * boost
+    return max(1.0, boost / LOWER_DAMPING) if gain > GOOD_STEP else boost
 
 
 def _in_double(state: GaussNewtonState, thorough: bool) -> GaussNewtonState:

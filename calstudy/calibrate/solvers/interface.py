@@ -6,28 +6,41 @@ import logging
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from calstudy.calibrate.degeneracy import fix_degeneracies
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
-from calstudy.calibrate.solution import Solution, Status
+from calstudy.calibrate.records import Solve
+from calstudy.calibrate.solvers.reduced import newton_decrement_at
 
 logger = logging.getLogger(__name__)
 
 # A loss that stalls while it could fall by more than this fraction has not converged: fixed learning rates jitter.
-STILL = 0.01
+STALL_LIMIT = 0.01
 # Power of a baseline relative to the strongest one of either of its antennas, below which Gauss-Newton steps in single
 # precision do not resolve it; and the relative power of its residual that is rounding.
-HIDDEN, ROUNDING = 1e-8, 1e-10
+HIDDEN_POWER, ROUNDING_POWER = 1e-8, 1e-10
 
 
-class Estimate(NamedTuple):
-    """Gains (Nants, Nfreqs) and intrinsic model (Nbls, Nfreqs), complex128, in the problem's order and unit."""
+class Solution(NamedTuple):
+    """Gains and foreground model of one integration and polarization, and how the solve ended.
+
+    Attributes
+    ----------
+    gains
+        Shape (Nants, Nfreqs), complex128, dimensionless.
+    model
+        Intrinsic visibilities F, shape (Nbls, Nfreqs), complex128, in the unit of the data.
+    record
+        Its loss is in the unit of the data squared.
+    """
 
     gains: np.ndarray
     model: np.ndarray
+    record: Solve
 
 
 class WarmStart(NamedTuple):
@@ -45,13 +58,6 @@ class WarmStart(NamedTuple):
     memory: Any
 
 
-class Verdict(NamedTuple):
-    """Why an iteration ends: the status and one sentence."""
-
-    status: Status
-    message: str
-
-
 class Solver(Protocol):
     """An iteration over states of its own kind. Solvers hold settings only; everything that changes is in the state."""
 
@@ -65,17 +71,17 @@ class Solver(Protocol):
     def step(self, state: Any) -> Any:
         """Return the next state; some solvers take several of their steps at once."""
 
-    def terminate(self, state: Any) -> Verdict | None:
-        """Return why the iteration ends here, or None if it goes on."""
+    def terminate(self, state: Any) -> Solve | None:
+        """Return the status and the message if the iteration ends here, or None if it goes on."""
 
     def losses(self, state: Any) -> Sequence[float]:
         """Return the loss before the first step and after each, in the unit of the data squared."""
 
-    def estimate(self, state: Any) -> Estimate:
-        """Return the best gains and model so far."""
+    def estimate(self, state: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the best gains and model so far, complex128, in the problem's order and unit."""
 
     def newton_decrement(self, state: Any, problem: CalibrationProblem) -> float:
-        """Return the relative Newton decrement at the estimate (see `Solution`); NaN if unknown."""
+        """Return the relative Newton decrement at the estimate (see `Solve`); NaN if unknown."""
 
     def memory(self, state: Any) -> Any:
         """Return data that the next solve can reuse, or None."""
@@ -91,45 +97,41 @@ def solve_warm(
     initial gains.
     """
     solution, state = _solve(problem, solver, warm)
-    return solution, WarmStart(solution.gains, solver.memory(state)) if solution.usable else None
+    return solution, WarmStart(solution.gains, solver.memory(state)) if solution.record.usable else None
 
 
 def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) -> tuple[Solution, Any]:
     """Return the solution and the solver's last state."""
     started, cpu_started = time.perf_counter(), time.process_time()
     state = solver.init(problem, warm)
-    while (verdict := solver.terminate(state)) is None:
+    while (ended := solver.terminate(state)) is None:
         state = solver.step(state)
     losses = np.array(solver.losses(state), float)
     gains, model = solver.estimate(state)
     newton_decrement = rms = math.nan
-    if verdict.status != "failed":
+    if ended.status != "failed":
         newton_decrement = float(np.clip(solver.newton_decrement(state, problem), 0, 1))
-        if verdict.status == "converged" and newton_decrement > max(STILL, solver.tolerance):
-            message = f"{verdict.message}, but a Gauss-Newton step would lower it by {newton_decrement:.1e} of itself"
-            verdict = Verdict("stalled", message)
-        if verdict.status == "converged" and (hidden := _hidden(gains, model, problem)) is not None:
-            verdict, newton_decrement = Verdict("stalled", hidden), math.nan
+        if ended.status == "converged" and newton_decrement > max(STALL_LIMIT, solver.tolerance):
+            message = f"{ended.message}, but a Gauss-Newton step would lower it by {newton_decrement:.1e} of itself"
+            ended = Solve("stalled", message)
+        if ended.status == "converged" and (hidden := _hidden(gains, model, problem)) is not None:
+            ended, newton_decrement = Solve("stalled", hidden), math.nan
         try:
             gains, model = fix_degeneracies(gains, model, problem)
             rms = decrement_rms(gains, model, problem, newton_decrement)
         except ValueError as error:
-            verdict = Verdict("failed", str(error))
-    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    solution = Solution(
-        gains,
-        model,
-        losses,
-        verdict.status,
-        verdict.message,
-        losses.size - 1,
-        seconds,
-        cpu_seconds,
-        newton_decrement,
-        rms,
+            ended = Solve("failed", str(error))
+    record = replace(
+        ended,
+        steps=losses.size - 1,
+        loss_history=losses,
+        seconds=time.perf_counter() - started,
+        cpu_seconds=time.process_time() - cpu_started,
+        newton_decrement=newton_decrement,
+        decrement_rms=rms,
     )
-    logger.debug("%s after %d steps, %.2f s: %s", solution.status, solution.n_steps, seconds, solution.message)
-    return solution, state
+    logger.debug("%s after %d steps, %.2f s: %s", record.status, record.steps, record.seconds, record.message)
+    return Solution(gains, model, record), state
 
 
 def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> str | None:
@@ -141,7 +143,7 @@ def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -
     strongest = np.zeros(problem.structure.n_antennas)
     for column in antennas.T:
         np.maximum.at(strongest, column, power)
-    weak = (power > 0) & (power < HIDDEN * strongest[antennas].min(axis=1)) & (left > ROUNDING * power)
+    weak = (power > 0) & (power < HIDDEN_POWER * strongest[antennas].min(axis=1)) & (left > ROUNDING_POWER * power)
     if not weak.any():
         return None
     share = math.sqrt(np.max(left[weak] / power[weak]))
@@ -165,3 +167,40 @@ def decrement_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProb
 def solve(problem: CalibrationProblem, solver: Solver) -> Solution:
     """Solve one problem from its initial gains (see `solve_warm`)."""
     return _solve(problem, solver, None)[0]
+
+
+class Checkpoint(NamedTuple):
+    """An intermediate estimate: gains (Nants, Nfreqs) and model (Nbls, Nfreqs), complex128, with degeneracies fixed.
+
+    The decrements are as in `calstudy.calibrate.records.Solve`.
+    """
+
+    n_steps: int
+    gains: np.ndarray
+    model: np.ndarray
+    newton_decrement: float
+    decrement_rms: float
+
+
+def trace(problem: CalibrationProblem, solver: Solver, steps: Sequence[int]) -> list[Checkpoint]:
+    """Run a solver from the problem's initial gains, and return its estimates after given numbers of steps.
+
+    The last estimate is that at the end of the solve. A solver that takes several steps at once gives its estimate
+    after as many steps or more; `Checkpoint.n_steps` is their number. Raises ValueError if an estimate has no positive
+    scale (see `calstudy.calibrate.degeneracy.model_scale`).
+    """
+    state = solver.init(problem)
+    due = sorted(set(steps))
+    found: list[Checkpoint] = []
+    while True:
+        done = len(solver.losses(state)) - 1
+        ended = solver.terminate(state) is not None
+        if ended or (due and done >= due[0]):
+            due = [step for step in due if step > done]
+            gains, model = fix_degeneracies(*solver.estimate(state), problem)
+            newton_decrement = min(max(newton_decrement_at(problem, gains), 0.0), 1.0)
+            rms = decrement_rms(gains, model, problem, newton_decrement)
+            found.append(Checkpoint(done, gains, model, newton_decrement, rms))
+        if ended:
+            return found
+        state = solver.step(state)

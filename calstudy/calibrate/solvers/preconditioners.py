@@ -23,6 +23,7 @@ the span of Q, for gains of any antennas, and is K on its complement.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -30,6 +31,7 @@ import scipy.linalg
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate.batches import Piece, column_products, joined
+from calstudy.calibrate.pairs import inner_product
 from calstudy.calibrate.projection import Linearization, Projection, Projector
 from calstudy.calibrate.tensors import Ends, FitTensors
 
@@ -302,3 +304,37 @@ def _inverse(matrices: tf.Tensor) -> tf.Tensor:
     """Invert positive definite matrices, (..., N, N)."""
     identity = tf.eye(tf.shape(matrices)[-1], batch_shape=tf.shape(matrices)[:-2], dtype=matrices.dtype)
     return tf.linalg.cholesky_solve(tf.linalg.cholesky(matrices), identity)
+
+
+Operator = Callable[[tf.Tensor], tf.Tensor]
+
+
+def conjugate_gradients(
+    operator: Operator, preconditioner: Operator, right_side: tf.Tensor, tolerance: tf.Tensor, max_iterations: tf.Tensor
+) -> tuple[tf.Tensor, tf.Tensor]:
+    """Solve ``operator(x) = right_side`` from zero; both operators must be symmetric and positive definite.
+
+    Iterations stop when the residual's squared norm, in the metric of the preconditioner, has fallen by the factor
+    `tolerance`, or at `max_iterations`, an int32 scalar. Returns the solution and the number of iterations.
+    """
+    first = preconditioner(right_side)
+    squared = inner_product(right_side, first)
+
+    def unfinished(
+        iteration: tf.Tensor, _x: tf.Tensor, _residual: tf.Tensor, _direction: tf.Tensor, rho: tf.Tensor
+    ) -> tf.Tensor:
+        return (iteration < max_iterations) & (rho > tolerance * squared)
+
+    def body(
+        iteration: tf.Tensor, x: tf.Tensor, residual: tf.Tensor, direction: tf.Tensor, rho: tf.Tensor
+    ) -> tuple[tf.Tensor, ...]:
+        image = operator(direction)
+        length = rho / inner_product(direction, image)
+        x, residual = x + length * direction, residual - length * image
+        conditioned = preconditioner(residual)
+        new_rho = inner_product(residual, conditioned)
+        return iteration + 1, x, residual, conditioned + new_rho / rho * direction, new_rho
+
+    start = (tf.constant(0), tf.zeros_like(right_side), right_side, first, squared)
+    iterations, x, *_ = tf.while_loop(unfinished, body, start)
+    return x, iterations

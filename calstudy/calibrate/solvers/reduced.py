@@ -23,12 +23,9 @@ import numpy as np
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
-from calstudy.calibrate.frozen_foregrounds import FrozenForegrounds
-from calstudy.calibrate.gain_space import GainSpace
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
-from calstudy.calibrate.projection import Projection, Projector
+from calstudy.calibrate.projection import Linearization, Projection, Projector
 from calstudy.calibrate.settings import MOST_COUPLED
-from calstudy.calibrate.solvers.conjugate_gradients import conjugate_gradients
 from calstudy.calibrate.solvers.preconditioners import (
     AntennaBlocks,
     CoupledBlocks,
@@ -37,11 +34,12 @@ from calstudy.calibrate.solvers.preconditioners import (
     antenna_degrees,
     antenna_inverse,
     channel_inverse,
+    conjugate_gradients,
     coordinate_inverse,
     coupled_blocks,
     coupled_inverse,
 )
-from calstudy.calibrate.tensors import FitTensors
+from calstudy.calibrate.tensors import BaselineProducts, FitTensors, GainSpace
 
 MOST_DAMPING = 1e-2
 CG_TOLERANCE = 1e-3
@@ -53,6 +51,36 @@ CG_COUPLED_TOLERANCE = 1e-8
 # double precision 3e-10: gains that matter less are nearly degenerate with foregrounds to rounding.
 ROUNDING_LOSS = 1e-15
 ROUNDING_LOSS_IN_DOUBLE = 1e-19
+
+
+class FrozenForegrounds:
+    """Replacement of `calstudy.calibrate.projection.Projector` for known foregrounds.
+
+    Because foregrounds do not respond, the Gauss-Newton matrix does not couple channels.
+    """
+
+    def __init__(self, tensors: FitTensors, dtype: tf.DType = tf.float32) -> None:
+        self.tensors, self.dtype, self._products = tensors, dtype, BaselineProducts(tensors)
+        self.project = tf.function(self._project, autograph=False)
+
+    def _project(self, gains: tf.Tensor, visibilities: tf.Tensor, weights: tf.Tensor, model: tf.Tensor) -> Projection:
+        loss, descent = self._products.residual(gains, self.tensors.ends, visibilities, weights, model)
+        curvature = self._products.curvature(gains, self.tensors.ends, weights)
+        part = Linearization(tf.cast(curvature, self.dtype), tf.cast(model, self.dtype), ())
+        return Projection(loss, (model,), descent, (part,))
+
+    def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return the Gauss-Newton matrix of the gains alone times eta, shape (2, Nants, Nfreqs)."""
+        (part,), ends = projection.parts, self.tensors.ends
+        change = self._products.change(eta, ends, part.curvature, part.model)
+        return self._products.pull(change, None, ends, part.curvature, part.model)
+
+    def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return the same as `Projector.curvature_descent`, with fixed foregrounds."""
+        (part,), ends = projection.parts, self.tensors.ends
+        second = pairs.multiply(part.model, ends.relative_change(eta))
+        change = self._products.change(eta, ends, part.curvature, second)
+        return -self._products.pull(change, None, ends, part.curvature, part.model)
 
 
 class Dampings(NamedTuple):
@@ -159,7 +187,7 @@ class ReducedKernels:
         self.tensors = FitTensors(structure)
         self.structure, self.frozen, self.dtype = structure, frozen, dtype
         finite = structure.prior != "none" and not frozen
-        self.by_channel = ((self.tensors.coupled and not finite) or frozen) and structure.gain_vectors is None
+        self.by_channel = ((self.tensors.shared and not finite) or frozen) and structure.gain_vectors is None
         self.dampings = (FINITE if finite else FREE)[dtype]
         self.projector = (
             FrozenForegrounds(self.tensors, dtype) if frozen else Projector(structure, self.tensors, dtype, thorough)
@@ -180,7 +208,7 @@ class ReducedKernels:
         if isinstance(self.projector, FrozenForegrounds):
             return False
         rows = 2 * self.tensors.n_antennas * self.projector.common.shape[1]
-        alone = not self.tensors.coupled and self.structure.prior != "both"
+        alone = not self.tensors.shared and self.structure.prior != "both"
         return alone and self.structure.gain_vectors is None and rows <= MOST_COUPLED
 
     def in_double(self, thorough: bool) -> ReducedKernels:
@@ -249,7 +277,7 @@ class ReducedKernels:
         """Return eta for a descent direction, both (2, Nants, Nfreqs), and the number of iterations.
 
         `descent` is minus half the gradient in eta; for tolerance and iterations see
-        `calstudy.calibrate.solvers.conjugate_gradients.conjugate_gradients`.
+        `calstudy.calibrate.solvers.preconditioners.conjugate_gradients`.
         """
         projection = equations.projection
         diagonal = equations.damping * antenna_degrees(self.tensors, projection)
@@ -307,7 +335,7 @@ _kernels = lru_cache(maxsize=6)(ReducedKernels)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
-    """Return the relative Newton decrement of the reduced problem at gains (Nants, Nfreqs) (see `Solution`)."""
+    """Return the relative Newton decrement of the reduced problem at gains (Nants, Nfreqs) (see `Solve`)."""
     kernels = compiled(problem.structure, problem.frozen)
     reduced = kernels.reduce(problem, gains)
     projection = kernels.project(reduced.gains, *reduced.data)

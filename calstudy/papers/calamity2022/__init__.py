@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import BaseModel
 
-from calstudy.calibrate.settings import FirstOrderSettings, FlagWeights, GainFit, Solver
+from calstudy.calibrate.settings import AdamaxSettings, FlagWeights, GainFit, Solver
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.settings import NoNoise, RadiometerNoise
 from calstudy.instrument.as_built import AsBuilt
@@ -205,7 +205,7 @@ def _solver(experiment: Experiment) -> Solver | None:
 def _too_few_steps(role: str, experiment: Experiment) -> str | None:
     del role
     solver = _solver(experiment)
-    if isinstance(solver, FirstOrderSettings) and solver.max_steps < LEAST_STEPS:
+    if isinstance(solver, AdamaxSettings) and solver.max_steps < LEAST_STEPS:
         return f"calibration.solver.max_steps is {solver.max_steps}, and {solver.name} takes thousands of steps"
     return None
 
@@ -213,8 +213,7 @@ def _too_few_steps(role: str, experiment: Experiment) -> str | None:
 def _other_solver(experiment: Experiment) -> str | None:
     """Return a refusal of a solver unlike the authors' code: fixed rate, last gains, steps or rule to stop."""
     solver = _solver(experiment)
-    papers = ("adamax", PAPER_RATE, "constant")
-    if not isinstance(solver, FirstOrderSettings) or (solver.name, solver.learning_rate, solver.schedule) != papers:
+    if not isinstance(solver, AdamaxSettings) or solver.learning_rate != PAPER_RATE:
         return f"calibration.solver is not the paper's (adamax at a constant rate of {PAPER_RATE})"
     for name, wanted in (("keep", "last"), ("precision", "single"), ("warm_start", False)):
         if getattr(solver, name) != wanted:

@@ -293,9 +293,8 @@ class Comparison(Family):
 
 def _what_is_made(experiment: Experiment) -> Experiment:
     """Return an experiment without the settings of products that only its own run makes."""
-    return experiment.model_copy(update={"outputs": experiment.outputs.reset("store", "runs", "figures")}).reset(
-        "scales", "name", "description", "papers"
-    )
+    outputs = experiment.outputs.with_defaults("store", "runs", "figures")
+    return experiment.model_copy(update={"outputs": outputs}).with_defaults("scales", "name", "description", "papers")
 
 
 def load_worlds(

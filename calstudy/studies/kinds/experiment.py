@@ -227,8 +227,8 @@ class Family(Study):
 
 def content_of(experiment: Experiment) -> Any:
     """Return the content that decides the run folder of an experiment."""
-    outputs = experiment.outputs.reset("store", "runs")
-    return identity(experiment.model_copy(update={"outputs": outputs}).reset("scales"))
+    outputs = experiment.outputs.with_defaults("store", "runs")
+    return identity(experiment.model_copy(update={"outputs": outputs}).with_defaults("scales"))
 
 
 def study_of(experiment: Experiment) -> Study:

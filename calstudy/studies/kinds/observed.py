@@ -11,8 +11,8 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
-from calstudy.calibrate.calibrators.by_file import ByFile
-from calstudy.calibrate.calibrators.calamity import Calamity
+from calstudy.calibrate.calibrators.given_gains import ByFile
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.experiment.files import StudyFile, checked
@@ -104,8 +104,8 @@ class ObservedStudy(Study):
     @property
     def content(self) -> Any:
         """The content of the file without scales and the folders of outputs."""
-        outputs = self.file.outputs.reset("store", "runs")
-        return identity(self.file.model_copy(update={"outputs": outputs}).reset("scales"))
+        outputs = self.file.outputs.with_defaults("store", "runs")
+        return identity(self.file.model_copy(update={"outputs": outputs}).with_defaults("scales"))
 
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study itself and the number of workers.

@@ -153,7 +153,7 @@ class BasinOfConvergence(SingleIntegrationStep):
             writer.writerow(COLUMNS)
             for cell in cells:
                 record, misfit = fits[cell]
-                writer.writerow([*cell, record.status, record.n_steps, misfit, record.message])
+                writer.writerow([*cell, record.status, record.steps, misfit, record.message])
         save_figure(draw_basin(basin), figure_arrays(basin), output, "basin")
         return Findings(_findings(basin), _remarks(basin))
 

@@ -88,7 +88,7 @@ class Degeneracies(SingleIntegrationStep):
             fitted[kind] = rms(change) / rms(visibilities)
             record = moved.solutions[0]
             remarks.append(
-                f"{kind}: exact {exact[kind]:.1e}, fitted {fitted[kind]:.1e} ({record.status}, {record.n_steps} steps)"
+                f"{kind}: exact {exact[kind]:.1e}, fitted {fitted[kind]:.1e} ({record.status}, {record.steps} steps)"
             )
         remarks.append(f"noise {integration.noise_std / rms(visibilities):.1e} of the data")
         values = {"exact": max(exact.values()), "fitted": max(fitted.values())}

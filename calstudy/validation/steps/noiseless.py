@@ -54,5 +54,5 @@ class Noiseless(SingleIntegrationStep):
             result = integration.calibrate(visibilities, settings)
             values[precision] = Finding(rms(integration.misfit(result, visibilities)) / rms(visibilities), 0.0)
             record = result.solutions[0]
-            remarks.append(f"{precision}: {record.status} after {record.n_steps} steps: {record.message}")
+            remarks.append(f"{precision}: {record.status} after {record.steps} steps: {record.message}")
         return Findings(values, tuple(remarks))

@@ -1,23 +1,23 @@
-"""Base class of the calibrators that minimize w |V - g_a g_b* F|^2."""
+"""Calibrators that minimize w |V - g_a g_b* F|^2: gains alone, or gains and foregrounds under some prior."""
 
 from __future__ import annotations
 
-from typing import Self
+from typing import ClassVar, Self
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.quiet import require_tensorflow
 from calstudy.base.resources import Cost
 from calstudy.calibrate.cost import LEAST_MODELS, Dimensions, solve_cost, solve_memory
-from calstudy.calibrate.interface import Assumed, Calibration, Outline, Progress
-from calstudy.calibrate.settings import ForegroundFit, GainFit
+from calstudy.calibrate.interface import Assumed, Calibration, Progress, SolvePlan
+from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, GainFit, GaussNewtonSettings, ScalePrior, Solver
 from calstudy.instrument.size import Size
 
 CROWDED = 0.9
 """Number of unknowns per sample from which a fit can absorb any data."""
 
 
-class LeastSquares(GainFit):
+class _LeastSquares(GainFit):
     """A fit of gains, and of foregrounds where there is a basis for them."""
 
     @property
@@ -31,7 +31,7 @@ class LeastSquares(GainFit):
         """Return the cost of the solves, within a factor of about two, as if no baselines shared a foreground model."""
         return solve_cost(self, size)
 
-    def leaner(self) -> Self | None:
+    def with_less_memory(self) -> Self | None:
         """Return the calibrator with half as many foreground models at a time."""
         if not isinstance(self, ForegroundFit) or self.models_at_once <= LEAST_MODELS:
             return None
@@ -54,10 +54,9 @@ class LeastSquares(GainFit):
             return str(error).removeprefix("calibration.")
         return None
 
-    def outline(self, frame: Frame) -> Outline:
+    def plan(self, frame: Frame) -> SolvePlan:
         """Return the cost of a solve of these baselines, with a note if it has too many unknowns."""
-        from calstudy.calibrate.problem import fitted_baselines
-        from calstudy.calibrate.structure import make_structure, repeat_structure
+        from calstudy.calibrate.problem import fitted_baselines, make_structure, repeat_structure
 
         frame = frame.baselines(fitted_baselines(frame, self.autos))
         structure = make_structure(frame, self)
@@ -65,7 +64,7 @@ class LeastSquares(GainFit):
         memory = solve_memory(Dimensions.of(repeat_structure(structure, together)), self)
         cost = Cost(solve_cost(self, Size.of_frame(frame)).seconds, memory)
         if self.frozen:
-            return Outline(cost)
+            return SolvePlan(cost)
         coefficients = structure.basis.n_coefficients
         unknowns = coefficients + structure.n_antennas * structure.n_frequencies
         samples = structure.n_baselines * structure.n_frequencies
@@ -75,7 +74,7 @@ class LeastSquares(GainFit):
                 f"The fit has {unknowns} unknowns for {samples} samples, so that it can absorb anything: expect slow "
                 "convergence, and no residual; use a smaller basis.min_delay or --buffer, or --redundant.",
             )
-        return Outline(cost, f"{coefficients} foreground coefficients each", notes)
+        return SolvePlan(cost, f"{coefficients} foreground coefficients each", notes)
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Solve every integration or group of them, and every polarization."""
@@ -85,21 +84,60 @@ class LeastSquares(GainFit):
 
 
 def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
-    """Raise InputError if the channels cannot hold the foreground basis of the longest baseline.
-
-    Also if joint groups cannot be read or do not fit the array; the longest baseline is then that of the others.
-    """
+    """Raise InputError if the channels cannot hold the foreground basis of the longest baseline."""
     from calstudy.calibrate.basis import require_room
-    from calstudy.calibrate.joint import other_baselines, place_groups, read_joint_groups
 
-    lengths = frame.lengths
-    if settings.joint_basis is not None:
-        placed = place_groups(read_joint_groups(settings.joint_basis.path), frame.pairs, frame.n_channels)
-        lengths = lengths[other_baselines(placed, lengths.size)]
-        if lengths.size == 0:
-            return
-    longest = lengths.max()
+    longest = frame.lengths.max()
     try:
         require_room(longest, frame.frequencies, settings.basis)
     except InputError as error:
         raise InputError(f"{error} (the longest baseline has {longest:.0f} m)") from None
+
+
+class Calamity(_LeastSquares, ForegroundFit):
+    """Gains are fitted together with a smooth foreground model of each baseline (paper Eq. LOGLIKELIHOOD)."""
+
+    calibrator: str = "calamity"
+
+
+class CalamityRedundant(_LeastSquares, ForegroundFit):
+    """Gains are fitted with a smooth foreground model of each redundant group (paper Eq. LOGLIKELIHOODREDUNDANT)."""
+
+    calibrator: str = "calamity-redundant"
+    foreground_prior: ForegroundPrior = ForegroundPrior(deviation=0.0, shared_deviation="infinite")
+
+
+class SkyBased(_LeastSquares):
+    """Only gains are fitted; the sky model is taken as the true foregrounds."""
+
+    calibrator: str = "sky-based"
+
+    def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
+        """Return a sentence if there is no sky model, or nothing to fit."""
+        return super().refusal(frame, True) if has_sky_model else "needs a sky model, and there is none"
+
+
+class DelayWeighted(_LeastSquares, ForegroundFit):
+    """Gains are fitted with a sky model whose errors, of known size, fill the modelled delays of each baseline."""
+
+    # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
+    # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
+    version: ClassVar[int] = 3
+    calibrator: str = "delay-weighted"
+    foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
+    prior: ScalePrior = "sky-model"
+    # At the default tolerance the foreground residual exceeds the EoR near the wedge.
+    solver: Solver = GaussNewtonSettings(tolerance=1e-5)
+
+
+class Unified(_LeastSquares, ForegroundFit):
+    """Gains are fitted with a sky model whose errors are common to redundant baselines, but for a smaller part."""
+
+    # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
+    # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
+    version: ClassVar[int] = 3
+    calibrator: str = "unified"
+    foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
+    prior: ScalePrior = "sky-model"
+    # At the default tolerance the foreground residual exceeds the EoR near the wedge.
+    solver: Solver = GaussNewtonSettings(tolerance=1e-5)

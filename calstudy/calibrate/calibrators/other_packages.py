@@ -1,4 +1,4 @@
-"""Base class of the calibrators of other packages, which find only gains, from data and a sky model."""
+"""Calibrators of other packages, which find only gains, from data and a sky model; hera_cal's skycal is one."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
-from calstudy.base.resources import Usage
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost, Usage
 from calstudy.calibrate.degeneracy import fix_phase
-from calstudy.calibrate.interface import Assumed, Calibration, Outcome, Progress
+from calstudy.calibrate.interface import Assumed, Calibration, Progress, Solve
 from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
 from calstudy.calibrate.settings import RUNAWAY, GainWeights, WeightedFit, unsettled_message
+from calstudy.instrument.size import Size
 
 # hera_cal wants a name for the polarization; each is calibrated by itself.
 POL, FEED = "nn", "Jnn"
@@ -68,7 +70,7 @@ class OtherPackage(WeightedFit):
     @abstractmethod
     def solve(
         self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Outcome]]:
+    ) -> tuple[np.ndarray, list[Solve]]:
         """Return gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how each solve ended.
 
         The data are of one polarization, with weight in each group of integrations. `start` is None in the first pass.
@@ -78,7 +80,7 @@ class OtherPackage(WeightedFit):
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Solve every polarization, and flag the gains of antennas and channels without data."""
-        from calstudy.calibrate.standard_formats import require_parallel_hands
+        from calstudy.calibrate.records import require_parallel_hands
         from calstudy.calibrate.weights import make_weights
 
         if assumed.sky_model is None:
@@ -92,7 +94,7 @@ class OtherPackage(WeightedFit):
         factors = 1.0 if self.baselines is None else self.baselines.factors(data.lengths)[:, None]
         groups = self.solves(data.n_times)
         gains = np.full((data.n_antennas, data.n_channels, len(groups), data.n_polarizations), np.nan, complex)
-        outcomes: list[Outcome] = []
+        outcomes: list[Solve] = []
         for p in range(data.n_polarizations):
             used = (weights[..., p] > 0) & (sky.visibilities[..., p] != 0) & (data.visibilities[..., p] != 0)
             visibilities = np.where(used, data.visibilities[..., p], 0).astype(complex)
@@ -112,13 +114,13 @@ class OtherPackage(WeightedFit):
             outcomes=outcomes,
         )
 
-    def _solve_timed(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def _solve_timed(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Solve]]:
         """Solve the groups that have data, and skip the others."""
         full = [number for number, times in enumerate(groups) if measured.weights[times].any()]
         shape = (measured.frame.n_antennas, measured.frame.n_channels, len(groups))
         gains = np.full(shape, np.nan, complex)
         message = "every sample is flagged or has no weight"
-        ended = [Outcome(status="skipped", message=message, seconds=0.0, cpu_seconds=0.0)] * len(groups)
+        ended = [Solve(status="skipped", message=message, seconds=0.0, cpu_seconds=0.0)] * len(groups)
         if full:
             with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
                 # These packages divide by zeros, and warn of numbers that they replace themselves.
@@ -133,7 +135,7 @@ class OtherPackage(WeightedFit):
                 )
         return gains, ended
 
-    def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Outcome]]:
+    def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Solve]]:
         """Solve groups; with weights from the gains, repeat with those of the previous pass until they settle."""
         settings, weights = self.weights, measured.weights
         gains, outcomes = self.solve(measured, groups)
@@ -153,7 +155,7 @@ class OtherPackage(WeightedFit):
         return gains, [_in_passes(*ended, passes) for ended in zip(outcomes, changes, unsettled, strict=True)]
 
 
-def _in_passes(outcome: Outcome, change: float, unsettled: bool, passes: int) -> Outcome:
+def _in_passes(outcome: Solve, change: float, unsettled: bool, passes: int) -> Solve:
     """Return an outcome with the number of passes and the last change of the weights."""
     diagnostics = {**outcome.diagnostics, "passes": passes, "weight_change": change}
     if not unsettled or outcome.status != "converged":
@@ -178,3 +180,101 @@ def patterns(used: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     number = number.ravel()
     first = [int(np.flatnonzero(number == index)[0]) for index in range(len(sets))]
     return [(used[:, cell], np.flatnonzero(number == index)) for index, cell in enumerate(first)]
+
+
+class Skycal(OtherPackage):
+    """hera_cal's skycal: a delay and a phase per antenna, then gains by channel; the sky model is taken as true.
+
+    Amplitudes come only from the cross-correlations, and not from the autocorrelations as in HERA's own pipeline.
+    """
+
+    calibrator: str = "skycal"
+    delays: bool = Field(True, description="First fit a delay and a phase per antenna.")
+    tolerance: float = Field(1e-8, gt=0, lt=1, description="Stop when no gain of a channel changes by more.")
+    max_steps: int = Field(100, ge=1)
+
+    def cost(self, size: Size) -> Cost:
+        """Return the cost of the solves: dense matrices of the antennas for each channel, about ten times."""
+        channels = size.channels.count * size.times * size.polarizations / self.integrations_per_solve
+        seconds = 5 + 1e-6 * size.samples + 10 * channels * (2e-5 + 2e-9 * size.antennas**3)
+        solve = size.samples * self.integrations_per_solve / (size.times * size.polarizations)
+        return Cost(seconds, LIBRARIES_MEMORY + COMPLEX128 * (6 * size.samples + 12 * solve))
+
+    def solve(
+        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, list[Solve]]:
+        """Solve every group of integrations."""
+        if start is not None:
+            measured = measured.weighted_by(start, groups)
+        found = [self._solve_group(measured, times) for times in groups]
+        return np.stack([gains for gains, _ in found], axis=2), [outcome for _, outcome in found]
+
+    def _solve_group(self, measured: Measured, times: slice) -> tuple[np.ndarray, Solve]:
+        """Return gains (Nants, Nfreqs), NaN where there are none.
+
+        Common gains depend only on the sums of w V M* and w |M|^2 over integrations.
+        """
+        data, sky, weights = measured.visibilities[times], measured.sky[times], measured.weights[times]
+        weight = np.sum(weights * np.abs(sky) ** 2, axis=0)
+        total = np.sum(weights * data * sky.conj(), axis=0)
+        ratio = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
+        start = self._delays(measured, ratio, weight)
+        gains = np.full(start.shape, np.nan, complex)
+        steps = np.zeros(start.shape[1], int)
+        for used, channels in patterns(weight > 0):
+            if used.any():
+                part = np.ix_(used, channels)
+                gains[:, channels], steps[channels] = self._refine(
+                    measured, np.flatnonzero(used), ratio[part], weight[part], start[:, channels]
+                )
+        return gains, self._outcome(steps)
+
+    def _delays(self, measured: Measured, ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Return gains (Nants, Nfreqs) with a delay and a phase each; unity if `delays` is false."""
+        gains = np.ones((measured.frame.n_antennas, measured.frame.n_channels), complex)
+        if not self.delays:
+            return gains
+        from hera_cal.datacontainer import DataContainer
+        from hera_cal.skycal import firstcal_gains, model_based_firstcal
+
+        keys = measured.keys(np.arange(len(ratio)))
+        containers = [
+            DataContainer({key: row[None] for key, row in zip(keys, rows, strict=True)}) for rows in (ratio, weight)
+        ]
+        delays, phases = model_based_firstcal(*containers, measured.frame.frequencies)
+        for (antenna, _), gain in firstcal_gains(delays, phases, measured.frame.frequencies).items():
+            gains[antenna] = gain[0]
+        return gains
+
+    def _refine(
+        self, measured: Measured, rows: np.ndarray, ratio: np.ndarray, weight: np.ndarray, start: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return gains of some channels with the same baselines, and the steps of each, -1 where there are none."""
+        from hera_cal.datacontainer import DataContainer
+        from hera_cal.skycal import refine_gains
+
+        keys = measured.keys(rows)
+        containers = [
+            DataContainer({key: row[None] for key, row in zip(keys, values, strict=True)}) for values in (ratio, weight)
+        ]
+        first = {(antenna, FEED): gain[None] for antenna, gain in enumerate(start)}
+        refined, details = refine_gains(
+            *containers, first, refine_tol=self.tolerance, refine_maxiter=self.max_steps, max_divergent_chan_frac=1.0
+        )
+        gains = np.full(start.shape, np.nan, complex)
+        for (antenna, _), gain in refined.items():
+            gains[antenna] = start[antenna] * gain[0]
+        (steps,) = details["iter"].values()
+        return gains, steps
+
+    def _outcome(self, steps: np.ndarray) -> Solve:
+        solved, failed = steps > 0, steps < 0
+        longest = int(steps.max(initial=0))
+        if not solved.any():
+            return Solve(status="failed", message=f"gains converged in no channel within {self.max_steps} steps")
+        if failed.any():
+            message = (
+                f"gains did not converge in {failed.sum()} of {(solved | failed).sum()} channels, which are flagged"
+            )
+            return Solve(status="stalled", message=message, steps=longest)
+        return Solve(status="converged", message=f"gains changed by less than {self.tolerance:g}", steps=longest)
