@@ -54,7 +54,7 @@ class SolveRecord:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Return all fields but the full loss history, as plain JSON types."""
+        """Return all fields as plain JSON types."""
         losses = self.loss_history
         return {
             "integration": self.integration,
@@ -72,11 +72,8 @@ class SolveRecord:
             "decrement_rms": _number(self.decrement_rms),
             "peak_memory": self.peak_memory,
             **({"diagnostics": dict(self.diagnostics)} if self.diagnostics else {}),
+            "loss_history": [_number(loss) for loss in losses],
         }
-
-    def detail(self) -> dict[str, Any]:
-        """Return the summary with the full loss history."""
-        return {**self.summary(), "loss_history": [_number(loss) for loss in self.loss_history]}
 
 
 def _number(value: float) -> float | None:

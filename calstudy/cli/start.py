@@ -72,9 +72,9 @@ def init(name: Name = "my-study", example: Example = None, data: Data = None, be
 def _described(data: str) -> DataSet:
     """Return the section of a file on measured data, after a look at their metadata."""
     from calstudy.experiment.starter import DataSet
-    from calstudy.measured.halves import read_facts
-    from calstudy.measured.selection import Selection
-    from calstudy.measured.settings import find_data
+    from calstudy.realdata.halves import read_facts
+    from calstudy.realdata.selection import Selection
+    from calstudy.realdata.settings import find_data
 
     try:
         facts = read_facts((find_data(data, Path()),), Selection(), even=False)

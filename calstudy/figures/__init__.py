@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from calstudy.products.comparison import Case
     from calstudy.products.graph import Graph
-    from calstudy.products.observed import ObservedGraph
+    from calstudy.products.observed import DataGraph
 
 
 class Drawing(NamedTuple):
@@ -211,8 +211,11 @@ class ObservedFigure(StudyFigure):
         return {}
 
     @abstractmethod
-    def observed_inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
-        """Return the products that the figure shows, by names of its own."""
+    def observed_inputs(self, graph: Any) -> Mapping[str, Task]:
+        """Return the products that the figure shows, by names of its own.
+
+        `graph` is an `ObservedGraph` of `calstudy.products.observed`, for diagnostics any `DataGraph`.
+        """
 
 
 def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:
@@ -292,8 +295,8 @@ def cases_task(
     return _task(figure, stand_ins, {**labels, **common}, inputs)
 
 
-def observed_task(figure: ObservedFigure, graph: ObservedGraph, stand_ins: Sequence[str]) -> Task:
+def observed_task(figure: ObservedFigure, graph: DataGraph, stand_ins: Sequence[str]) -> Task:
     """Return the task that draws one figure of measured data, with the stand-ins printed on it if it shows the sky."""
     with guarded(figure):
         inputs = figure.observed_inputs(graph)
-    return _task(figure, stand_ins, {"wedge_buffer": graph.power.wedge_buffer}, inputs)
+    return _task(figure, stand_ins, graph.figure_settings, inputs)

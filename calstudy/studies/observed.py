@@ -2,44 +2,45 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Generic, Self, TypeVar
 
 import yaml
 from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.identity import identity
+from calstudy.base.observation import Frame
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.by_file import ByFile
 from calstudy.calibrate.calibrators.calamity import Calamity
 from calstudy.calibrate.execution import require_calibratable
-from calstudy.calibrate.interface import CALIBRATORS, Calibrator
-from calstudy.experiment.files import apply_scale, override, parse_override
+from calstudy.calibrate.interface import CALIBRATORS, Calibrator, Outline
+from calstudy.experiment.files import apply_scale, input_files, override, parse_override
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import FIGURES, StudyName
 from calstudy.figures import ObservedFigure, observed_task
 from calstudy.instrument.interface import model_of
-from calstudy.measured.defaults import with_defaults
-from calstudy.measured.halves import PARITIES, Halves, modelled, read_facts, require_same_sky
-from calstudy.measured.interference import require_surroundings
-from calstudy.measured.settings import InjectionSettings, ObservedSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.products.observed import ObservedGraph
 from calstudy.products.observed_injection import injection_tables
 from calstudy.products.observed_quality import quality
 from calstudy.products.observed_spectra import observed_spectra
+from calstudy.realdata.halves import PARITIES, Facts, Parts, modelled, read_facts, require_same_sky
+from calstudy.realdata.interference import require_surroundings
+from calstudy.realdata.settings import DataSettings, InjectionSettings, ObservedSettings, with_defaults
 from calstudy.run.task import Task
-from calstudy.studies.capacity import workers_for
+from calstudy.studies.capacity import fit
 from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
 from calstudy.studies.study import Budget, Made, Study
 
 KEY = "observed"
 """Key that marks a file of measured data."""
-DEFAULT_FIGURES = ("observed-wedge", "observed-spherical")
+DEFAULT_FIGURES = ("diagnostics", "observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)
 
 
@@ -53,26 +54,21 @@ class ObservedOutputs(Section):
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
 
 
-class ObservedFile(Section):
-    """Measured data: their selection, calibration and power spectra, and an injected signal."""
+class DataFile(Section):
+    """Measured data and their calibration."""
 
     name: StudyName
     description: str = ""
-    observed: ObservedSettings
+    observed: DataSettings
     calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Field(
         default_factory=Calamity,
         description="As in an experiment. Without `solver`, Gauss-Newton steps go on longer, for data of few baselines "
         "converge slowly; without `prior` and sky model, the size of the gains fixes the scale.",
     )
-    power: PowerSettings = PowerSettings()
-    injection: InjectionSettings | None = Field(None, description="Measure what the calibration loses; null: do not.")
     outputs: ObservedOutputs = Field(default_factory=ObservedOutputs)
-    scales: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
-    )
 
     @model_validator(mode="after")
-    def _calibration_is_of_measured_data(self) -> ObservedFile:
+    def _calibration_is_of_measured_data(self) -> Self:
         if self.calibration.assumed:
             raise fault("calibration.assumed", "is for simulated data; give the sky model as observed.sky_model")
         if isinstance(self.calibration, ByFile) and self.calibration.folder is not None:
@@ -80,18 +76,76 @@ class ObservedFile(Section):
         return self
 
 
-class ObservedStudy(Study):
-    """A study of measured data, from its file and the metadata of the two halves."""
+class ObservedFile(DataFile):
+    """Measured data: their selection, calibration and power spectra, and an injected signal."""
 
-    def __init__(self, file: ObservedFile, halves: Halves) -> None:
-        self.file, self.halves = file, halves
+    observed: ObservedSettings
+    power: PowerSettings = PowerSettings()
+    injection: InjectionSettings | None = Field(None, description="Measure what the calibration loses; null: do not.")
+    scales: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
+    )
+
+
+File = TypeVar("File", bound=DataFile)
+
+
+class DataStudy(ABC, Generic[File]):
+    """A study of measured data, from its file and the metadata of their parts."""
+
+    def __init__(self, file: File, data: Parts) -> None:
+        self.file, self.data = file, data
         self.name, self.description = file.name, file.description
-        self.graph = ObservedGraph(file.observed, file.calibration, file.power, file.injection, halves)
 
     @property
     def outputs(self) -> ObservedOutputs:
         """Store and folder of runs."""
         return self.file.outputs
+
+    @property
+    @abstractmethod
+    def targets(self) -> Sequence[Task]:
+        """Products that a run makes for its user."""
+
+    @cached_property
+    def frames(self) -> list[Frame]:
+        """Antennas, baselines and channels of the data that are calibrated, of each data set."""
+        path = self.file.observed.sky_model
+        frames = list({id(facts): facts.frame for facts in self.data.facts.values()}.values())
+        return frames if path is None else [modelled(frame, path) for frame in frames]
+
+    @cached_property
+    def outline(self) -> Outline:
+        """Properties of the calibration that are known before it starts."""
+        with guarded(self.file.calibration):
+            return self.file.calibration.outline(self.frames[0])
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the calibrator on settings that will not work well."""
+        return self.outline.notes
+
+    def fitted(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study fitted to a budget, and the number of workers.
+
+        Raises InputError if the memory is too small, the calibrator refuses the data, or they are too few for a search
+        for interference.
+        """
+        if self.file.observed.flag_interference is not None:
+            for facts in self.data.facts.values():
+                require_surroundings(facts.times.size, facts.frequencies.size)
+        for frame in self.frames:
+            require_calibratable(self.file.calibration, frame, self.file.observed.sky_model is not None)
+        file, workers = fit(self.file, budget, lambda file: type(self)(file, self.data).targets)
+        return type(self)(file, self.data), workers
+
+
+class ObservedStudy(DataStudy[ObservedFile], Study):
+    """A study of measured data, from its file and the metadata of the two halves."""
+
+    def __init__(self, file: ObservedFile, data: Parts) -> None:
+        super().__init__(file, data)
+        self.graph = ObservedGraph(file.observed, file.calibration, file.power, file.injection, data)
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
@@ -110,23 +164,11 @@ class ObservedStudy(Study):
         )
 
     def fitted(self, budget: Budget) -> tuple[Self, int]:
-        """Return the study itself and the number of workers.
-
-        Raises InputError if a beam cannot be made, the memory is too small, the calibrator refuses the data, or they
-        are too few for a search for interference.
-        """
-        section = self.file.observed
-        if section.flag_interference is not None:
-            for facts in self.halves.facts.values():
-                require_surroundings(facts.times.size, facts.frequencies.size)
-        with guarded(section.beam):
-            model_of(section.beam).require_usable(self.halves.facts["even"].channels)
-        for parity in PARITIES[:1] if self.halves.interleaved else PARITIES:
-            frame = self.halves.facts[parity].frame
-            if section.sky_model is not None:
-                frame = modelled(frame, section.sky_model)
-            require_calibratable(self.file.calibration, frame, section.sky_model is not None)
-        return self, workers_for(self.targets, self.outputs.store, budget)
+        """Return the study fitted to a budget, and the number of workers; also refuse a beam that cannot be made."""
+        beam = self.file.observed.beam
+        with guarded(beam):
+            model_of(beam).require_usable(self.data.facts["even"].channels)
+        return super().fitted(budget)
 
     @cached_property
     def shown(self) -> list[ObservedFigure]:
@@ -176,13 +218,7 @@ def load_observed(
     Parameters and errors are as for `calstudy.studies.load.load_study`.
     """
     plain, folder = apply_scale(data, scale), path.resolve().parent
-    for text in overrides:
-        plain = override(plain, *parse_override(text))
-    plain = with_defaults(plain, folder)
-    try:
-        file = ObservedFile.model_validate(plain, context={"folder": folder})
-    except ValidationError as error:
-        raise ExperimentError(sentences(error, ObservedFile, plain)) from None
+    file = validated(ObservedFile, plain, overrides, folder)
     for place, figure in enumerate(file.outputs.figures or ()):
         if not isinstance(figure, ObservedFigure):
             built_in = [name for name in FIGURES.built_in() if issubclass(FIGURES.find(name), ObservedFigure)]
@@ -193,15 +229,54 @@ def load_observed(
     return ObservedStudy(file, _halves(file))
 
 
-def _halves(file: ObservedFile) -> Halves:
-    """Return the halves of the data from their metadata; raises InputError if they cannot be calibrated or crossed."""
-    section = file.observed
-    selection = section.select.selection
+def validated(model: type[File], content: Mapping[str, Any], overrides: Sequence[str], folder: Path) -> File:
+    """Validate the content of a file of measured data; relative paths start at `folder`.
+
+    Fields of the calibration that the content lacks have the defaults for measured data; then the overrides are
+    applied, ``path=value`` texts. Raises ExperimentError if fields are unknown, missing or have values that are not
+    allowed, or an input file does not exist.
+    """
+
+    def overridden(plain: dict[str, Any]) -> dict[str, Any]:
+        for text in overrides:
+            plain = override(plain, *parse_override(text))
+        return plain
+
+    plain = overridden(with_defaults(content, overridden(dict(content)), folder))
     try:
-        even = read_facts(section.data, selection, section.positions)
-        odd = read_facts(section.odd, selection, section.positions) if section.odd else even
+        file = model.model_validate(plain, context={"folder": folder})
+    except ValidationError as error:
+        raise ExperimentError(sentences(error, model, plain)) from None
+    for field, block, name in input_files(file.calibration):
+        path = getattr(block, name)
+        if not (folder / path).exists():
+            raise ExperimentError([f"calibration.{field} = {str(path)!r}: no such file"])
+        plain = override(plain, f"calibration.{field}", str((folder / path).resolve()))
+    return model.model_validate(plain, context={"folder": folder})
+
+
+def read_selected(file: DataFile, files: tuple[Path, ...], even: bool = True) -> Facts:
+    """Read the metadata of the selected data; raises InputError as `read_facts`, or if the noise is not known.
+
+    `even` requires equally spaced channels.
+    """
+    section = file.observed
+    try:
+        facts = read_facts(files, section.select.selection, section.positions, even)
     except InputError as error:
         raise InputError(str(error).replace("--select ", "observed.select.")) from None
+    if file.calibration.needs_noise and not facts.autos:
+        raise InputError(
+            "calibration.foreground_prior.noise: must be given, for the data have no autocorrelations that tell it"
+        )
+    return facts
+
+
+def _halves(file: ObservedFile) -> Parts:
+    """Return the halves of the data from their metadata; raises InputError if they cannot be calibrated or crossed."""
+    section = file.observed
+    even = read_selected(file, section.data)
+    odd = read_selected(file, section.odd) if section.odd else even
     if section.odd:
         require_same_sky(even, odd)
     elif even.times.size < 2:
@@ -214,13 +289,9 @@ def _halves(file: ObservedFile) -> Halves:
             f"observed.flux_scale: the data are in {even.unit!r}, and power spectra need Jy: give {{kind: factor, "
             "unit: 1 Jy}, or system-temperature, or a sky model"
         )
-    if file.calibration.needs_noise and not (even.autos and odd.autos):
-        raise InputError(
-            "calibration.foreground_prior.noise: must be given, for the data have no autocorrelations that tell it"
-        )
     together = file.calibration.integrations_per_solve
-    halves = Halves({"even": even, "odd": odd})
-    shortest = min(len(halves.times(parity)) for parity in ("even", "odd"))
+    halves = Parts({"even": even, "odd": odd})
+    shortest = min(len(halves.times(parity)) for parity in PARITIES)
     if together > shortest:
         raise InputError(
             f"calibration.integrations_per_solve = {together}: a half of the data has {shortest} integrations"

@@ -9,7 +9,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
-from calstudy.measured.settings import Interference
+from calstudy.realdata.settings import Interference
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
