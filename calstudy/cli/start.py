@@ -73,6 +73,7 @@ def _described(data: str) -> DataSet:
     """Return the section of a file on measured data, after a look at their metadata."""
     from calstudy.experiment.starter import DataSet
     from calstudy.realdata.halves import read_facts
+    from calstudy.realdata.interference import has_surroundings
     from calstudy.realdata.selection import Selection
     from calstudy.realdata.settings import find_data
 
@@ -83,11 +84,13 @@ def _described(data: str) -> DataSet:
     first, last = math.floor(facts.frequencies[0] / 1e3), math.ceil(facts.frequencies[-1] / 1e3)
     return DataSet(
         path=data,
-        summary=f"{facts.antennas} antennas, {facts.frequencies.size} channels between {first / 1e3:.3f} and "
-        f"{last / 1e3:.3f} MHz, {facts.times.size} integrations, in {facts.unit!r}.",
+        summary=f"{facts.antennas} antennas with baselines of up to {facts.frame.lengths.max():.0f} m, "
+        f"{facts.frequencies.size} channels between {first / 1e3:.3f} and {last / 1e3:.3f} MHz, {facts.times.size} "
+        f"integrations, in {facts.unit!r}.",
         first=f"{first / 1e3:.3f} MHz",
         last=f"{last / 1e3:.3f} MHz",
         in_jansky=facts.unit.lower() == "jy",
+        searchable=has_surroundings(facts.times.size, facts.frequencies.size),
     )
 
 

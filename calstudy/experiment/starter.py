@@ -71,7 +71,8 @@ observed:
   select:
     frequencies: {first}..{last}                          # leave out edges and interference
     # antennas: 0,1,12                                    # lengths, times and polarizations likewise
-  # flag: [149.7 MHz..150.2 MHz]                          # channels of interference inside the band
+  # flag: [149.7 MHz..150.2 MHz]                          # channels of known interference inside the band
+  {search}flag_interference: true                               # what stands out in time and frequency
   # positions: antennas.csv                               # number, east_m, north_m, up_m, in place of the file's
   # sky_model: model.uvh5                                 # visibilities in Jy, if there are any
   beam: {beam}
@@ -99,7 +100,7 @@ SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: f
 class DataSet:
     """Entries of a new file on measured data: path as it is written, a sentence, and the ends of the band.
 
-    `in_jansky` is true for data in Jy.
+    `in_jansky` is true for data in Jy, and `searchable` if they are enough for a search for interference.
     """
 
     path: str
@@ -107,6 +108,7 @@ class DataSet:
     first: str
     last: str
     in_jansky: bool
+    searchable: bool
 
 
 def observed_text(name: str, schema: Path, data: DataSet, beam: str) -> str:
@@ -114,6 +116,7 @@ def observed_text(name: str, schema: Path, data: DataSet, beam: str) -> str:
     _require_name(name)
     scale = "# " + SCALE if data.in_jansky else SCALE
     values = {"summary": data.summary, "path": data.path, "first": data.first, "last": data.last}
+    values["search"] = "" if data.searchable else "# "
     return f"{MODELINE}{schema}\n{OBSERVED.format(name=name, beam=beam, scale=scale, **values)}"
 
 

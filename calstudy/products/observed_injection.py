@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from pyuvdata import UVData
 
 FACTOR = "factor.json"
+LARGEST_ERROR = 0.5
+"""Standard deviation of a T that is measured: T is a fraction, and 95 % intervals of larger ones hold all of 0 to 1."""
 
 
 @once
@@ -210,7 +212,7 @@ def measure(job: Job) -> Mapping[str, Any]:
     settings = job.settings["power"]
     delays = {name: read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
     # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
-    summary = signal_loss.write_transfer(job.output, Injection(**delays), settings, 1.0)
+    summary = signal_loss.write_transfer(job.output, Injection(**delays), settings, 1.0, LARGEST_ERROR)
     signals = {}
     for modes, excise in EXCISION.items():
         spectrum = spherical_average(delays["signal"], settings, excise)
@@ -219,7 +221,22 @@ def measure(job: Job) -> Mapping[str, Any]:
         write_csv(job.output / f"eor.{modes}.csv", signals[modes])
     residual = load_spectrum(job.inputs["spectra"] / spectrum_file("residual", "outside-wedge"), SphericalSpectrum)
     signal_loss.write_corrected(job.output, residual, signals["outside-wedge"])
-    return {"transfer": summary}
+    return {"transfer": summary, "warnings": _not_measured(summary)}
+
+
+def _not_measured(summary: Mapping[str, Any]) -> list[str]:
+    """Return a sentence that names the bands outside the wedge in which T is not measured; none without any."""
+    unknown = [band for band in summary["outside-wedge"] if band["transfer"] is None and band["error"] is not None]
+    if not unknown:
+        return []
+    named = ", ".join(
+        f"{low:g} to {high:g} (error {band['error']:.2g})" for band in unknown for low, high in [band["k"]]
+    )
+    return [
+        f"T is not measured at k of {named} h/Mpc: an error above {LARGEST_ERROR:g} leaves open all that T can be; "
+        "interference that is not flagged (observed.flag_interference: true), few integrations or a weak "
+        "injection.level are the usual reasons"
+    ]
 
 
 def _cost_of_eor(task: Task) -> Cost:
@@ -249,4 +266,4 @@ SIMULATE_EOR = Stage(name="observed-eor", version=3, make=simulate_eor, cost=_co
 SET_LEVEL = Stage(name="observed-level", version=1, make=set_level, cost=_cost_of_average)
 INJECT = Stage(name="inject", version=1, make=inject, cost=_cost_of_data)
 AVERAGE_EOR = Stage(name="observed-eor-average", version=1, make=average_eor, cost=_cost_of_average)
-OBSERVED_TRANSFER = Stage(name="observed-transfer", version=2, make=measure, cost=lambda task: Cost(4, disk=1e6))
+OBSERVED_TRANSFER = Stage(name="observed-transfer", version=3, make=measure, cost=lambda task: Cost(4, disk=1e6))

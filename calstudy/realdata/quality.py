@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 GAIN_FACTOR = 5.0
 # Means of pure noise over many samples scatter by a few per cent.
 CHI2_FACTOR = 3.0
+INTERFERENCE = "interference? (--flag-interference, observed.flag_interference: true)"
 NAMED = 6
 """Largest number of channels or antennas named in a warning; solution.json has all of them."""
 # Median over mean of the square of a complex normal variable.
@@ -70,7 +71,7 @@ class Quality:
         antennas = [f"antenna {name}" for name in self.antennas]
         inverse = 1 / np.where(self.gain_by_antenna > 0, self.gain_by_antenna, np.nan)
         found = [
-            _sentence("|g| is far above the antenna's median", "x", channels, highest, GAIN_FACTOR, "interference?"),
+            _sentence("|g| is far above the antenna's median", "x", channels, highest, GAIN_FACTOR, INTERFERENCE),
             _sentence("|g| is far above that of the other antennas", "x", antennas, self.gain_by_antenna, GAIN_FACTOR),
             _sentence(
                 "|g| is far below that of the other antennas", "1/", antennas, inverse, GAIN_FACTOR, "a dead one?"
