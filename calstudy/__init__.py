@@ -1,6 +1,7 @@
 """calstudy: simulation and validation studies of 21 cm interferometer calibration."""
 
 import os
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 
 # TensorFlow rounds differently with these kernels and without. It reads this once, when it is imported, in whichever
@@ -11,3 +12,17 @@ try:
     __version__ = version("calstudy")
 except PackageNotFoundError:
     __version__ = "0+unknown"
+
+INTERFACE = ("load", "open_run")
+__all__ = ["__version__", *INTERFACE]
+
+
+def __getattr__(name: str) -> object:
+    # What these functions need takes a second to import, which commands such as --help do without.
+    if name in INTERFACE:
+        return getattr(import_module("calstudy.interface"), name)
+    raise AttributeError(f"module 'calstudy' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *INTERFACE]

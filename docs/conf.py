@@ -10,6 +10,9 @@ from typing import Any
 
 import nbformat
 
+from calstudy.studies.reference import field_reference
+from calstudy.studies.scores import leaderboard
+
 NOTEBOOK_OUTPUTS = Path(__file__).parents[1] / "build" / "notebooks"
 """Where `pytest -m notebook --notebook-outputs build/notebooks` leaves the notebooks as it ran them."""
 
@@ -118,8 +121,19 @@ def _scale(reduced: list[str]) -> str:
     )
 
 
+def write_generated_pages(app: Any) -> None:
+    """Write the reference of fields and the leaderboard, unless they are there as they should be."""
+    docs = Path(__file__).parent
+    pages = {"experiments.md": field_reference(), "leaderboard.md": leaderboard(docs / "challenge")}
+    for name, text in pages.items():
+        page = docs / name
+        if not page.is_file() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")
+
+
 def setup(app: Any) -> None:
-    """Register what happens to notebooks and docstrings."""
+    """Register what happens to generated pages, notebooks and docstrings."""
+    app.connect("builder-inited", write_generated_pages)
     app.connect("source-read", show_outputs)
     app.connect("autodoc-skip-member", skip_values)
     app.connect("autodoc-process-docstring", escape_mathematics, priority=100)

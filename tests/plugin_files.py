@@ -1,4 +1,4 @@
-"""Plug-ins from outside the package, as docs/extending.md shows them: in a file, or in an installed package."""
+"""Plug-ins from outside the package, as the pages on extending show them: in a file, or in an installed package."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+DOCS = Path(__file__).parents[1] / "docs"
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("extending*.md")))
 
 
 def example(title: str) -> tuple[str, str, dict[str, Any]]:
     """Return the name of the file that a section of the page shows, its content, and the experiment's block."""
-    text = PAGE.read_text(encoding="utf-8").partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+    text = TEXT.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
     code, block = (re.search(rf"```{language}\n(.*?)```", text, re.DOTALL)[1] for language in ("python", "yaml"))
     return re.match(r"# (\w+\.py)\n", code)[1], code, yaml.safe_load(block)
 

@@ -50,7 +50,8 @@ def makers() -> dict[str, tuple[int, dict[tuple[str, str], str]]]:
     defined = [item for name in names for item in vars(import_module(name)).values()]
     stages = {item.name: item for item in defined if isinstance(item, Stage)}
     offered = [getattr(item, "registry", item) for item in defined]
-    registries = {item.noun: item for item in offered if isinstance(item, Registry)}
+    # Kinds of study have no version: they ask for products, and make none.
+    registries = {item.noun: item for item in offered if isinstance(item, Registry) and hasattr(item.base, "version")}
     found = {f"stage {name}": (stage.version, reached(stage.make, {})) for name, stage in stages.items()}
     for noun, registry in registries.items():
         for thing in map(registry.find, registry.built_in()):

@@ -1,6 +1,7 @@
 """The command line: quick, and clear about mistakes."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +11,11 @@ import yaml
 from command_line import run_command
 from tiny import of_the_paper, tiny
 
+from calstudy.calibrate.settings import BasisSettings
+from calstudy.cli import main as cli
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import FIGURES
+from calstudy.instrument.as_built import AsBuilt
 from calstudy.studies.reference import field_reference
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -216,6 +220,22 @@ def test_a_report_of_what_is_no_run_is_refused(tmp_path):
     assert "not the folder of a finished run" in refused(calstudy("report", ".", cwd=tmp_path))
 
 
-def test_the_field_reference_in_the_docs_is_current():
-    path = Path(__file__).parents[1] / "docs" / "experiments.md"
-    assert path.read_text() == field_reference(), "run: python -m calstudy fields > docs/experiments.md"
+def test_one_section_of_the_reference_has_its_fields_and_those_of_the_sections_inside(capsys):
+    whole = field_reference()
+    for section, fields in {
+        "calibration.basis": BasisSettings.model_fields,
+        "instrument.as_built": AsBuilt.model_fields,
+        "observed.select": ["frequencies"],
+    }.items():
+        cli.app(["fields", section], standalone_mode=False)
+        text = capsys.readouterr().out
+        assert all(f"`{name}`" in text or f".{name}`" in text for name in fields)
+        assert set(re.findall(r"^#+ `([\w.]+)", text, re.MULTILINE)) == {
+            path for path in re.findall(r"^#+ `([\w.]+)", whole, re.MULTILINE) if f"{path}.".startswith(f"{section}.")
+        }
+
+
+def test_a_section_that_is_none_is_refused_with_the_nearest(capsys):
+    status, text = run_command(capsys, "fields", "calibration.bases")
+    assert status == 2
+    assert "did you mean 'calibration.basis'" in text

@@ -9,7 +9,7 @@ import pytest
 from tiny import tiny
 
 from calstudy.experiment.files import override, validate
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Budget, run_study
 
 DRAWN = True

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from calstudy.studies.collection import Collection
+from calstudy.studies.kinds.collection import Collection
 from calstudy.studies.load import load_study
 from calstudy.verdicts.sentences import OUTCOMES, outcomes_of_sentences
 from calstudy.verdicts.tables import from_json

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import nbformat
 import pytest
 
+from calstudy.experiment.files import parse_override
+
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 EXPERIMENTS = NOTEBOOKS.parent / "experiments"
 REDUCED = {
@@ -67,7 +69,8 @@ def test_a_notebook_runs(path, tmp_path, request):
         f"outputs.runs={tmp_path / 'runs'}",
         *REDUCED.get(path.stem, []),
     ]
-    values = f"EXPERIMENTS = {str(EXPERIMENTS)!r}\nOVERRIDES = {overrides!r}\nWORKERS = 1"
+    changes = dict(map(parse_override, overrides))
+    values = f"EXPERIMENTS = {str(EXPERIMENTS)!r}\nOVERRIDES = {changes!r}\nWORKERS = 1"
     told = {"tags": ["injected-parameters"], "reduced": REDUCED.get(path.stem, [])}
     notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(values, metadata=told))
     nbclient.NotebookClient(notebook, timeout=1200, resources={"metadata": {"path": str(tmp_path)}}).execute()

@@ -12,7 +12,7 @@ from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
+    from calstudy.results.reader import Results
 
 SIGMAS_95 = 1.96
 TINY = 1e-9
@@ -120,7 +120,7 @@ def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
     return Finding(float(np.sum(weights * values[known])), float(np.sum(weights * errors[known])))
 
 
-def difference_of_losses(first: RunResults, second: RunResults, k_min: float, k_max: float = np.inf) -> Finding:
+def difference_of_losses(first: Results, second: Results, k_min: float, k_max: float = np.inf) -> Finding:
     """Return T free of the flux scale of one run minus that of another, over bins from `k_min` to `k_max` in h/Mpc."""
     one, other = (run.transfer("outside-wedge") for run in (first, second))
     used = (one.k >= k_min - TINY) & (one.k <= k_max)
@@ -158,7 +158,7 @@ def _last_biased(biased: np.ndarray) -> int | None:
     return last
 
 
-def power_without_eor(run: RunResults, used: np.ndarray, weights: np.ndarray) -> Finding:
+def power_without_eor(run: Results, used: np.ndarray, weights: np.ndarray) -> Finding:
     """Return a weighted mean of P^R0 over bins outside the wedge, mK^2 h^-3 Mpc^3: the residual of data without EoR.
 
     The bins are (Nk,) bool; the weights of the used bins may have any sum. Errors come from leaving out antennas
@@ -179,7 +179,7 @@ def power_without_eor(run: RunResults, used: np.ndarray, weights: np.ndarray) ->
     return Finding(float(np.sum(share * power)), float(uncertainty))
 
 
-def bias(run: RunResults, k_min: float, k_max: float) -> Finding:
+def bias(run: Results, k_min: float, k_max: float) -> Finding:
     """Return s^2 P^R0 / P^S outside the wedge: the residual without EoR over the EoR, free of the flux scale s.
 
     Bins of k (h/Mpc) are weighted with their modes. For uncertainty and errors see `power_without_eor`; it also

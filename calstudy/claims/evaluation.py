@@ -16,7 +16,7 @@ from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.statement import Statement
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
+    from calstudy.results.reader import Results
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Evaluation:
     without_role: tuple[str, ...] = ()
 
 
-def evaluate_run(papers: Sequence[Paper], results: RunResults | PooledResults) -> Evaluation:
+def evaluate_run(papers: Sequence[Paper], results: Results | PooledResults) -> Evaluation:
     """Evaluate the statements of papers on the roles that one run plays."""
     verdicts: list[Verdict] = []
     without_role = []
@@ -45,7 +45,7 @@ def evaluate_run(papers: Sequence[Paper], results: RunResults | PooledResults) -
     return Evaluation(verdicts, tuple(without_role))
 
 
-def refusals_of_run(paper: Paper, results: RunResults | PooledResults) -> dict[str, str | None]:
+def refusals_of_run(paper: Paper, results: Results | PooledResults) -> dict[str, str | None]:
     """Return the reason why a run cannot play each role of a paper, None for the roles that it plays."""
     with guarded(paper):
         return {role: paper.refusal_of_run(role, results) for role in paper.roles}
@@ -72,7 +72,7 @@ def evaluate_run_times(papers: Sequence[Paper], run: RunTimes) -> Evaluation:
     return Evaluation(verdicts, tuple(without_role))
 
 
-def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults | PooledResults]) -> Evaluation:
+def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, Results | PooledResults]) -> Evaluation:
     """Evaluate every statement of papers on the runs by role.
 
     A statement whose roles no run plays is not evaluated, with the reason. If all runs pool realizations, statements
@@ -83,7 +83,7 @@ def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, RunResults | Po
 
 
 def evaluate_by_solver(
-    papers: Sequence[Paper], runs: Mapping[str, RunResults | PooledResults]
+    papers: Sequence[Paper], runs: Mapping[str, Results | PooledResults]
 ) -> dict[str, list[Verdict]]:
     """Evaluate every statement of papers on the runs (by role) with the paper's own solver, and on those with another.
 
@@ -106,12 +106,12 @@ def evaluate_by_solver(
     return {"the paper's solver": own, ", ".join(names): other} if own else {}
 
 
-def _solver(run: RunResults | PooledResults) -> str:
+def _solver(run: Results | PooledResults) -> str:
     calibration = run.experiment.calibration
     return calibration.solver.name if isinstance(calibration, GainFit) else calibration.label
 
 
-def _accepted(paper: Paper, runs: Mapping[str, RunResults | PooledResults]) -> dict[str, RunResults | PooledResults]:
+def _accepted(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> dict[str, Results | PooledResults]:
     """Return the runs whose roles a paper accepts, because another paper may have a role of the same name."""
     with guarded(paper):
         return {
@@ -122,7 +122,7 @@ def _accepted(paper: Paper, runs: Mapping[str, RunResults | PooledResults]) -> d
 
 
 def _evaluate(
-    paper: Paper, runs: Mapping[str, RunResults | PooledResults | RunTimes], only_played: bool = False
+    paper: Paper, runs: Mapping[str, Results | PooledResults | RunTimes], only_played: bool = False
 ) -> list[Verdict]:
     """Evaluate the statements of a paper; with `only_played`, only those with a role that a run plays."""
     found = []

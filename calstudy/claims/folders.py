@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -23,16 +22,14 @@ from calstudy.claims.evaluation import (
 )
 from calstudy.claims.paper import Paper
 from calstudy.claims.realizations import PooledResults
-from calstudy.claims.results import RunResults
 from calstudy.claims.run_times import RunTimes
-from calstudy.experiment.files import validate
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import PAPERS
-from calstudy.experiment.yaml_files import read_mapping
+from calstudy.results.folder import RunFolder
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import write_claims, write_claims_by_solver
 
-MANIFEST, EXPERIMENT = "manifest.json", "experiment.yaml"
 INSTEAD = "name a paper by --paper, or use --run-code if you trust who wrote the folder"
 
 
@@ -64,46 +61,42 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     InputError
         If it is neither, names no paper or code that may not be run, or cannot be written.
     """
-    manifest = _manifest(folder)
-    if "points" in manifest:
-        raise InputError(f"{folder}: is the folder of a sweep; give that of one of its points, below {folder}/points")
+    run = RunFolder(folder)
+    if run.parts and not run.members:
+        part = next(iter(run.parts.values())).path
+        raise InputError(f"{folder}: is the folder of several runs; give that of one of them, such as {part}")
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
-        found, by_solver = _evaluated(folder, manifest, named)
-    evaluated = EvaluatedRun(manifest["name"], found.verdicts, found.without_role)
+        found, by_solver = _evaluated(run, named)
+    evaluated = EvaluatedRun(run.name, found.verdicts, found.without_role)
     try:
-        write_claims(found.verdicts, folder, evaluated.title, manifest["stand_ins"], found.without_role)
+        write_claims(found.verdicts, folder, evaluated.title, run.manifest["stand_ins"], found.without_role)
         if by_solver:
-            write_claims_by_solver(by_solver, folder, evaluated.title, manifest["stand_ins"])
+            write_claims_by_solver(by_solver, folder, evaluated.title, run.manifest["stand_ins"])
     except OSError as error:
         raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
     return evaluated
 
 
-def _evaluated(
-    folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]
-) -> tuple[Evaluation, Mapping[str, list[Verdict]]]:
+def _evaluated(run: RunFolder, named: Sequence[Paper]) -> tuple[Evaluation, Mapping[str, list[Verdict]]]:
     """Return the verdicts of a folder, and those by solver of a collection."""
-    if manifest.get("kind") == "runtime":
-        study = read_mapping(folder / EXPERIMENT)
-        times = RunTimes.of(manifest["name"], _tables(folder))
-        return evaluate_run_times(_named(named, study.get("papers", ()), folder), times), {}
-    if "members" in manifest:
-        held_to, runs = _played(folder, manifest, named)
+    if run.manifest.get("kind") == "runtime":
+        times = RunTimes.of(run.name, run.tables)
+        return evaluate_run_times(_named(named, run.content.get("papers", ()), run.path), times), {}
+    if "members" in run.manifest:
+        held_to, runs = _played(run, named)
         return evaluate_members(held_to, runs), evaluate_by_solver(held_to, runs)
-    run = _results(folder, named)
-    return evaluate_run(_named(named, run.experiment.papers, folder), run), {}
+    results = _results(run, named)
+    return evaluate_run(_named(named, results.experiment.papers, run.path), results), {}
 
 
-def _played(
-    folder: Path, manifest: Mapping[str, Any], named: Sequence[Paper]
-) -> tuple[list[Paper], dict[str, RunResults | PooledResults]]:
+def _played(run: RunFolder, named: Sequence[Paper]) -> tuple[list[Paper], dict[str, Results | PooledResults]]:
     """Return the papers of a collection, and its members by the role that they play."""
-    members = {name: _results(folder.resolve().parent / place, named) for name, place in manifest["members"].items()}
-    own = {paper.reference: paper for run in members.values() for paper in run.experiment.papers}
-    chosen = _named(named, list(own.values()), folder)
-    experiments = {name: run.experiment for name, run in members.items()}
-    roles = members_by_role(chosen, experiments, manifest["roles"])
+    members = {name: _results(member, named) for name, member in run.members.items()}
+    own = {paper.reference: paper for member in members.values() for paper in member.experiment.papers}
+    chosen = _named(named, list(own.values()), run.path)
+    experiments = {name: member.experiment for name, member in members.items()}
+    roles = members_by_role(chosen, experiments, run.manifest["roles"])
     return chosen, {role: members[name] for role, name in roles.items()}
 
 
@@ -123,28 +116,8 @@ def _named(named: Sequence[Paper], own: Sequence[Any], folder: Path) -> list[Pap
     return papers
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
-    try:
-        return json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise InputError(
-            f"{folder}: is not the folder of a finished run (it has no readable manifest.json); give one that "
-            "'calstudy run' printed"
-        ) from None
-
-
-def _tables(folder: Path) -> Path:
-    if not (folder / "tables").is_dir():
-        raise InputError(f"{folder}: has no tables; run the experiment again")
-    return folder / "tables"
-
-
-def _results(folder: Path, named: Sequence[Paper]) -> RunResults | PooledResults:
-    content = dict(read_mapping(folder / EXPERIMENT))
-    if named:
-        content.pop("papers", None)
-    experiment = validate(content, folder)
+def _results(run: RunFolder, named: Sequence[Paper]) -> Results | PooledResults:
+    experiment = run.experiment(without=("papers",) if named else ())
     if experiment.realizations:
-        figures = folder / "figures"
-        return PooledResults.of(experiment, figures if figures.is_dir() else folder)
-    return RunResults(experiment, (_tables(folder),))
+        return PooledResults.of(experiment, run.figures)
+    return Results(run.tables.folders, experiment)

@@ -10,7 +10,7 @@ from calstudy.experiment.model import PAPERS, Experiment
 
 if TYPE_CHECKING:
     from calstudy.claims.realizations import PooledResults
-    from calstudy.claims.results import RunResults
+    from calstudy.results.reader import Results
     from calstudy.verdicts.statement import Statement
 
 
@@ -51,7 +51,7 @@ class Paper(Plugin):
         del role, experiment
         return None
 
-    def refusal_of_run(self, role: str, results: RunResults | PooledResults) -> str | None:
+    def refusal_of_run(self, role: str, results: Results | PooledResults) -> str | None:
         """Return in words why a finished run cannot play a role, or None; by default `refusal` of its experiment."""
         return self.refusal(role, results.experiment)
 

@@ -16,7 +16,7 @@ from calstudy.run.task import Job, Stage, Task
 if TYPE_CHECKING:
     from calstudy.claims.evaluation import Evaluation
     from calstudy.claims.realizations import PooledResults
-    from calstudy.claims.results import RunResults
+    from calstudy.results.reader import Results
 
 REALIZATIONS = "realizations"
 """Figure with the measurements on all realizations of an experiment."""
@@ -30,7 +30,7 @@ def _facts(experiment: Experiment) -> Experiment:
 
 def _inputs(graph: Graph) -> dict[str, Task]:
     if graph.experiment.realizations:
-        return {REALIZATIONS: figure_task(graph, FIGURES.make(REALIZATIONS), stand_ins(graph.experiment))}
+        return {REALIZATIONS: figure_task(FIGURES.make(REALIZATIONS), {"": graph}, stand_ins(graph.experiment))}
     inputs = {
         "spectra": spectra.spectra(graph),
         "agreement": agreement.agreement(graph),
@@ -99,22 +99,23 @@ def evaluate(job: Job) -> Mapping[str, Any]:
     return _write(job, evaluate_members(papers, runs))
 
 
-def _results(job: Job, name: str, experiment: Experiment) -> RunResults | PooledResults:
+def _results(job: Job, name: str, experiment: Experiment) -> Results | PooledResults:
     from calstudy.claims.realizations import PooledResults
-    from calstudy.claims.results import RunResults
+    from calstudy.results.reader import Results
 
     if experiment.realizations:
         return PooledResults.of(experiment, job.inputs[f"{REALIZATIONS}:{name}"])
     tables = (job.inputs.get(f"{table}:{name}") for table in TABLES)
-    return RunResults(experiment, tuple(folder for folder in tables if folder is not None))
+    return Results(tuple(folder for folder in tables if folder is not None), experiment)
 
 
 def evaluate_run_times(job: Job) -> Mapping[str, Any]:
     """Write claims.json and claims.md of a run-time study."""
     from calstudy.claims import evaluation
     from calstudy.claims.run_times import RunTimes
+    from calstudy.results.reader import Tables
 
-    times = RunTimes.of(job.settings["title"], job.inputs["runtime"])
+    times = RunTimes.of(job.settings["title"], Tables((job.inputs["runtime"],)))
     return _write(job, evaluation.evaluate_run_times(job.settings["papers"], times))
 
 

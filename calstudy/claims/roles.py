@@ -21,7 +21,7 @@ from calstudy.power.cosmology import k_parallel, make_cosmology
 from calstudy.verdicts.statement import Unevaluated
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
+    from calstudy.results.reader import Results
 
 INCOMPLETE = ("sky.foregrounds.flux_limit", "sky.foregrounds.count")
 """Fields of the assumed sky that leave sources out."""
@@ -100,7 +100,7 @@ def k_of_delay(experiment: Experiment, delay: float) -> float:
     return float(k_parallel(cosmology, np.array(delay), channels.first + channels.width * (channels.count - 1) / 2))
 
 
-def require_long_baselines(run: RunResults, k: float) -> None:
+def require_long_baselines(run: Results, k: float) -> None:
     """Raise Unevaluated unless the horizon of the longest baseline plus the buffer of the wedge reaches k (h/Mpc).
 
     Errors of a sky model, and the errors of gains they cause, have delays up to the horizon of the longest baseline
@@ -118,7 +118,7 @@ def require_long_baselines(run: RunResults, k: float) -> None:
         )
 
 
-def require_same_world(first: RunResults, second: RunResults) -> None:
+def require_same_world(first: Results, second: Results) -> None:
     """Raise Unevaluated unless sky, instrument, data and sky model of two runs are the same."""
     one, other = first.experiment, second.experiment
     for section in ("sky", "instrument", "corruption"):

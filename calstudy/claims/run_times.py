@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calstudy.products.files import read_json
 from calstudy.products.run_times import RUNTIME, PowerLaw, fit_power_law
+from calstudy.results.reader import Tables
 from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
@@ -29,9 +29,9 @@ class RunTimes:
     table: Mapping[str, Any]
 
     @classmethod
-    def of(cls, name: str, folder: Path) -> RunTimes:
+    def of(cls, name: str, tables: Tables) -> RunTimes:
         """Read the table of a run."""
-        table = json.loads((folder / RUNTIME).read_text(encoding="utf-8"))
+        table = read_json(tables.path(RUNTIME, "the run has no table of run times"))
         return cls(f"{name} on {machine_in_words(table['machine'])}", table)
 
     def cases(self, panel: str, device: str = "cpu") -> list[Mapping[str, Any]]:

@@ -88,9 +88,10 @@ def calibrate(
     solve converged, 3 if some did not, 2 if an input cannot be used.
     """
     from calstudy.base.resources import parse_memory
+    from calstudy.experiment.files import StudyFile
     from calstudy.products.files import quiet_libraries
     from calstudy.realdata.selection import split_selections
-    from calstudy.studies.calibration import load_calibration, require_free
+    from calstudy.studies.calibration import UNFINISHED, DataCalibration, require_free
     from calstudy.studies.study import Budget
 
     changes = {
@@ -103,6 +104,7 @@ def calibrate(
     if max_memory is not None:
         parse_memory(max_memory)
     content = {
+        "name": "calibration",
         "observed": {
             "data": [str(path) for path in data],
             "select": split_selections(select or []),
@@ -110,6 +112,7 @@ def calibrate(
             "sky_model": None if sky_model is None else str(sky_model),
         },
         "calibration": _calibration(settings_file, changes),
+        "outputs": {"store": str(output / UNFINISHED), "runs": str(output)},
         "calfits": calfits,
         "expected_loss": expected_loss,
     }
@@ -118,7 +121,8 @@ def calibrate(
     console = Console(soft_wrap=True, highlight=False)
     require_free(output, overwrite)
     with _named_as_options(output), quiet_libraries():
-        study = load_calibration(content, texts, output, Budget(workers=1, max_memory=max_memory))
+        study = DataCalibration.load(StudyFile(Path("calibration.yaml"), content, overrides=texts))
+        study, _ = study.sized_to(Budget(workers=1, max_memory=max_memory))
         for line in (*study.notes, *(study.read() if dry_run else ()), study.described()):
             console.print(line, markup=False)
         if dry_run:

@@ -11,8 +11,9 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
+from calstudy.base.table import Table
 from calstudy.verdicts.criterion import AtMost, Criterion, Finding
-from calstudy.verdicts.tables import Table, show_verdicts
+from calstudy.verdicts.tables import show_verdicts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,22 +8,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-File = Annotated[
-    Path,
-    typer.Argument(help="An experiment or a comparison (YAML), or the name of a published one.", show_default=False),
-]
+from calstudy.cli.options import AsJson, MaxMemory, Scale, Set, StudyFile, Workers
+
 Format = Annotated[str, typer.Option("--format", help="uvh5, uvfits or ms (which takes python-casacore).")]
 Output = Annotated[Path, typer.Option(help="Folder for the data; worlds of a comparison get a folder each in it.")]
-Scale = Annotated[str | None, typer.Option(help="Apply a named set of overrides of the file, such as 'small'.")]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set instrument.times.count=8."),
-]
-Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
-MaxMemory = Annotated[
-    str | None,
-    typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
-]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier export.")]
 Blind = Annotated[
     Path | None,
@@ -32,7 +20,7 @@ Blind = Annotated[
 
 
 def export(
-    file: File,
+    file: StudyFile,
     output: Output,
     file_format: Format = "uvh5",
     scale: Scale = None,
@@ -52,8 +40,8 @@ def export(
     from calstudy.studies.blind import write_recipe
     from calstudy.studies.export import CARRIER
     from calstudy.studies.export import export as write
+    from calstudy.studies.kinds.comparison import load_worlds
     from calstudy.studies.study import Budget
-    from calstudy.studies.worlds import load_worlds
 
     console = Console(soft_wrap=True, highlight=False)
     if blind is not None:
@@ -82,12 +70,11 @@ OfClass = Annotated[
 ScoreFile = Annotated[
     Path | None, typer.Option("--output", metavar="FILE.json", help="Write the scores, for a leaderboard.")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
 OverwriteScores = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier file of scores.")]
 
 
 def score(
-    file: File,
+    file: StudyFile,
     folder: Gains = None,
     calibrator: OfClass = None,
     name: Name = None,
@@ -106,9 +93,9 @@ def score(
     """
     from calstudy.base.errors import InputError
     from calstudy.products.files import quiet_libraries
+    from calstudy.studies.kinds.comparison import load_worlds
     from calstudy.studies.scores import measure_scores, tables
     from calstudy.studies.study import Budget
-    from calstudy.studies.worlds import load_worlds
 
     if output is not None and output.exists() and not overwrite:
         raise InputError(f"--output {output}: is there already; use --overwrite or another name")

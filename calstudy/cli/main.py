@@ -27,12 +27,14 @@ from calstudy.cli.calibrate import calibrate
 from calstudy.cli.check import check_app
 from calstudy.cli.compare_gains import compare_gains
 from calstudy.cli.export import export, leaderboard, score
+from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
 from calstudy.cli.regress import regress
 from calstudy.cli.start import examples, init, schema
 from calstudy.cli.storage import runs, store
 from calstudy.cli.validate import validate
 
 app = typer.Typer(
+    cls=Sections,
     help="Simulation and validation studies of 21 cm interferometer calibration.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -58,28 +60,10 @@ app.add_typer(check_app, name="check")
 EXIT_INPUT = 2
 EXIT_INTERRUPTED = 130
 
-File = Annotated[
-    Path,
-    typer.Argument(
-        help="The file (YAML) of an experiment or a collection, or the name of a published one, such as quickstart.",
-        show_default=False,
-    ),
-]
-Scale = Annotated[str | None, typer.Option(help="Apply a named set of overrides of the file, such as 'small'.")]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set calibration.basis.buffer='200 ns'."),
-]
-Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
-MaxMemory = Annotated[
-    str | None,
-    typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
-]
 Output = Annotated[
     Path | None,
     typer.Option(metavar="FOLDER", help="Where the run gets its folder: --set outputs.runs=FOLDER."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
 Finished = Annotated[
     list[Path] | None,
     typer.Option(
@@ -90,7 +74,6 @@ Finished = Annotated[
 Strict = Annotated[
     bool, typer.Option("--strict", help="Make products again that are of other code or other versions of packages.")
 ]
-Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster instead.")]
 
 
 def _show_version(wanted: bool) -> None:
@@ -110,7 +93,7 @@ def _root(
 
 @app.command()
 def run(
-    file: File,
+    file: StudyFile,
     scale: Scale = None,
     overrides: Set = None,
     workers: Workers = None,
@@ -139,7 +122,7 @@ def run(
 
 @app.command()
 def plan(
-    file: File,
+    file: StudyFile,
     scale: Scale = None,
     overrides: Set = None,
     workers: Workers = None,
@@ -222,12 +205,19 @@ def report(
 
 @app.command()
 def fields(
-    file: Annotated[Path | None, typer.Argument(help="A Python file: print the settings of what it defines.")] = None,
+    section: Annotated[
+        str | None,
+        typer.Argument(help="A section, such as calibration.basis, or a Python file: the settings of what it defines."),
+    ] = None,
 ) -> None:
-    """Print the reference of all fields of an experiment file (Markdown)."""
-    from calstudy.studies.reference import field_reference, plugin_reference
+    """Print the reference of all fields of an experiment file, or of one section (Markdown)."""
+    from calstudy.studies.reference import field_reference, plugin_reference, section_reference
 
-    typer.echo(field_reference() if file is None else plugin_reference(file), nl=False)
+    if section is None:
+        typer.echo(field_reference(), nl=False)
+    else:
+        is_file = section.endswith(".py")
+        typer.echo(plugin_reference(Path(section)) if is_file else section_reference(section), nl=False)
 
 
 @data_app.command()

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
+from calstudy.cli.options import MaxMemory, Scheduler, Set, Workers
 
 if TYPE_CHECKING:
     from calstudy.regression.tables import Regression
@@ -25,10 +26,6 @@ Against = Annotated[
     Path | None, typer.Option(metavar="RUN", help="Compare with this finished run instead of making the study again.")
 ]
 Update = Annotated[bool, typer.Option("--update", help="Then accept the new results as the reference.")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field.")]
-Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes, as for run.")]
-MaxMemory = Annotated[str | None, typer.Option(metavar="SIZE", help="Memory for all workers, as for run.")]
-Scheduler = Annotated[str | None, typer.Option(metavar="TCP://HOST:PORT", help="A dask cluster, as for run.")]
 
 
 def regress(

@@ -35,8 +35,8 @@ KINDS = {
 def examples() -> None:
     """List the published experiments, which `run`, `plan` and `init --example` take by name."""
     from calstudy.base.package_files import experiment_names, published
+    from calstudy.base.table import Table
     from calstudy.experiment.yaml_files import read_mapping
-    from calstudy.verdicts.tables import Table
 
     rows = []
     for name in experiment_names():

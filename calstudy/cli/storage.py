@@ -33,17 +33,17 @@ SECONDS = {"h": 3600.0, "d": 86_400.0}
 
 def runs(folder: RunsFolder = Path("runs")) -> None:
     """List finished runs: time, size, and number of products."""
-    from calstudy.run.inventory import list_runs
-    from calstudy.verdicts.tables import Table
+    from calstudy.base.table import Table
+    from calstudy.results.folder import find_runs
 
     rows = [
         (
-            entry.folder.relative_to(folder).as_posix(),
-            entry.finished.strftime("%Y-%m-%d %H:%M"),
-            _size(entry.size),
-            f"{len(entry.keys)}",
+            run.path.relative_to(folder).as_posix(),
+            run.finished.strftime("%Y-%m-%d %H:%M"),
+            _size(run.size),
+            f"{len(run.keys)}",
         )
-        for entry in list_runs(folder)
+        for run in find_runs(folder)
     ]
     Table(("folder", "finished (UTC)", "size", "products"), rows, f"runs in {folder}").show(Console(highlight=False))
 
@@ -63,7 +63,8 @@ def store(
     deleted with --older-than. Without --delete nothing is changed; with it, at least one of --older-than,
     --larger-than, --unreferenced and --verify must choose the products. Do not delete during a run.
     """
-    from calstudy.run.inventory import age_of, leftovers, list_runs, products
+    from calstudy.results.folder import find_runs
+    from calstudy.run.inventory import age_of, leftovers, products
     from calstudy.run.inventory import unreferenced as without_run
     from calstudy.run.store import Store
 
@@ -79,7 +80,7 @@ def store(
         raise InputError("--delete: say which products by --older-than, --larger-than, --unreferenced or --verify")
     where, chosen = Store(folder), list(products(Store(folder)))
     if unreferenced:
-        chosen = without_run(chosen, list_runs(runs))
+        chosen = without_run(chosen, [key for run in find_runs(runs) for key in run.keys])
     chosen = [product for product in chosen if age_of(product) >= oldest and product.size >= smallest]
     console = Console(highlight=False)
     _show(chosen, folder, console)
@@ -118,8 +119,8 @@ def _verify(store: Store, delete: bool) -> None:
 
 
 def _show(chosen: list[Product], folder: Path, console: Console) -> None:
+    from calstudy.base.table import Table
     from calstudy.run.inventory import age_of
-    from calstudy.verdicts.tables import Table
 
     rows = []
     for stage in sorted({str(product.record["stage"]) for product in chosen}):

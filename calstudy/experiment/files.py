@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
+from calstudy.base.package_files import find_experiment
 from calstudy.base.plugins import load_function
 from calstudy.base.schema import FOLDER
 from calstudy.calibrate.interface import CALIBRATORS
@@ -24,6 +26,7 @@ from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.size import antenna_count
 from calstudy.sky.settings import SkySettings
 
+M = TypeVar("M", bound=BaseModel)
 TAGS = {"solver": "name", "calibration": CALIBRATORS.tag}
 """Field that a bare string sets, where a block may be written as a string; elsewhere its `kind`."""
 
@@ -282,18 +285,60 @@ def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
     return experiment.model_copy(update={"calibration": calibration})
 
 
-def validate(data: Mapping[str, Any], base: Path) -> Experiment:
-    """Validate the content of an experiment file.
+def checked(model: type[M], data: Mapping[str, Any], base: Path) -> M:
+    """Return the content of a file as a section; relative paths of plug-ins start at the folder `base`.
 
-    Relative paths of input files start at the folder `base`. Raises ExperimentError with one sentence per fault: the
-    field's dotted path, the value, and the allowed values.
+    Raises ExperimentError with one sentence per fault: the field's dotted path, the value, and the allowed values.
     """
-    plain = dict(data)
     try:
-        experiment = Experiment.model_validate(plain, context={"folder": base})
+        return model.model_validate(dict(data), context={"folder": base})
     except ValidationError as error:
-        raise ExperimentError(sentences(error, Experiment, plain)) from None
-    return _resolve_assumed(_resolve_files(plain, experiment, base), base)
+        raise ExperimentError(sentences(error, model, dict(data))) from None
+
+
+def validate(data: Mapping[str, Any], base: Path) -> Experiment:
+    """Return the experiment of a file, with absolute paths of input files; parameters and errors as for `checked`."""
+    return _resolve_assumed(_resolve_files(dict(data), checked(Experiment, data, base), base), base)
+
+
+@dataclass(frozen=True)
+class StudyFile:
+    """The content of a file, and the scale and the ``path=value`` overrides of the command line, not yet applied."""
+
+    path: Path
+    content: Mapping[str, Any]
+    scale: str | None = None
+    overrides: Sequence[str] = ()
+
+    @classmethod
+    def open(cls, path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> StudyFile:
+        """Read a file, given its path or the name of a published one; raises InputError if it cannot be read."""
+        path = find_experiment(path)
+        return cls(path, read_mapping(path), scale, overrides)
+
+    @property
+    def folder(self) -> Path:
+        """The folder where relative paths start."""
+        return self.path.resolve().parent
+
+    def changed(self) -> dict[str, Any]:
+        """Return the content with scale and overrides applied; raises InputError if one cannot be applied."""
+        data = apply_scale(self.content, self.scale)
+        for text in self.overrides:
+            data = override(data, *parse_override(text))
+        return data
+
+    def read(self, model: type[M]) -> M:
+        """Return the changed content as a section; errors as for `changed` and `checked`."""
+        return checked(model, self.changed(), self.folder)
+
+    def experiment(self) -> Experiment:
+        """Return the changed content as an experiment, of which all scales are valid; errors as for `read`."""
+        _require_scales(self.content, self.folder)
+        data = self.changed()
+        if data.get("scales") != self.content.get("scales"):
+            _require_scales({**self.content, "scales": data["scales"]}, self.folder)
+        return validate(data, self.folder)
 
 
 def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Experiment:
@@ -315,17 +360,9 @@ def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) ->
     ExperimentError
         If fields are unknown or missing, or have invalid values.
     """
-    path = Path(path)
-    content = read_mapping(path)
-    _require_scales(content, path.resolve().parent)
-    data = apply_scale(content, scale)
-    for text in overrides:
-        data = override(data, *parse_override(text))
-    if data.get("scales") != content.get("scales"):
-        _require_scales({**content, "scales": data["scales"]}, path.resolve().parent)
-    return validate(data, path.resolve().parent)
+    return StudyFile.open(path, scale, overrides).experiment()
 
 
-def dump(experiment: Experiment) -> str:
-    """Return the resolved experiment as YAML; `load` reads it back to the same experiment."""
-    return yaml.safe_dump(experiment.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)
+def dump(content: BaseModel) -> str:
+    """Return the content of a file as YAML; an experiment is read back by `load` as the same experiment."""
+    return yaml.safe_dump(content.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)

@@ -33,6 +33,10 @@ STUDY_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
+Figures = Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)]
+Papers = Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)]
+
+
 class Refusing(Protocol):
     """The interface of an experiment to its figures, which are `calstudy.figures.StudyFigure`."""
 
@@ -120,17 +124,22 @@ class Convergence(Section):
     )
 
 
-class Outputs(Section):
+class Folders(Section):
+    """Folders of products and runs."""
+
+    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
+    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
+
+
+class Outputs(Folders):
     """Figures, and the folders of products and runs."""
 
-    figures: Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)] = Field(
+    figures: Figures = Field(
         default_factory=lambda: tuple(FIGURES.make(name) for name in DEFAULT_FIGURES),
         description="What is drawn: names of figures, or files of your own.",
     )
     inspect: Inspection = Inspection()
     convergence: Convergence = Convergence()
-    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all experiments.")
-    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
 
 
 SweepValues = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
@@ -182,7 +191,7 @@ class Experiment(Section):
         default_factory=_paper_variants, min_length=1, description="By default the six of the paper's figures."
     )
     outputs: Outputs = Field(default_factory=Outputs)
-    papers: Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)] = Field(
+    papers: Papers = Field(
         (),
         description="Published papers whose statements the run is compared with, such as [calamity2022]; none by "
         "default.",

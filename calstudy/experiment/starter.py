@@ -17,7 +17,7 @@ TEXT = """\
 # A small experiment: about a minute. Fields that are left out have the values of
 # Ewall-Wice et al. (2022), but for calibration.weights.
 # `calstudy plan {name}.yaml` checks it and says what a run takes; `calstudy run {name}.yaml` runs it.
-# All fields: docs/experiments.md, or `calstudy fields`.
+# All fields: `calstudy fields`.
 name: {name}
 description: A small array with cable reflections in the gains, calibrated with CALAMITY.
 
@@ -62,7 +62,7 @@ OBSERVED = """\
 # Measured data: {summary}
 # Calibration, power spectra of the data and of what is left, and what the calibration takes from an EoR that is put in.
 # `calstudy plan {name}.yaml` checks it and says what a run takes; `calstudy run {name}.yaml` runs it.
-# All fields: docs/experiments.md; how to read the results: docs/measured-data.md.
+# All fields: `calstudy fields observed`; how to read the results: docs/measured-data.md.
 name: {name}
 
 observed:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import GainFit
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
     from calstudy.products.comparison import Case
     from calstudy.products.graph import Graph
     from calstudy.products.observed import DataGraph
+
+
+TWO_ARRAYS = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
+"""Roles and headings of the two arrays of a collection."""
 
 
 class Drawing(NamedTuple):
@@ -45,12 +50,17 @@ class Drawing(NamedTuple):
 
 
 class StudyFigure(Plugin):
-    """The base of all figures of a study.
+    """The base of all figures: of one run, or of a family of experiments.
 
     Attributes
     ----------
+    of
+        Kinds of study that the figure can be drawn of, the names of modules of `calstudy.studies.kinds`.
     caption
         One sentence for the report.
+    titles
+        Of a figure that compares members of a collection: their roles, from left to right, and headings. Empty: all
+        members, by their names.
     variants
         Names of the variants of the data that it requires.
     needs_calibration
@@ -59,6 +69,8 @@ class StudyFigure(Plugin):
         True if the experiment must calibrate data with the EoR and without.
     needs_least_squares
         True if the calibrator must fit by least squares: it is repeated, or its tangent space is needed.
+    needs_injection
+        True if a signal must be injected into measured data.
     shows_sky
         True if a stand-in for sky, beam or scale enters it, and so is printed on it.
     tolerances
@@ -67,11 +79,14 @@ class StudyFigure(Plugin):
     """
 
     registry: ClassVar = FIGURES
+    of: ClassVar[tuple[str, ...]] = ("experiment",)
     caption: ClassVar[str] = ""
+    titles: ClassVar[Mapping[str, str]] = {}
     variants: ClassVar[tuple[str, ...]] = ()
     needs_calibration: ClassVar[bool] = False
     needs_signal_loss: ClassVar[bool] = False
     needs_least_squares: ClassVar[bool] = False
+    needs_injection: ClassVar[bool] = False
     shows_sky: ClassVar[bool] = True
     tolerances: ClassVar[Rules] = ()
 
@@ -79,6 +94,8 @@ class StudyFigure(Plugin):
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
+        if "experiment" not in self.of:
+            return f"is a figure {_listed(self.of)}, and cannot be drawn of a single experiment"
         missing = [name for name in self.variants if name not in experiment.variants]
         if missing:
             return f"needs the variant(s) {', '.join(missing)}"
@@ -95,12 +112,29 @@ class StudyFigure(Plugin):
             return "needs a calibrator that fits by least squares, such as calamity"
         return None
 
-    @abstractmethod
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the products that the figure shows, by names of its own."""
+    def roles(self, played: Collection[str]) -> Sequence[str]:
+        """Return the roles that the figure compares, given those played by members: by default all of `titles`."""
+        del played
+        return tuple(self.titles)
 
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return further settings that the figure takes from the experiment: sections and JSON-able values."""
+    def inputs(self, graph: Any) -> Mapping[str, Task]:
+        """Return the products of a run, or of one member of a family, that the figure shows; by default its spectra.
+
+        Parameters
+        ----------
+        graph
+            Products of the experiment, a `calstudy.products.graph.Graph`; of measured data an `ObservedGraph`.
+
+        Returns
+        -------
+        Tasks by names of the figure's own. If it shows a single product of each member, the name may be empty.
+        """
+        from calstudy.products.spectra import spectra
+
+        return {"spectra": spectra(graph)}
+
+    def settings(self, graph: Any) -> Mapping[str, Any]:
+        """Return what else the figure needs of a run, or of one member: sections and JSON-able values."""
         del graph
         return {}
 
@@ -111,47 +145,15 @@ class StudyFigure(Plugin):
         Parameters
         ----------
         job
-            Its `inputs` are folders of products; its `settings` are those of the method `settings`, and ``notes``: the
-            stand-ins to print.
+            Its `inputs` are folders of products, by the names of the method `inputs`; those of members of a family
+            have names ``name:label`` (`members_of`). Its `settings` are those of the method `settings`, and ``notes``:
+            the stand-ins to print. Of a family, ``layouts`` has the array layout of each member, by label, and
+            ``members`` the settings of each if there are any.
         """
 
 
-class ComparisonFigure(StudyFigure):
-    """A figure of a collection: it compares the members that play certain roles.
-
-    Attributes
-    ----------
-    titles
-        The roles that are compared, from left to right, and their headings; empty: all members, by their names in place
-        of roles. Its `draw` finds the product ``name`` of a member's `inputs` under ``name:role`` in ``job.inputs``,
-        and its layout in ``job.settings["layouts"]``.
-    """
-
-    titles: ClassVar[Mapping[str, str]] = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
-
-    def roles(self, played: Collection[str]) -> Sequence[str]:
-        """Return the roles that the figure compares, given those played by members: by default all of `titles`."""
-        del played
-        return tuple(self.titles)
-
-    def refusal(self, experiment: Experiment) -> str:
-        """Refuse: a single experiment has nothing to compare."""
-        return "compares the members of a collection, and cannot be drawn of a single experiment"
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the products of one member that the figure shows: by default its averaged spectra."""
-        from calstudy.products.spectra import spectra
-
-        return {"spectra": spectra(graph)}
-
-    def member_settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the entry of one member in ``job.settings["members"]``, by role; by default nothing."""
-        del graph
-        return {}
-
-
 class CasesFigure(StudyFigure):
-    """A figure of a comparison: calibrators in worlds. `draw` finds those of its `settings` that all cases share.
+    """A figure of the scores of a comparison: calibrators in worlds.
 
     Attributes
     ----------
@@ -159,19 +161,16 @@ class CasesFigure(StudyFigure):
         The scores that it shows, and saves as its arrays: those in ``bands`` of k, or in the experiment's ``bins``.
     """
 
+    of = ("comparison",)
     scores: ClassVar[Literal["bands", "bins"]] = "bands"
     tolerances = ((r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),)
-
-    def refusal(self, experiment: Experiment) -> str:
-        """Refuse: a single experiment has nothing to compare."""
-        return "compares calibrators, and cannot be drawn of a single experiment"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the scores of one case."""
         from calstudy.products.graph import required
         from calstudy.products.score import score
 
-        return {"score": required(score(graph))}
+        return {"": required(score(graph))}
 
     @abstractmethod
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
@@ -196,31 +195,19 @@ class CasesFigure(StudyFigure):
         return Drawing(self.draw_cases(cases, job), shown)
 
 
-class ObservedFigure(StudyFigure):
-    """A figure of measured data; `needs_injection` is true if a signal must be injected."""
-
-    needs_injection: ClassVar[bool] = False
-
-    def refusal(self, experiment: Experiment) -> str:
-        """Refuse: an experiment has no measured data."""
-        return "shows measured data, and cannot be drawn of an experiment"
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: there is no experiment to show."""
-        del graph
-        return {}
-
-    @abstractmethod
-    def observed_inputs(self, graph: Any) -> Mapping[str, Task]:
-        """Return the products that the figure shows, by names of its own.
-
-        `graph` is an `ObservedGraph` of `calstudy.products.observed`, for diagnostics any `DataGraph`.
-        """
+def figures_for(kind: str, figures: Sequence[Plugin], field: str) -> tuple[StudyFigure, ...]:
+    """Return the figures of a field of a file; raises ExperimentError if the kind of study cannot draw one."""
+    for place, figure in enumerate(cast(Sequence[StudyFigure], figures)):
+        if kind not in figure.of:
+            known = [name for name in FIGURES.built_in() if kind in FIGURES.find(name).of]
+            hint = f"{nearest(figure.label, known)} (built in: {', '.join(known)})"
+            sentence = f"is a figure {_listed(figure.of)}, not {_listed((kind,))}{hint}"
+            raise ExperimentError([f"{field}.{place}: {figure.label!r} {sentence}"])
+    return cast(tuple[StudyFigure, ...], tuple(figures))
 
 
-def figures_of(experiment: Experiment) -> tuple[StudyFigure, ...]:
-    """Return the figures of an experiment; their registry accepts no other plug-ins."""
-    return cast(tuple[StudyFigure, ...], experiment.outputs.figures)
+def _listed(kinds: Sequence[str]) -> str:
+    return f"for {' or '.join(kinds)} files"
 
 
 def draw(job: Job) -> Mapping[str, Any]:
@@ -248,55 +235,57 @@ def draw(job: Job) -> Mapping[str, Any]:
 DRAW = Stage(name="figure", version=4, make=draw, cost=lambda task: Cost(3, disk=1e6))
 
 
-def comparison_task(graphs: Mapping[str, Graph], figure: ComparisonFigure, stand_ins: Sequence[str]) -> Task:
-    """Return the task that draws one figure of a collection.
-
-    `graphs` are those of the members, by role, or by name for a figure of all members. `stand_ins` are printed on the
-    figure if it shows the sky.
-    """
-    settings: dict[str, Any] = {"layouts": {role: graph.experiment.instrument.layout for role, graph in graphs.items()}}
-    with guarded(figure):
-        members = {role: figure.member_settings(graph) for role, graph in graphs.items()}
-        if any(members.values()):
-            settings["members"] = members
-        inputs = {
-            f"{name}:{role}": task for role, graph in graphs.items() for name, task in figure.inputs(graph).items()
-        }
-    return _task(figure, stand_ins, settings, inputs)
-
-
-def figure_task(graph: Graph, figure: StudyFigure, stand_ins: Sequence[str]) -> Task:
-    """Return the task that draws one figure of an experiment, with the stand-ins printed on it if it shows the sky."""
-    with guarded(figure):
-        return _task(figure, stand_ins, figure.settings(graph), figure.inputs(graph))
-
-
-def _task(
-    figure: StudyFigure, stand_ins: Sequence[str], settings: Mapping[str, Any], inputs: Mapping[str, Task]
+def figure_task(
+    figure: StudyFigure,
+    members: Mapping[str, Graph | DataGraph],
+    stand_ins: Sequence[str],
+    settings: Mapping[str, Any] | None = None,
 ) -> Task:
+    """Return the task that draws a figure.
+
+    Parameters
+    ----------
+    members
+        What it is drawn of, by label; a single run has an empty label.
+    stand_ins
+        Printed on the figure if it shows the sky.
+    settings
+        In place of those of the method `settings` of the figure.
+    """
+    with guarded(figure):
+        own = {label: figure.settings(graph) for label, graph in members.items()} if settings is None else {}
+        inputs = {
+            ":".join(part for part in (name, label) if part): task
+            for label, graph in members.items()
+            for name, task in figure.inputs(graph).items()
+        }
+    if settings is None:
+        settings = own[""] if "" in own else _of_members(members, own)
+    return draw_task(figure, inputs, stand_ins, settings)
+
+
+def _of_members(members: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    layouts = {label: graph.experiment.instrument.layout for label, graph in members.items()}
+    return {"layouts": layouts, **({"members": own} if any(own.values()) else {})}
+
+
+def draw_task(
+    figure: StudyFigure, inputs: Mapping[str, Task], stand_ins: Sequence[str], settings: Mapping[str, Any]
+) -> Task:
+    """Return the task that draws a figure of given products."""
     notes = list(stand_ins) if figure.shows_sky else []
     return Task(DRAW, figure.label, {"figure": figure, "notes": notes, **settings}, inputs)
 
 
-def cases_task(
-    figure: CasesFigure, graphs: Mapping[str, Graph], labels: Mapping[str, Sequence[str]], stand_ins: Sequence[str]
-) -> Task:
-    """Return the task that draws one figure of a comparison.
-
-    `graphs` are those of all cases, by `calstudy.products.comparison.case_name`; `labels` those of the calibrators and
-    the worlds. `stand_ins` are printed on the figure if it shows the sky.
-    """
-    with guarded(figure):
-        inputs = {name: figure.inputs(graph)["score"] for name, graph in graphs.items()}
-        first, *others = [figure.settings(graph) for graph in graphs.values()] or [{}]
-    common = {
-        key: value for key, value in first.items() if all(key in other and other[key] == value for other in others)
+def members_of(job: Job) -> dict[str, dict[str, Path]]:
+    """Return the folders of a job by member and by the figure's own names; the label of a single run is empty."""
+    if "layouts" not in job.settings:
+        return {"": dict(job.inputs)}
+    return {
+        label: {
+            f":{name}".removesuffix(f":{label}")[1:]: folder
+            for name, folder in job.inputs.items()
+            if f":{name}".endswith(f":{label}")
+        }
+        for label in job.settings["layouts"]
     }
-    return _task(figure, stand_ins, {**labels, **common}, inputs)
-
-
-def observed_task(figure: ObservedFigure, graph: DataGraph, stand_ins: Sequence[str]) -> Task:
-    """Return the task that draws one figure of measured data, with the stand-ins printed on it if it shows the sky."""
-    with guarded(figure):
-        inputs = figure.observed_inputs(graph)
-    return _task(figure, stand_ins, graph.figure_settings, inputs)

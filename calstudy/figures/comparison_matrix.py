@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from calstudy.base.table import number
 from calstudy.figures import CasesFigure
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import SIGMAS, upper_limit
 from calstudy.run.task import Job
-from calstudy.verdicts.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

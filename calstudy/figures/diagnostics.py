@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from scipy.signal.windows import blackmanharris
 
-from calstudy.figures import Drawing, ObservedFigure
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
 from calstudy.products.files import DATA, read_visibilities
@@ -272,15 +272,16 @@ def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarr
     return np.array([str(names[int(number)]) for number in gains.ant_array[used]]), values[:, :, middle]
 
 
-class DiagnosticsFigure(ObservedFigure):
+class DiagnosticsFigure(StudyFigure):
     """Diagnostics of a calibration of measured data, of the even half or of all data."""
 
+    of = ("observed",)
     caption = (
         "The calibration of the measured data, of the first polarization: data, model and residual by baseline length "
         "and delay, convergence of the solves, gains, and chi^2 of antennas, channels and integrations."
     )
 
-    def observed_inputs(self, graph: DataGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: DataGraph) -> Mapping[str, Task]:
         """Return the data and the calibration of the first part."""
         part = next(iter(graph.parts.facts))
         return {"data": observed(graph, part), "calibration": calibrated(graph, part)}

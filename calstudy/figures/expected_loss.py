@@ -13,7 +13,6 @@ from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER, draw_transfer
 from calstudy.plotting import style
 from calstudy.products import expected_loss, signal_loss
-from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half, power_over_samples, spread_of_scale, typical_error
@@ -122,15 +121,9 @@ class ExpectedLossFigure(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw expected and measured T side by side."""
-        from calstudy.power.expected import ExpectedBins
-        from calstudy.power.tables import load_spectrum
-        from calstudy.power.transfer import TransferFunction, TransferMap
+        from calstudy.results.reader import Tables
 
-        folder, name = job.inputs["transfer"], signal_loss.TRANSFER
-        found = ExpectedLoss(
-            expected=load_spectrum(job.inputs["expected"] / expected_loss.EXPECTED, ExpectedBins),
-            measured=load_spectrum(folder / spectrum_file(name, "outside-wedge"), TransferFunction),
-            map=load_spectrum(folder / spectrum_file(name, "wedge"), TransferMap),
-        )
+        tables = Tables((job.inputs["transfer"], job.inputs["expected"]))
+        found = ExpectedLoss(tables.expected_transfer, tables.transfer("outside-wedge"), tables.transfer_map())
         figure = draw_expected_loss(found, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
         return Drawing(figure, found)

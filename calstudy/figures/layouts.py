@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.figures.layout import draw_layouts, layout_panel
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 
 
-class Layouts(ComparisonFigure):
+class Layouts(StudyFigure):
     """The arrays of the members that play the roles `minimally_redundant` and `redundant`."""
 
+    of = ("collection",)
     caption = "The two arrays."
+    titles = TWO_ARRAYS
     shows_sky = False
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:

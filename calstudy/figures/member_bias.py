@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import Drawing, StudyFigure, members_of
 from calstudy.figures.comparison_spectra import look
 from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import BINS, score
+from calstudy.products.score import score
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, Rules
 
@@ -36,10 +36,9 @@ class MemberBias:
 
 def read_member(folder: Path) -> MemberBias:
     """Read the bias of a member from its scores."""
-    from calstudy.power.score import Score
-    from calstudy.power.tables import load_spectrum
+    from calstudy.results.reader import Tables
 
-    bins = load_spectrum(folder / BINS, Score)
+    bins = Tables((folder,)).score
     return MemberBias(bins.k, bins.bias, bins.bias_error)
 
 
@@ -74,11 +73,11 @@ def _error(reference: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     return reference[f"{name.removesuffix('.bias')}.bias_error"]
 
 
-class MemberBiasFigure(ComparisonFigure):
+class MemberBiasFigure(StudyFigure):
     """The foregrounds that calibration leaves over the EoR, for every member of a collection."""
 
     version: ClassVar[int] = 2
-    titles: ClassVar[Mapping[str, str]] = {}
+    of = ("collection",)
     caption = (
         "Absolute value of the bias of each member outside the wedge with 95 % bars; open symbols: 95 % upper limit "
         "where it is not above its error. The dashed line is the EoR."
@@ -91,5 +90,5 @@ class MemberBiasFigure(ComparisonFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw all members."""
-        members = {name.removeprefix("score:"): read_member(folder) for name, folder in job.inputs.items()}
+        members = {name: read_member(found["score"]) for name, found in members_of(job).items()}
         return Drawing(draw_member_bias(members, job.settings["notes"]), members)

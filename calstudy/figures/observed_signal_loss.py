@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.figures import Drawing, ObservedFigure
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
 from calstudy.plotting import style
 from calstudy.products.expected_loss import EXPECTED
@@ -69,9 +69,10 @@ def draw_observed_loss(loss: ObservedLoss, buffer: float, stand_ins: Sequence[st
     return figure
 
 
-class ObservedSignalLoss(ObservedFigure):
+class ObservedSignalLoss(StudyFigure):
     """The transfer function of the calibration of measured data."""
 
+    of = ("observed",)
     caption = (
         "What the calibration of these data leaves of an EoR that is put into them: T per k, with what the fit "
         "predicts, and per baseline length and delay."
@@ -80,7 +81,7 @@ class ObservedSignalLoss(ObservedFigure):
     shows_sky = False
     tolerances = ((r".*\.(transfer|cross_transfer|squared_coherence)", Drawn(half, "half of it")),)
 
-    def observed_inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
         """Return measurement and expectation."""
         prediction = expected(graph)
         return {"transfer": required(transfer(graph)), **({"expected": prediction} if prediction else {})}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calstudy.figures import Drawing, ObservedFigure
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
 from calstudy.plotting import style
 from calstudy.products.files import spectrum_file
@@ -76,16 +76,17 @@ def _limits(columns: Mapping[str, Mapping[str, SphericalSpectrum]]) -> tuple[flo
     return 0.3 * float(min(np.quantile(values, 0.03), np.nanmin(errors) * SIGMAS_95)), 4 * float(values.max())
 
 
-class ObservedSpherical(ObservedFigure):
+class ObservedSpherical(StudyFigure):
     """Spherical power spectra of measured data."""
 
+    of = ("observed",)
     caption = (
         "Spherical power spectra of the measured data, even x odd, with 95 % bars of the noise alone; open where "
         "negative."
     )
     tolerances = ((r".*\.(power|noise_error)", Drawn(half, "follows from fitted gains; half of it")),)
 
-    def observed_inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
         """Return the averaged spectra."""
         return {"spectra": observed_spectra(graph)}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from calstudy.figures import Drawing, ObservedFigure
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.wedge import draw_panels
 from calstudy.products.files import spectrum_file
 from calstudy.products.observed_spectra import observed_spectra
@@ -24,16 +24,17 @@ TITLES = {
 MAX_DELAY = 2e-6
 
 
-class ObservedWedge(ObservedFigure):
+class ObservedWedge(StudyFigure):
     """Cylindrical power spectra of measured data."""
 
+    of = ("observed",)
     caption = (
         "Cylindrical power spectra of the measured data: as given, calibrated, the residual, and the power of their "
         "noise from the difference of the two halves; negative values in blue."
     )
     tolerances = ((r".*\.power", Drawn(half, "follows from fitted gains; half of it")),)
 
-    def observed_inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
         """Return the averaged spectra."""
         return {"spectra": observed_spectra(graph)}
 

@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.units import Wavenumber
-from calstudy.experiment.model import Experiment
 from calstudy.experiment.realizations import described
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
@@ -166,6 +165,7 @@ def _quoted(arrays: Arrays, name: str) -> np.ndarray:
 class Realizations(StudyFigure):
     """Statistics of the realizations of an experiment: T, pulls, coverage, and the correlation between bins."""
 
+    of = ("realizations",)
     caption = (
         "Realizations: transfer function T with the scatter of one realization; its quoted error and its scatter; the "
         "correlation of T between bins; pulls, mean and scatter; part of the 95 % bars that cover; P^R and P^R / T "
@@ -179,10 +179,6 @@ class Realizations(StudyFigure):
     )
 
     max_k: Wavenumber = Field(1.0, gt=0, description="Upper end of the axes of k; the arrays have all bins.")
-
-    def refusal(self, experiment: Experiment) -> str:
-        """Refuse: a single experiment has nothing to pool."""
-        return "pools the realizations of an experiment, and cannot be drawn of a single one"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the measurements on every realization."""

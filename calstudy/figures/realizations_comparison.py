@@ -11,7 +11,7 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.units import Wavenumber
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure, members_of
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
 from calstudy.plotting import style
 from calstudy.products import realizations
@@ -56,9 +56,11 @@ def draw_comparison(
     return figure
 
 
-class RealizationsComparison(ComparisonFigure):
+class RealizationsComparison(StudyFigure):
     """T of two arrays over the same draws, and their difference, with realizations-comparison.csv."""
 
+    of = ("collection",)
+    titles = TWO_ARRAYS
     caption = (
         "Transfer function outside the wedge of two arrays, over the same draws of EoR, gains and noise: mean and "
         "scatter of one realization, and the mean difference with 95 % bars that include all that was drawn."
@@ -71,7 +73,7 @@ class RealizationsComparison(ComparisonFigure):
         """Return the measurements on every realization of one member."""
         return realizations.inputs(graph)
 
-    def member_settings(self, graph: Graph) -> Mapping[str, Any]:
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
         """Return the draws of each realization."""
         return realizations.settings(graph)
 
@@ -79,16 +81,15 @@ class RealizationsComparison(ComparisonFigure):
         """Write the table, and draw both arrays and their difference."""
         from calstudy.power.realizations import Design, pool_region
 
-        regions = {}
+        regions, inputs = {}, members_of(job)
         members = job.settings["members"]
         if len({str(settings) for settings in members.values()}) > 1:
             raise InputError(f"{self.label}: the members draw different realizations; give them the same blocks")
         for role, title in self.titles.items():
             settings = members[role]
             design = Design(settings["draws"], [(block["draw"], block["members"]) for block in settings["blocks"]])
-            suffix = f":{role}"
-            folders = {name.removesuffix(suffix): path for name, path in job.inputs.items() if name.endswith(suffix)}
-            regions[title] = pool_region(realizations.read_samples(folders, len(design.draws), REGION), design)
+            samples = realizations.read_samples(inputs[role], len(design.draws), REGION)
+            regions[title] = pool_region(samples, design)
         first, second = regions.values()
         if not np.array_equal(first.bin_edges, second.bin_edges):
             raise InputError(f"{self.label}: the members have different bins of k, expected the same power.bins")

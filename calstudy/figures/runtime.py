@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.products.files import read_json
-from calstudy.products.graph import Graph
 from calstudy.products.run_times import CASE, QUANTILES, PowerLaw, fit_power_law
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import MACHINE
 
 if TYPE_CHECKING:
@@ -103,6 +101,7 @@ def _add_legend(figure: Figure, series: Sequence[RuntimeSeries], symbol: str) ->
 class Runtime(StudyFigure):
     """Time per step, or per solve, of the solvers against the size of the array."""
 
+    of = ("runtime",)
     caption = "Run time against the size of the array: medians, central 95 %, fitted powers."
     tolerances = ((r".*", MACHINE),)
 
@@ -112,14 +111,6 @@ class Runtime(StudyFigure):
     def label(self) -> str:
         """The name with the panel."""
         return f"runtime-{self.panel}"
-
-    def refusal(self, experiment: Experiment) -> str:
-        """Refuse: an experiment measures no run times."""
-        return "shows a run-time study, and cannot be drawn of an experiment"
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: the measurements are those of the study."""
-        return {}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the time per step against the number of antennas, or against the longest baseline."""

@@ -13,7 +13,6 @@ from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
 from calstudy.products import signal_loss
-from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import (
@@ -159,13 +158,10 @@ class SignalLossFigure(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw T per k and per (|b|, tau)."""
-        from calstudy.power.tables import load_spectrum
-        from calstudy.power.transfer import TransferFunction, TransferMap
+        from calstudy.results.reader import Tables
 
-        folder, name = job.inputs["transfer"], signal_loss.TRANSFER
-        outside, inside = (
-            load_spectrum(folder / spectrum_file(name, part), TransferFunction) for part in signal_loss.REGIONS
-        )
-        loss = SignalLoss(outside, inside, load_spectrum(folder / spectrum_file(name, "wedge"), TransferMap))
+        tables = Tables((job.inputs["transfer"],))
+        outside, inside = (tables.transfer(region) for region in signal_loss.REGIONS)
+        loss = SignalLoss(outside, inside, tables.transfer_map())
         figure = draw_signal_loss(loss, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
         return Drawing(figure, loss)

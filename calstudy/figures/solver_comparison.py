@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.spherical import SIGMAS_95, Marking, SphericalColumn, draw_band, draw_points, read_column
 from calstudy.plotting import style
 from calstudy.run.task import Job
@@ -102,13 +102,14 @@ def _add_legend(figure: Figure) -> None:
     figure.legend(handles, labels, loc="outside upper center", ncols=5, columnspacing=1.0, handletextpad=0.3)
 
 
-class SolverComparison(ComparisonFigure):
+class SolverComparison(StudyFigure):
     """P^R outside the wedge with the paper's solver and the default one, with EoR and without, of one array or both.
 
     The members in the roles `paper_solver` and `redundant_paper_solver` have the paper's solver, those in the roles
     `minimally_redundant` and `redundant` the default one. An array is shown if both of its roles are played.
     """
 
+    of = ("collection",)
     caption = "Residual power outside the wedge with the paper's solver and the default one: with EoR, and without."
     titles: ClassVar[Mapping[str, str]] = {role: title for title, roles in ARRAYS.items() for role in roles}
     tolerances = SPHERICAL_RULES

@@ -11,10 +11,8 @@ import numpy as np
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.products import spectra
-from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 if TYPE_CHECKING:
@@ -217,11 +215,10 @@ SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eo
 
 def read_column(folder: Path, title: str, modes: str) -> SphericalColumn:
     """Read the spherical spectra of all series of a product of stage `spectra`, for "all-modes" or "outside-wedge"."""
-    from calstudy.power.spectra import SphericalSpectrum
-    from calstudy.power.tables import load_spectrum
+    from calstudy.results.reader import Tables
 
-    found = {name: folder / spectrum_file(name, modes) for name in SERIES}
-    series = {name: load_spectrum(path, SphericalSpectrum) for name, path in found.items() if path.exists()}
+    tables = Tables((folder,))
+    series = {name: tables.spherical(name, modes) for name in tables.variants if name in SERIES}
     return SphericalColumn(title=title, **series)
 
 
@@ -231,10 +228,6 @@ class Spherical(StudyFigure):
     caption = "Spherical power spectra with 95 % bars; open where negative."
     variants = ("eor",)
     tolerances = SPHERICAL_RULES
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra."""
-        return {"spectra": spectra.spectra(graph)}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
         """Return the buffer of the wedge."""

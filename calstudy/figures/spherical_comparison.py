@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.figures.spherical import SphericalColumn, draw_spherical, read_column
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
@@ -33,9 +33,11 @@ def draw_spherical_comparison(
     return draw_spherical(columns, zoom_k, stand_ins)
 
 
-class SphericalComparison(ComparisonFigure):
+class SphericalComparison(StudyFigure):
     """Spherical power spectra outside the wedge of the members in the roles `minimally_redundant` and `redundant`."""
 
+    of = ("collection",)
+    titles = TWO_ARRAYS
     caption = "Spherical power spectra outside the wedge, of both arrays; below, enlarged."
     tolerances = SPHERICAL_RULES
 

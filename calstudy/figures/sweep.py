@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.experiment.files import short_names
-from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
 from calstudy.plotting import style
 from calstudy.products import signal_loss
-from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
 
@@ -149,15 +147,12 @@ def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> 
 class Sweep(StudyFigure):
     """The signal loss of all points of a sweep, with summary.csv: one row per point, region and band of k."""
 
+    of = ("sweep",)
     caption = "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars."
-
-    def refusal(self, experiment: Experiment) -> str:
-        """Refuse: a single experiment has nothing to compare."""
-        return "compares the points of a sweep, and cannot be drawn of a single experiment"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the signal loss of one point."""
-        return {"transfer": required(signal_loss.transfer(graph))}
+        return {"": required(signal_loss.transfer(graph))}
 
     def draw(self, job: Job) -> Drawing:
         """Write summary.csv, and draw T against the varied fields."""
@@ -168,10 +163,9 @@ class Sweep(StudyFigure):
 
 
 def _bands(folder: Path, region: str) -> TransferFunction:
-    from calstudy.power.tables import load_spectrum
-    from calstudy.power.transfer import TransferFunction
+    from calstudy.results.reader import Tables
 
-    return load_spectrum(folder / spectrum_file(signal_loss.BAND, region), TransferFunction)
+    return Tables((folder,)).transfer_in_bands(region)
 
 
 def _write_summary(path: Path, points: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> None:

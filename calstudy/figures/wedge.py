@@ -11,10 +11,8 @@ import numpy as np
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
-from calstudy.products import spectra
-from calstudy.products.files import spectrum_file
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import Drawn, cylindrical_error
 
 if TYPE_CHECKING:
@@ -172,21 +170,15 @@ class Wedge(StudyFigure):
         ),
     )
 
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra."""
-        return {"spectra": spectra.spectra(graph)}
-
     def settings(self, graph: Graph) -> Mapping[str, Any]:
         """Return the buffer of the wedge."""
         return {"wedge_buffer": graph.experiment.power.wedge_buffer}
 
     def draw(self, job: Job) -> Drawing:
         """Draw a panel for each variant."""
-        from calstudy.power.spectra import CylindricalSpectrum
-        from calstudy.power.tables import load_spectrum
+        from calstudy.results.reader import Tables
 
-        folder = job.inputs["spectra"]
-        files = {name: folder / spectrum_file(name, "wedge") for name in self.variants}
-        panels = WedgePanels(**{name: load_spectrum(file, CylindricalSpectrum) for name, file in files.items()})
+        tables = Tables((job.inputs["spectra"],))
+        panels = WedgePanels(**{name: tables.wedge(name) for name in self.variants})
         figure = draw_wedge(panels, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
         return Drawing(figure, panels)

@@ -28,8 +28,8 @@ from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement, Unevaluated
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
+    from calstudy.results.reader import Results
 
 WINDOW = (0.2, 0.5)
 """Range of k beyond the wedge and its leakage by the taper, h/Mpc."""
@@ -40,7 +40,7 @@ MISSING = Source("Abstract", ("incomplete_sky_model",))
 JOINT = "the precision of the catalogue and the spectral smoothness of the antennas constrain each other"
 
 
-def _bias(run: RunResults, incomplete: bool = True) -> Finding:
+def _bias(run: Results, incomplete: bool = True) -> Finding:
     """Return the bias in the window if the array is large enough and, if `incomplete`, a realistic part is missing."""
     require_long_baselines(run, WINDOW[1])
     lacking = run.sky_model_error
@@ -59,7 +59,7 @@ def _bias(run: RunResults, incomplete: bool = True) -> Finding:
     AtLeast(1, sigmas=2),
     "the EoR cannot be measured below a bias of its own size",
 )
-def incomplete_model_contaminates_window(run: RunResults) -> Finding:
+def incomplete_model_contaminates_window(run: Results) -> Finding:
     return _bias(run)
 
 
@@ -70,7 +70,7 @@ def incomplete_model_contaminates_window(run: RunResults) -> Finding:
     "less than the EoR itself, so that it can be measured",
     roles=("complete_sky_model",),
 )
-def complete_model_leaves_window_clean(run: RunResults) -> Finding:
+def complete_model_leaves_window_clean(run: Results) -> Finding:
     return _bias(run, incomplete=False)
 
 
@@ -81,7 +81,7 @@ def complete_model_leaves_window_clean(run: RunResults) -> Finding:
     "less than the EoR itself, so that it can be measured",
     roles=("smooth_antennas",),
 )
-def smooth_antennas_leave_window_clean(run: RunResults) -> Finding:
+def smooth_antennas_leave_window_clean(run: Results) -> Finding:
     return _bias(run)
 
 
@@ -92,7 +92,7 @@ def smooth_antennas_leave_window_clean(run: RunResults) -> Finding:
     "the EoR cannot be measured below a bias of its own size",
     roles=("structured_antennas",),
 )
-def structured_antennas_contaminate_window(run: RunResults) -> Finding:
+def structured_antennas_contaminate_window(run: Results) -> Finding:
     return _bias(run)
 
 

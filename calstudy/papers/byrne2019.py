@@ -18,8 +18,8 @@ from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
+    from calstudy.results.reader import Results
 
 CRUCIAL = (0.1, 0.2)
 """Range of k in which the noise allows a detection first, h/Mpc."""
@@ -35,7 +35,7 @@ MISSING = Source("Abstract", ("redundant_incomplete",))
     AtLeast(1, sigmas=2),
     "a bias of the size of the EoR itself",
 )
-def absolute_calibration_overwhelms_eor(run: RunResults) -> Finding:
+def absolute_calibration_overwhelms_eor(run: Results) -> Finding:
     return bias(run, *CRUCIAL)
 
 
@@ -46,7 +46,7 @@ def absolute_calibration_overwhelms_eor(run: RunResults) -> Finding:
     "less than the EoR itself: with the complete model there are no such errors",
     roles=("redundant_complete",),
 )
-def complete_model_leaves_crucial_modes(run: RunResults) -> Finding:
+def complete_model_leaves_crucial_modes(run: Results) -> Finding:
     return bias(run, *CRUCIAL)
 
 

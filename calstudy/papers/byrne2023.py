@@ -23,8 +23,8 @@ from calstudy.verdicts.criterion import AtLeast, Finding, Within
 from calstudy.verdicts.statement import Source, Statement, Unevaluated
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
+    from calstudy.results.reader import Results
 
 WINDOW = (0.2, 0.5)
 """Range of k, h/Mpc."""
@@ -40,7 +40,7 @@ BOTH = Source("Abstract", ("sky_based", "delay_weighted"))
     AtLeast(2),
     "substantially: by half at least",
 )
-def error_of_calibration_is_reduced(sky_based: RunResults, delay_weighted: RunResults) -> Finding:
+def error_of_calibration_is_reduced(sky_based: Results, delay_weighted: Results) -> Finding:
     require_same_world(sky_based, delay_weighted)
     first, second = (run.measured("correction_over_noise_outside") for run in (sky_based, delay_weighted))
     return ratio(*(Finding(median.value, median.scatter / median.count**0.5) for median in (first, second)))
@@ -53,7 +53,7 @@ def error_of_calibration_is_reduced(sky_based: RunResults, delay_weighted: RunRe
     HUNDRED,
     "a hundred, to half an order of magnitude",
 )
-def sensitivity_improves_hundredfold(sky_based: RunResults, delay_weighted: RunResults) -> Finding:
+def sensitivity_improves_hundredfold(sky_based: Results, delay_weighted: Results) -> Finding:
     require_same_world(sky_based, delay_weighted)
     require_long_baselines(sky_based, WINDOW[1])
     first, second = (bias(run, *WINDOW) for run in (sky_based, delay_weighted))

@@ -24,8 +24,8 @@ from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
+    from calstudy.results.reader import Results
 
 MODES = (0.1, 1.0)
 """Range of k, h/Mpc."""
@@ -44,7 +44,7 @@ DEFORMED = Source("Abstract", ("one_beam",))
     AtLeast(1000),
     "the paper's factor",
 )
-def leakage_exceeds_signal_thousandfold(run: RunResults) -> Finding:
+def leakage_exceeds_signal_thousandfold(run: Results) -> Finding:
     require_long_baselines(run, MODES[1])
     return bias(run, *MODES)
 
@@ -56,7 +56,7 @@ def leakage_exceeds_signal_thousandfold(run: RunResults) -> Finding:
     "less than the EoR itself",
     roles=("all_beams",),
 )
-def known_beams_leave_less_than_signal(run: RunResults) -> Finding:
+def known_beams_leave_less_than_signal(run: Results) -> Finding:
     require_long_baselines(run, MODES[1])
     return bias(run, *MODES)
 

@@ -24,8 +24,8 @@ from calstudy.verdicts.criterion import AtLeast, Finding, Within
 from calstudy.verdicts.statement import Source, Statement
 
 if TYPE_CHECKING:
-    from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
+    from calstudy.results.reader import Results
 
 TILES = (0.15, 0.4)
 """Range of the fraction of tiles with at least one dead dipole."""
@@ -41,7 +41,7 @@ DEAD = Source("Abstract", ("dead_dipoles",))
     Within(10**1.5, 10**2.5),
     "a hundred, to half an order of magnitude",
 )
-def bias_is_a_hundred_signals(run: RunResults) -> Finding:
+def bias_is_a_hundred_signals(run: Results) -> Finding:
     require_long_baselines(run, MODES[1])
     return bias(run, *MODES)
 
@@ -52,7 +52,7 @@ def bias_is_a_hundred_signals(run: RunResults) -> Finding:
     AtLeast(1, sigmas=2),
     "above it at all, beyond the errors",
 )
-def bias_exceeds_expected_signal(run: RunResults) -> Finding:
+def bias_exceeds_expected_signal(run: Results) -> Finding:
     require_long_baselines(run, MODES[1])
     return bias(run, *MODES)
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.table import Table, number
 from calstudy.products import score, spectra
 from calstudy.products.files import read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Job, Stage, Task
-from calstudy.verdicts.tables import Table, number
 
 if TYPE_CHECKING:
     from calstudy.power.score import CalibratedSpectra, Score

@@ -54,8 +54,6 @@ SOURCES = ("difference", "autos")
 class DataGraph(Memory):
     """The tasks that read and calibrate measured data, from the sections of a file and the parts of the data."""
 
-    figure_settings: Mapping[str, Any] = {}
-
     def __init__(self, observed: DataSettings, calibration: Calibrator, parts: Parts) -> None:
         super().__init__()
         self.observed, self.calibration, self.parts = observed, calibration, parts
@@ -78,7 +76,6 @@ class ObservedGraph(DataGraph):
         super().__init__(observed, calibration, parts)
         self.observed: ObservedSettings = observed
         self.power, self.injection = power, injection
-        self.figure_settings = {"wedge_buffer": power.wedge_buffer}
 
     @property
     def beam_settings(self) -> dict[str, Any]:

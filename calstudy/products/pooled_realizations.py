@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calstudy.base.resources import Cost
+from calstudy.base.table import Table, number
 from calstudy.experiment.realizations import described
 from calstudy.power.corrected import Corrected
 from calstudy.power.realizations import QUANTITIES, TRANSFER_QUANTITIES, PooledRegion, error_ratio, mean_over_bins
@@ -18,7 +19,7 @@ from calstudy.products.graph import Graph, once
 from calstudy.products.realization_results import JUDGED_K, JUDGED_REGION, RegionResults, judge, read_results
 from calstudy.run.task import Job, Stage, Task
 from calstudy.verdicts.criterion import Finding, Verdict
-from calstudy.verdicts.tables import Table, number, tally, to_json, to_markdown
+from calstudy.verdicts.tables import tally, to_json, to_markdown
 
 CSV, MARKDOWN, VERDICTS = "realizations.csv", "realizations.md", "realizations.json"
 PULLS = ("pull_eor", "pull_input", "pull_without_eor")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -16,12 +16,11 @@ from pydantic import ValidationError
 
 from calstudy.base.errors import InputError
 from calstudy.experiment.model import FIGURES
-from calstudy.experiment.yaml_files import read_mapping
+from calstudy.results.folder import EXPERIMENT, MANIFEST, NO_RUN, RunFolder
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.tables import CLAIMS_FILES, CLAIMS_JSON, from_json
+from calstudy.verdicts.tables import CLAIMS_FILES
 from calstudy.verdicts.tolerances import Rules
 
-EXPERIMENT, MANIFEST = "experiment.yaml", "manifest.json"
 KEPT = ("png", "npz")
 """Endings of the kept files of a figure: the picture and its arrays."""
 TABLES = ("realizations.md", "comparison.md")
@@ -29,7 +28,7 @@ TABLES = ("realizations.md", "comparison.md")
 
 
 @dataclass(frozen=True)
-class Results:
+class Reference:
     """Figures (arrays by figure and name) and claims of a run or of a reference.
 
     `tolerances` are those of the figures that the experiment of a reference names, by label. `on_machines` is true for
@@ -57,12 +56,10 @@ def find_references(folders: Sequence[Path]) -> list[Path]:
     return found
 
 
-def read_reference(folder: Path) -> Results:
+def read_reference(folder: Path) -> Reference:
     """Read a reference; raise InputError if an array, claim or experiment file is not readable."""
-    experiment = read_mapping(folder / EXPERIMENT)
-    return replace(
-        _read(folder, folder), tolerances=_tolerances(experiment, folder), on_machines="runtime" in experiment
-    )
+    run = RunFolder(folder)
+    return Reference(run.arrays(), run.claims, _tolerances(run.content, folder), "runtime" in run.content)
 
 
 def _tolerances(experiment: Mapping[str, Any], folder: Path) -> dict[str, Rules]:
@@ -81,27 +78,12 @@ def _tolerances(experiment: Mapping[str, Any], folder: Path) -> dict[str, Rules]
     return found
 
 
-def read_run(folder: Path) -> Results:
+def read_run(folder: Path) -> Reference:
     """Read a finished run or collection; raise InputError for another folder."""
-    if not (folder / "figures").is_dir() or not (folder / MANIFEST).is_file():
-        raise InputError(f"{folder}: is not the folder of a finished run; give one that 'calstudy run' printed")
-    return _read(folder, folder / "figures")
-
-
-def _read(folder: Path, figures: Path) -> Results:
-    try:
-        arrays = {path.stem: _arrays(path) for path in sorted(figures.glob("*.npz"))}
-        claims = (
-            from_json((folder / CLAIMS_JSON).read_text(encoding="utf-8")) if (folder / CLAIMS_JSON).is_file() else []
-        )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{folder}: its results cannot be read ({error})") from None
-    return Results(arrays, claims)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    run = RunFolder(folder)
+    if not (folder / "figures").is_dir() or not run.manifest:
+        raise InputError(f"{folder}: {NO_RUN}")
+    return Reference(run.arrays(), run.claims)
 
 
 def accept(run: Path, reference: Path) -> None:
@@ -113,7 +95,7 @@ def accept(run: Path, reference: Path) -> None:
     written; the complete run is read before anything is written.
     """
     try:
-        manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))
+        manifest = RunFolder(run).manifest
         paths = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
         paths |= {name: run / name for name in CLAIMS_FILES if (run / name).is_file()}
         paths |= {name: run / "tables" / name for name in TABLES if (run / "tables" / name).is_file()}
@@ -152,9 +134,10 @@ def _replace(path: Path, content: bytes) -> None:
 
 def _experiment(run: Path) -> dict[str, Any]:
     """Return the description of the run, without the folders of the machine where it was made."""
+    finished = RunFolder(run)
     if (run / EXPERIMENT).is_file():
-        return _without_folders(read_mapping(run / EXPERIMENT))
-    manifest = json.loads((run / MANIFEST).read_text(encoding="utf-8"))
+        return _without_folders(finished.content)
+    manifest = finished.manifest
     drawn = sorted(path.stem for path in (run / "figures").glob("*.npz"))
     return {
         "name": manifest["name"],

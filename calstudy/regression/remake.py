@@ -11,7 +11,6 @@ from calstudy.base.errors import InputError
 from calstudy.regression.reference import EXPERIMENT
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, run_study
-from calstudy.studies.sweep import Sweep
 
 
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
@@ -22,6 +21,6 @@ def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: C
     Raise InputError if the experiment is a sweep, or as the run raises it.
     """
     study = load_study(reference / EXPERIMENT, None, overrides)
-    if isinstance(study, Sweep):
-        raise InputError(f"{reference}: is a sweep, which has no reference results")
+    if not study.has_reference:
+        raise InputError(f"{reference}: is a {study.key}, which has no reference results")
     return run_study(study, budget, console, strict=True).folder

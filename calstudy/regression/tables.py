@@ -10,8 +10,9 @@ from pathlib import Path
 from rich.console import Console
 
 from calstudy.base.errors import InputError
+from calstudy.base.table import Table
 from calstudy.regression.comparison import ArrayComparison, ClaimComparison
-from calstudy.verdicts.tables import Table, count
+from calstudy.verdicts.tables import count
 
 REGRESSION_JSON = "regression.json"
 STATUSES = ("same", "moved", "beyond")

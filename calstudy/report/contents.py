@@ -3,45 +3,26 @@
 from __future__ import annotations
 
 import csv
-import json
+import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import InputError
+from calstudy.base.table import Table
+from calstudy.products.pooled_realizations import VERDICTS
 from calstudy.report import measured
 from calstudy.report.charts import Chart, read_charts
-from calstudy.report.headline import Number, read_claims, read_excess, read_headline
+from calstudy.report.headline import Number, read_headline, read_signal
+from calstudy.results.folder import EXPERIMENT, MANIFEST, RunFolder
 from calstudy.run.progress import duration
-from calstudy.verdicts.tables import marked, tally
+from calstudy.verdicts.tables import CLAIMS_JSON, marked, tally
 from calstudy.verdicts.tables import measured as number_measured
 
-MANIFEST, EXPERIMENT, CLAIMS, SUMMARY = "manifest.json", "experiment.yaml", "claims.json", "summary.csv"
-COMPARISON = "comparison.csv"
-REALIZATIONS = "realizations.json"
+SUMMARY, COMPARISON = "summary.csv", "comparison.csv"
 CLAIMS_TITLE = "Claims of the paper"
-REGIONS = {"outside-wedge": "outside the wedge", "inside-wedge": "inside the wedge"}
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report.
-
-    The note, which may be empty, is a sentence below the title; `verdicts` are the indices of the columns with
-    verdicts, which are coloured.
-    """
-
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    note: str = ""
-    verdicts: Sequence[int] = ()
-
-    @property
-    def outcomes(self) -> list[str]:
-        """The verdicts in the table, once each."""
-        return sorted({row[place] for row in self.rows for place in self.verdicts} - {""})
 
 
 @dataclass(frozen=True)
@@ -78,56 +59,38 @@ class Contents:
     experiment: str = ""
 
 
-def read_contents(folder: Path) -> Contents:
-    """Read the folder of a finished run of an experiment, a sweep or a collection; raises InputError for others."""
-    manifest = _manifest(folder)
-    products = manifest.get("products", [])
-    experiment = folder / EXPERIMENT
+def read_contents(run: RunFolder) -> Contents:
+    """Read the folder of a finished run of any study; raises InputError for others."""
+    manifest = run.manifest
+    experiment = run.path / EXPERIMENT
     text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
     sky_model = f" Sky model: {manifest['sky_model']}." if "sky_model" in manifest else ""
     tables = [
-        _claims(folder, products),
-        _summary(folder),
-        _comparison(folder),
-        _realizations(folder),
-        *(Table(*found) for found in measured.tables(folder)),
-        _signal_loss(folder, sky_model),
-        _convergence(products, sky_model),
-        _simulation(products),
-        _stages(products),
+        _claims(run),
+        _summary(run.path),
+        _comparison(run.path),
+        _realizations(run),
+        *measured.tables(run.path),
+        _signal_loss(run, sky_model),
+        _convergence(run.products, sky_model),
+        _simulation(run.products),
+        _stages(run.products),
     ]
+    signal = read_signal(run)
+    excess = [] if signal is None or signal.excess is None else [signal.excess]
     return Contents(
-        title=manifest["name"],
-        description=manifest.get("description") or _description(text),
+        title=run.name,
+        description=manifest.get("description") or (run.content.get("description", "") if text else ""),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
-        warnings=[*read_excess(folder), *(f"{label}: {text}" for label, text in _warnings(products))],
-        pictures=_pictures(folder, manifest),
+        warnings=[*excess, *(f"{label}: {text}" for label, text in _warnings(run.products))],
+        pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
-        headline=read_headline(folder),
-        files=_files(folder),
-        parts=_parts(folder, manifest),
+        headline=read_headline(run),
+        files=_files(run.path),
+        parts=_parts(run),
         experiment=text,
     )
-
-
-def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{folder}: not the folder of a finished run ({MANIFEST}: {error.strerror})") from None
-    except ValueError:
-        raise InputError(f"{path}: not valid JSON; the same run again writes it anew") from None
-    if not isinstance(manifest, dict) or "name" not in manifest:
-        raise InputError(f"{path}: not the manifest of a run")
-    return manifest
-
-
-def _description(experiment: str) -> str:
-    import yaml
-
-    return (yaml.safe_load(experiment) or {}).get("description", "") if experiment else ""
 
 
 def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
@@ -151,12 +114,12 @@ def _warnings(products: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     ]
 
 
-def _pictures(folder: Path, manifest: Mapping[str, Any]) -> list[Picture]:
+def _pictures(run: RunFolder) -> list[Picture]:
     """Return the pictures of the manifest in its order and with its captions, then others by name."""
-    found = {path.stem: path for path in sorted((folder / "figures").glob("*.png"))}
-    drawn = [item for item in manifest.get("products", []) if item["stage"] == "figure"]
+    found = {path.stem: path for path in sorted((run.path / "figures").glob("*.png"))}
+    drawn = [item for item in run.products if item["stage"] == "figure"]
     captions = {item["label"]: item.get("notes", {}).get("caption", "") for item in drawn}
-    captions = manifest.get("captions", captions)
+    captions = run.manifest.get("captions", captions)
     order = [name for name in captions if name in found]
     order += [name for name in found if name not in captions]
     return [_picture(name, captions.get(name, ""), found[name]) for name in order]
@@ -170,29 +133,25 @@ def _picture(name: str, caption: str, path: Path) -> Picture:
 
 def _files(folder: Path) -> list[str]:
     tables = sorted(path for path in (folder / "tables").glob("*") if path.is_file())
-    records = [folder / name for name in ("claims.md", CLAIMS, EXPERIMENT, MANIFEST, "run.log")]
+    records = [folder / name for name in ("claims.md", CLAIMS_JSON, EXPERIMENT, MANIFEST, "run.log")]
     return [str(path.relative_to(folder)) for path in (*records, *tables) if path.is_file()]
 
 
-def _parts(folder: Path, manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
-    points = [
-        (item["folder"].rpartition("/")[2], f"{item['folder']}/report.html") for item in manifest.get("points", [])
-    ]
-    pages = {name: f"../{place}/report.html" for name, place in manifest.get("members", {}).items()}
+def _parts(run: RunFolder) -> list[tuple[str, str]]:
     # Members may come from references, which have no page.
-    return points + [(name, page) for name, page in pages.items() if (folder / page).is_file()]
+    pages = {name: part.path.resolve() / "report.html" for name, part in run.parts.items()}
+    return [(name, os.path.relpath(page, run.path.resolve())) for name, page in pages.items() if page.is_file()]
 
 
-def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None:
+def _claims(run: RunFolder) -> Table | None:
     """Return the verdicts on the papers' statements, or a sentence without a role in any paper; None without papers."""
-    path = folder / CLAIMS
-    if not path.is_file():
+    if not run.has_claims:
         return None
-    claims = read_claims(path)
+    claims = run.claims
     evaluated = [claim for claim in claims if claim.measured is not None]
     if not evaluated:
-        reasons = [text for item in products for text in item.get("notes", {}).get("without_role", [])]
-        return Table(CLAIMS_TITLE, (), (), " ".join(reasons)) if reasons else None
+        reasons = [text for item in run.products for text in item.get("notes", {}).get("without_role", [])]
+        return Table((), (), CLAIMS_TITLE, " ".join(reasons)) if reasons else None
     rows = [
         (
             claim.section,
@@ -206,9 +165,8 @@ def _claims(folder: Path, products: Sequence[Mapping[str, Any]]) -> Table | None
     ]
     others = len(claims) - len(evaluated)
     lacking = f" {others} further claims were not evaluated; claims.md says why." if others else ""
-    note = f"{tally(claims)}.{lacking}"
     columns = ("section", "the paper says", "measured is", "measured", "must be", "verdict")
-    return Table(CLAIMS_TITLE, columns, rows, note, verdicts=(5,))
+    return Table(columns, rows, CLAIMS_TITLE, f"{tally(claims)}.{lacking}")
 
 
 def with_error(value: float | None, error: float | None) -> str:
@@ -227,19 +185,23 @@ def _band(row: Mapping[str, str]) -> str:
     return f"{float(row['k from [h/Mpc]']):g} to {float(row['k to [h/Mpc]']):g}"
 
 
-def _cell(row: Mapping[str, str], name: str) -> str:
-    value, error = float(row[name]), float(row[f"{name} error"])
-    return "no modes" if value != value else f"{value:.3f} ± {error:.3f}"
+def _number(value: float, error: float) -> str:
+    return f"{value:.3f} ± {error:.3f}" if math.isfinite(value) else "no modes"
 
 
-def _signal_loss(folder: Path, sky_model: str) -> Table | None:
-    paths = {region: folder / "tables" / f"transfer-bands.{region}.csv" for region in REGIONS}
-    if not all(path.is_file() for path in paths.values()):
+def _signal_loss(run: RunFolder, sky_model: str) -> Table | None:
+    try:
+        outside, inside = (run.tables.transfer_in_bands(region) for region in ("outside-wedge", "inside-wedge"))
+    except InputError:
         return None
-    outside, inside = (_read_csv(path) for path in paths.values())
     rows = [
-        (_band(out), _cell(out, "transfer"), _cell(out, "squared coherence"), _cell(within, "transfer"))
-        for out, within in zip(outside, inside, strict=True)
+        (
+            f"{outside.bin_edges[band]:g} to {outside.bin_edges[band + 1]:g}",
+            _number(outside.transfer[band], outside.transfer_error[band]),
+            _number(outside.squared_coherence[band], outside.squared_coherence_error[band]),
+            _number(inside.transfer[band], inside.transfer_error[band]),
+        )
+        for band in range(outside.k.size)
     ]
     note = (
         "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR. "
@@ -247,7 +209,7 @@ def _signal_loss(folder: Path, sky_model: str) -> Table | None:
         "of each baseline with itself it is the fraction of the power that is retained. One standard deviation."
     )
     columns = ("k (h/Mpc)", "T outside the wedge", "squared coherence outside", "T inside the wedge")
-    return Table("Signal loss", columns, rows, note + sky_model)
+    return Table(columns, rows, "Signal loss", note + sky_model)
 
 
 def _summary(folder: Path) -> Table | None:
@@ -258,11 +220,11 @@ def _summary(folder: Path) -> Table | None:
     bands = list(dict.fromkeys(_band(row) for row in rows))
     points: dict[str, dict[str, str]] = {}
     for row in rows:
-        points.setdefault(row["point"], {})[_band(row)] = _cell(row, "transfer")
+        points.setdefault(row["point"], {})[_band(row)] = _number(float(row["transfer"]), float(row["transfer error"]))
     cells = [(point, *(found[band] for band in bands)) for point, found in points.items()]
     columns = ("point", *(f"k = {band} h/Mpc" for band in bands))
     return Table(
-        "Signal loss of every point", columns, cells, "T = P^R / P^S outside the wedge, one standard deviation."
+        columns, cells, "Signal loss of every point", "T = P^R / P^S outside the wedge, one standard deviation."
     )
 
 
@@ -286,27 +248,25 @@ def _comparison(folder: Path) -> Table | None:
         "in comparison.md and comparison.csv."
     )
     columns = ("world", "calibrator", *measured, "solves")
-    return Table("Calibrators compared", columns, [(*case, *found, last[case]) for case, found in cells.items()], note)
+    return Table(columns, [(*case, *found, last[case]) for case, found in cells.items()], "Calibrators compared", note)
 
 
-def _realizations(folder: Path) -> Table | None:
+def _realizations(run: RunFolder) -> Table | None:
     """Return the verdicts on the realizations of an experiment."""
-    path = folder / "tables" / REALIZATIONS
-    if not path.is_file():
-        return None
+    verdicts = run.verdicts(run.path / "tables" / VERDICTS)
     rows = [
         (
-            item["sentence"],
-            item["quantity"],
-            item["reason"] or with_error(item["measured"], item["uncertainty"]),
-            item["threshold"],
-            item["verdict"],
+            item.sentence,
+            item.quantity,
+            item.reason or with_error(item.measured, item.uncertainty),
+            item.threshold,
+            item.verdict,
         )
-        for item in json.loads(path.read_text(encoding="utf-8"))
+        for item in verdicts
     ]
     columns = ("wanted", "measured is", "measured", "must be", "verdict")
     note = "All numbers are in realizations.md and realizations.csv."
-    return Table("Realizations", columns, rows, note, verdicts=(4,))
+    return Table(columns, rows, "Realizations", note) if rows else None
 
 
 def _convergence(products: Sequence[Mapping[str, Any]], sky_model: str) -> Table | None:
@@ -321,7 +281,7 @@ def _convergence(products: Sequence[Mapping[str, Any]], sky_model: str) -> Table
         for item in found
     ]
     columns = ("calibration of", "solves", "median steps", "median time per solve")
-    return Table("Solver convergence", columns, rows, sky_model.strip()) if rows else None
+    return Table(columns, rows, "Solver convergence", sky_model.strip()) if rows else None
 
 
 def _simulation(products: Sequence[Mapping[str, Any]]) -> Table | None:
@@ -339,7 +299,7 @@ def _simulation(products: Sequence[Mapping[str, Any]]) -> Table | None:
             )
     columns = ("component", "largest interpolation error", "delay floor beyond the horizon")
     note = "Errors relative to the rms; the floor is that of the worst baseline."
-    return Table("Accuracy of the simulation", columns, rows, note) if rows else None
+    return Table(columns, rows, "Accuracy of the simulation", note) if rows else None
 
 
 def _stages(products: Sequence[Mapping[str, Any]]) -> Table | None:
@@ -360,4 +320,4 @@ def _stages(products: Sequence[Mapping[str, Any]]) -> Table | None:
     ]
     columns = ("stage", "products", "made by this run", "time", "cpu time", "peak memory of the process")
     note = "Time and memory when each product was made, by this run or an earlier one."
-    return Table("Stages", columns, rows, note) if rows else None
+    return Table(columns, rows, "Stages", note) if rows else None

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from calstudy.base.table import Table
+from calstudy.products.files import read_json
 
 QUALITY, NOISE = "quality.json", "noise.json"
 FIT_TITLE, NOISE_TITLE = "Fit to the measured data", "Noise of the measured data"
@@ -21,15 +23,13 @@ NOISE_NOTE = (
 )
 
 
-def tables(folder: Path) -> Iterator[tuple[str, Sequence[str], Sequence[Sequence[str]], str]]:
-    """Yield title, columns, rows and note of the tables of a run of measured data; nothing for other runs."""
+def tables(folder: Path) -> list[Table]:
+    """Return the tables of a run of measured data; none for other runs."""
     found = (
-        (FIT_TITLE, FIT_COLUMNS, _fits(folder), FIT_NOTE),
-        (NOISE_TITLE, NOISE_COLUMNS, _noise(folder), NOISE_NOTE),
+        Table(FIT_COLUMNS, _fits(folder), FIT_TITLE, FIT_NOTE),
+        Table(NOISE_COLUMNS, _noise(folder), NOISE_TITLE, NOISE_NOTE),
     )
-    for title, columns, rows, note in found:
-        if rows:
-            yield title, columns, rows, note
+    return [table for table in found if table.rows]
 
 
 def _fits(folder: Path) -> list[tuple[str, ...]]:
@@ -37,7 +37,7 @@ def _fits(folder: Path) -> list[tuple[str, ...]]:
     path = folder / "tables" / QUALITY
     if not path.is_file():
         return []
-    found = json.loads(path.read_text(encoding="utf-8"))
+    found = read_json(path)
     return [_fit(parity, part) for parity, part in found.items() if part.get("samples")]
 
 
@@ -60,7 +60,7 @@ def _noise(folder: Path) -> list[tuple[str, ...]]:
     if not path.is_file():
         return []
     rows = []
-    for what, levels in json.loads(path.read_text(encoding="utf-8")).items():
+    for what, levels in read_json(path).items():
         ratio = levels.get("difference_over_autos")
         powers = ("" if levels[source] is None else f"{levels[source]:.3g}" for source in ("difference", "autos"))
         name = "data as given" if what == "data" else what

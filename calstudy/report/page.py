@@ -10,6 +10,7 @@ from uuid import uuid4
 from calstudy.base.errors import InputError
 from calstudy.report.contents import Contents, read_contents
 from calstudy.report.pair import Pair, read_pair
+from calstudy.results.folder import RunFolder
 
 REPORT = "report.html"
 
@@ -47,7 +48,7 @@ def write_report(folder: Path) -> Path:
 
     Raises InputError for other folders.
     """
-    return _write(render(read_contents(folder)), folder / REPORT)
+    return _write(render(read_contents(RunFolder(folder))), folder / REPORT)
 
 
 def write_pair(first: Path, second: Path, output: Path, overwrite: bool = False) -> Path:

@@ -10,7 +10,9 @@ from typing import Any
 
 import yaml
 
-from calstudy.report.contents import CLAIMS_TITLE, Contents, Picture, Table, read_contents
+from calstudy.base.table import Table
+from calstudy.report.contents import CLAIMS_TITLE, Contents, Picture, read_contents
+from calstudy.results.folder import RunFolder
 
 ALWAYS_DIFFERENT = ("name", "description", "outputs")
 """Sections of an experiment whose differences do not concern its results."""
@@ -36,7 +38,7 @@ class Pair:
 
 def read_pair(folders: tuple[Path, Path]) -> Pair:
     """Read two run folders; raises InputError if one of them is not that of a finished run."""
-    first, second = (read_contents(folder) for folder in folders)
+    first, second = (read_contents(RunFolder(folder)) for folder in folders)
     names = (first.title, second.title)
     if first.title == second.title:
         names = (folders[0].resolve().name, folders[1].resolve().name)
@@ -66,7 +68,7 @@ def _differences(first: str, second: str, names: tuple[str, str]) -> Table:
         if fields[0].get(name) != fields[1].get(name) and name.partition(".")[0] not in ALWAYS_DIFFERENT
     ]
     note = "" if rows else "The experiments do not differ."
-    return Table("Fields that differ", ("field", *names), rows, note)
+    return Table(("field", *names), rows, "Fields that differ", note)
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -90,4 +92,4 @@ def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -
         for statement, sides in rows.items()
     ]
     columns = ("section", "the paper says", "measured is", "must be", *names, *(f"verdict, {name}" for name in names))
-    return Table(CLAIMS_TITLE, columns, cells, verdicts=(6, 7)) if cells else None
+    return Table(columns, cells, CLAIMS_TITLE) if cells else None

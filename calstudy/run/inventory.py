@@ -1,8 +1,7 @@
-"""List the products of a store and the runs of a folder, and find products that no run refers to."""
+"""List the products of a store, and find products that no run refers to."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -11,38 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from calstudy.base.errors import InputError
 from calstudy.run.store import Product, Store
-
-MANIFEST = "manifest.json"
-
-
-@dataclass(frozen=True)
-class RunEntry:
-    """A finished run: its folder, the name of the study, the size of all files in bytes, and its products' keys."""
-
-    folder: Path
-    name: str
-    finished: datetime
-    size: int
-    keys: frozenset[str]
-
-
-def list_runs(folder: Path) -> list[RunEntry]:
-    """Return the finished runs in a folder and its subfolders, the latest first; raises InputError without a folder."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of runs")
-    found = []
-    for path in sorted(folder.rglob(MANIFEST)):
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            finished = datetime.fromisoformat(content["finished"])
-            keys = frozenset(entry["key"] for entry in content.get("products", []))
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        size = sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
-        found.append(RunEntry(path.parent, str(content.get("name", "")), finished, size, keys))
-    return sorted(found, key=lambda entry: entry.finished, reverse=True)
 
 
 def products(store: Store) -> Iterator[Product]:
@@ -81,10 +49,10 @@ def age_of(product: Product) -> float:
     return (datetime.now(UTC) - made).total_seconds()
 
 
-def unreferenced(found: Iterable[Product], runs: Iterable[RunEntry]) -> list[Product]:
-    """Return the products that no run names, and from which no such product was made."""
+def unreferenced(found: Iterable[Product], named: Iterable[str]) -> list[Product]:
+    """Return the products without a key that a run names, and from which no such product was made."""
     known = {product.record["key"]: product for product in found}
-    waiting, used = [key for run in runs for key in run.keys], set()
+    waiting, used = list(named), set()
     while waiting:
         key = waiting.pop()
         if key not in used:

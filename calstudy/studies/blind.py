@@ -13,7 +13,7 @@ import yaml
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.experiment.model import Experiment
-from calstudy.studies.comparison import Comparison
+from calstudy.studies.kinds.comparison import Comparison
 
 SEEDS = ("seed", "seeds", "seeds_without_eor")
 DRAWN = ("sky.foregrounds", "sky.eor", "sky.diffuse", "corruption.noise")

@@ -13,13 +13,13 @@ from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
 from calstudy.calibrate.interface import Calibrator
-from calstudy.experiment.model import Experiment
+from calstudy.experiment.model import Experiment, Folders
 from calstudy.instrument.size import Size
 from calstudy.products.calibration import CALIBRATE_CHUNK
 from calstudy.products.simulation import SIMULATE_CHUNK
 from calstudy.run.store import Store
 from calstudy.run.task import Stage, Task
-from calstudy.studies.study import Budget, Folders
+from calstudy.studies.study import Budget
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """Limits of the number of workers, of which more than cores wait for each other."""
@@ -51,7 +51,7 @@ def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -
     The number of chunks of a simulation changes its visibilities by less than the tolerance of their interpolation,
     and does not change their key in the store. The result is the file, perhaps with more `simulation.chunks`
     and a calibrator that needs less memory, and the number of workers that fit into the memory, or the requested
-    number if no memory was given. `targets` returns the wanted products of a file.
+    number if no memory was given.
 
     Raises
     ------
@@ -65,22 +65,10 @@ def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -
         _require_sharing(file, workers, scheduler)
     if scheduler is not None:
         return file, workers or 1
-    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    # The parent process has the libraries in memory, too.
-    memory -= LIBRARIES_MEMORY
+    memory = _memory(budget)
     hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
     lean = _stream(_cut(_Work(file, targets), memory / hoped), memory / hoped)
-    cut, needs = lean.file, {task: task.cost.memory for task in lean.missing}
-    if not needs:
-        return cut, workers or hoped
-    largest = max(needs, key=needs.__getitem__)
-    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
-    if ranks.count() > 1:
-        return cut, 1
-    fitting = max(1, int(memory // needs[largest]))
-    if workers is not None and budget.max_memory is None:
-        return cut, workers
-    return cut, min(hoped, fitting)
+    return lean.file, _workers(lean.missing, memory, hoped, budget)
 
 
 def require_data_fit(experiment: Experiment, budget: Budget) -> None:
@@ -98,6 +86,26 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
             f"the data have {samples:.3g} samples, which take {need / 1e9:,.1f} GB, and there are "
             f"{memory / 1e9:.1f} GB of memory; use fewer antennas, channels or integrations"
         )
+
+
+def _memory(budget: Budget) -> float:
+    """Return the memory for work, in bytes; the parent process has the libraries in memory, too."""
+    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
+    return memory - LIBRARIES_MEMORY
+
+
+def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget) -> int:
+    """Return how many workers fit into the memory, of those hoped for; raises InputError if not even one does."""
+    needs = {task: task.cost.memory for task in missing}
+    if not needs:
+        return budget.workers or hoped
+    largest = max(needs, key=needs.__getitem__)
+    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
+    if ranks.count() > 1:
+        return 1
+    if budget.workers is not None and budget.max_memory is None:
+        return budget.workers
+    return min(hoped, max(1, int(memory // needs[largest])))
 
 
 def _require_sane(budget: Budget) -> None:

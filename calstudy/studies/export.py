@@ -27,8 +27,8 @@ from calstudy.run.execution import Workers
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
-from calstudy.studies.comparison import Comparison
 from calstudy.studies.folder import log_to, write
+from calstudy.studies.kinds.comparison import Comparison
 from calstudy.studies.study import Budget, make
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def export(
     Parameters
     ----------
     worlds
-        From `calstudy.studies.worlds.load_worlds`, with the calibrator `CARRIER`.
+        From `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`.
     folder
         That of a single world; several worlds have subfolders ``world-1`` and so on.
     file_format

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,11 +12,11 @@ from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
+from calstudy.results.folder import MANIFEST, RunFolder
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task
-from calstudy.studies.collection import Collection
-from calstudy.studies.experiment import ExperimentStudy
-from calstudy.studies.folder import MANIFEST
+from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Study
 
 TABLES = "tables"
@@ -77,12 +76,12 @@ def find_finished(folders: Sequence[Path]) -> list[FinishedRun]:
 
 
 def _read(folder: Path) -> FinishedRun | None:
+    run = RunFolder(folder)
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        tables = {entry["key"]: entry for entry in manifest.get("products", []) if isinstance(entry.get("files"), dict)}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        tables = {entry["key"]: entry for entry in run.products if isinstance(entry.get("files"), dict)}
+    except (InputError, KeyError, TypeError, AttributeError):
         return None
-    return FinishedRun(folder, manifest, tables)
+    return FinishedRun(folder, run.manifest, tables)
 
 
 def with_finished(collection: Study, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Collection:
@@ -106,7 +105,6 @@ def with_finished(collection: Study, folders: Sequence[Path], console: Console, 
         if (reason := _needs_more(collection, name, study)) is not None:
             console.print(f"{name}: will be run ({reason})", markup=False)
             continue
-        assert isinstance(study, ExperimentStudy)
         if (run := _choose(name, study, runs, console)) is not None:
             taken[name] = run, study.tables
     if not taken:
@@ -137,11 +135,11 @@ def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], cons
     return None
 
 
-def _needs_more(collection: Collection, name: str, study: Study) -> str | None:
+def _needs_more(collection: Collection, name: str, study: ExperimentStudy) -> str | None:
     """Return the reason why a collection needs more of a member than its tables, or None."""
-    if not isinstance(study, ExperimentStudy):
+    if not study.kept_tables:
         return "it has realizations; such members are always run"
-    tables = {task.key for task in study.tables}
+    tables = {task.key for task in study.kept_tables}
     others = {task.key for task in study.tasks} - tables
     for task in collection.own:
         for needed in task.needs.values():

@@ -15,29 +15,22 @@ from typing import Any
 from uuid import uuid4
 
 from calstudy.base.errors import InputError, exit_status
-from calstudy.base.identity import digest_json
+from calstudy.results.folder import EXPERIMENT, MANIFEST
 from calstudy.run.provenance import git_commit, machine, of_other_code, other_code, package_versions
 from calstudy.run.store import Product
-from calstudy.run.task import Task
+from calstudy.run.task import Task, unique
 from calstudy.verdicts.tables import CLAIMS_FILES
 
-MANIFEST, EXPERIMENT, LOG = "manifest.json", "experiment.yaml", "run.log"
+LOG = "run.log"
 LEFTOVER = re.compile(r"\..+-[0-9a-f]{32}")
-POINTS, CASES = "points", "cases"
-"""Folders of the run folders of a sweep's points, and of the experiments of a comparison's cases."""
 
 
-def run_folder(runs: Path, name: str, content: Any) -> Path:
-    """Return the folder of a study's runs: its name and a digest of its JSON-able content.
+def open_folder(folder: Path, subfolders: Sequence[str]) -> None:
+    """Make a run folder; raises InputError if it contains files that are not from a run.
 
-    The same study has the same folder; a changed study never overwrites it.
+    `subfolders` are those that a run writes besides figures and tables.
     """
-    return runs.expanduser().resolve() / f"{name}-{digest_json(content)[:8]}"
-
-
-def open_folder(folder: Path) -> None:
-    """Make a run folder; raises InputError if it contains files that are not from a run."""
-    results = {"report.html", "figures", "tables", POINTS, CASES, "regression.json"}
+    results = {"report.html", "figures", "tables", *subfolders, "regression.json"}
     known = results | {MANIFEST, EXPERIMENT, LOG, *CLAIMS_FILES}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -153,7 +146,7 @@ def product_entries(
     tables of the run folder, have the SHA-256 of each file.
     """
     keys, published = {task.key for task in made}, {task.key for task in tables}
-    other = of_other_code(tasks, {task.key: products[task.key] for task in tasks if task.key in products})
+    other = of_other_code(unique(tasks), {task.key: products[task.key] for task in tasks if task.key in products})
     entries = []
     for task in tasks:
         if task.key in products:

@@ -9,11 +9,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from calstudy.experiment.model import Experiment
-from calstudy.studies import collection, comparison, observed, runtime
-from calstudy.studies.collection import CollectionFile
-from calstudy.studies.comparison import ComparisonFile
-from calstudy.studies.observed import ObservedFile
-from calstudy.studies.runtime import RuntimeFile
+from calstudy.studies.study import built_in_kinds
 
 SCHEMA_FILE = "experiment.schema.json"
 """Name of the published schema, next to the experiments."""
@@ -21,16 +17,11 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def experiment_schema() -> str:
-    """Return the JSON schema of experiments, collections, comparisons, run-time studies and measured data as text.
+    """Return the JSON schema of the files of all built-in kinds of study as text.
 
     It has strings for quantities; only ``calstudy plan`` checks units and conditions on several fields.
     """
-    kinds: dict[type[BaseModel], str] = {
-        CollectionFile: collection.KEY,
-        RuntimeFile: runtime.KEY,
-        ComparisonFile: comparison.KEY,
-        ObservedFile: observed.KEY,
-    }
+    kinds = {kind.model: kind.key for kind in built_in_kinds() if kind.model is not Experiment}
     models: list[type[BaseModel]] = [Experiment, *kinds]
     references, found = models_json_schema([(model, "validation") for model in models])
     schema: dict[str, Any] = references[Experiment, "validation"]

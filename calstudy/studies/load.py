@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from calstudy.base.package_files import find_experiment
-from calstudy.experiment.files import load
-from calstudy.experiment.yaml_files import read_mapping
-from calstudy.studies import collection, comparison, observed, runtime
-from calstudy.studies.experiment import ExperimentStudy
-from calstudy.studies.realizations import Realizations
-from calstudy.studies.study import Study
-from calstudy.studies.sweep import expand
+from calstudy.experiment.files import StudyFile
+from calstudy.studies.study import KINDS, Study, kind_of
 
 
 def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Study:
-    """Read an experiment, a sweep, a collection, a comparison, a run-time study or measured data.
+    """Read a file, and return the study that it describes.
 
     Parameters
     ----------
     path
-        The YAML file, or the name of a published one, such as ``quickstart``. A file with the key `experiments` is a
-        collection, with `calibrators` a comparison, with `runtime` a run-time study, with `observed` one of measured
-        data. An experiment with the key `sweep` is the family of its points, with `realizations` all its
-        realizations.
+        The YAML file, or the name of a published one, such as ``quickstart``. The kind of study is that whose `key` it
+        has, or that which its key `study` names; it is an experiment if there is neither. An experiment with the key
+        `sweep` is the family of its points, with `realizations` all its realizations.
     scale
         Name of a set of overrides in the file's `scales`.
     overrides
@@ -37,17 +31,11 @@ def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = 
     ExperimentError
         If fields are unknown, missing, or have values that are not allowed.
     """
-    path = find_experiment(path)
-    data = read_mapping(path)
-    if runtime.KEY in data:
-        return runtime.load_runtime(path, data, scale, overrides)
-    if collection.KEY in data:
-        return collection.load_collection(path, data, scale, overrides)
-    if comparison.KEY in data:
-        return comparison.load_comparison(path, data, scale, overrides)
-    if observed.KEY in data:
-        return observed.load_observed(path, data, scale, overrides)
-    experiment = load(path, scale, overrides)
-    if experiment.realizations:
-        return Realizations(experiment)
-    return expand(experiment) if experiment.sweep else ExperimentStudy(experiment)
+    return study_of(StudyFile.open(path, scale, overrides))
+
+
+def study_of(file: StudyFile) -> Study:
+    """Return the study that the content of a file describes; errors as for `load_study`."""
+    kind = kind_of(file.content, file.folder)
+    plain = {key: value for key, value in file.content.items() if key != KINDS.tag}
+    return kind.load(replace(file, content=plain))

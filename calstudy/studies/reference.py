@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import types
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, nearest
 from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
-from calstudy.experiment.model import Experiment, RealizationBlock, Variant
-from calstudy.instrument.as_built import DeadDipoles
-from calstudy.instrument.settings import AntennaBeam
-from calstudy.studies.collection import CollectionFile, Member
-from calstudy.studies.comparison import ComparisonFile
-from calstudy.studies.observed import ObservedFile
-from calstudy.studies.runtime import RuntimeFile
+from calstudy.experiment.model import Experiment
+from calstudy.studies.study import KINDS, Study, built_in_kinds
 
 
 def _alternatives(annotation: Any) -> list[Any]:
@@ -122,6 +119,16 @@ def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[s
             tags = get_args(block.model_fields[tag].annotation)
             yield from (f"### `{path}: {' | '.join(map(str, tags))}`", "")
             yield from _section(block, path, listed)
+    elif len(items := _items(info.annotation)) == 1:
+        yield from (f"## `{path}`: each", "", *_section(items[0], path, listed))
+
+
+def _items(annotation: Any) -> list[type[BaseModel]]:
+    """Return the blocks, but for plug-ins, that a field accepts as items of a list, or as values of a mapping."""
+    lists = [item for item in _alternatives(annotation) if get_origin(item) in (tuple, dict)]
+    return [
+        block for item in lists for value in get_args(item) for block in _blocks(value) if not issubclass(block, Plugin)
+    ]
 
 
 def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iterator[str]:
@@ -160,12 +167,10 @@ def plugin_reference(path: Path) -> str:
         If the file cannot be run, or contains none.
     """
     module = load_file(path)
-    found = [
-        value
-        for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, Plugin) and value.__module__ == module.__name__
-    ]
-    if not found:
+    own = [thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__]
+    kinds = [thing for thing in own if issubclass(thing, Study)]
+    found = [thing for thing in own if issubclass(thing, Plugin)]
+    if not found and not kinds:
         raise InputError(
             f"{path}: holds no calibrator, figure or the like (no subclass of calstudy.base.plugins.Plugin)"
         )
@@ -174,7 +179,32 @@ def plugin_reference(path: Path) -> str:
         tag = plugin.registry.tag
         lines += [f"# {plugin.registry.noun.capitalize()} `{tag}: {path.name}:{plugin.__name__}`", ""]
         lines += _section(plugin, "", {})
+    for kind in kinds:
+        lines += [f"# Files with `{KINDS.tag}: {path.name}:{kind.__name__}`", "", *_section(kind.model, "", {})]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def section_reference(section: str) -> str:
+    """Return the part of the reference with one section, such as ``calibration.basis``, and the sections inside it.
+
+    Raises
+    ------
+    InputError
+        If there is no such section.
+    """
+    sections: list[str] = []
+    for kind_of_file in re.split(r"^(?=# )", field_reference(), flags=re.MULTILINE):
+        parts = re.split(r"^(?=##+ `([\w.]+))", kind_of_file, flags=re.MULTILINE)[1:]
+        paths, texts = parts[::2], parts[1::2]
+        chosen = [text for path, text in zip(paths, texts, strict=True) if f"{path}.".startswith(f"{section}.")]
+        if chosen:
+            return "".join(chosen).rstrip() + "\n"
+        sections += paths
+    first = ", ".join(dict.fromkeys(path for path in sections if "." not in path))
+    raise InputError(
+        f"{section}: neither a section of experiment files{nearest(section, sections)} (at the top: {first}), "
+        "nor a Python file"
+    )
 
 
 def field_reference() -> str:
@@ -183,57 +213,14 @@ def field_reference() -> str:
     lines = [
         "# Experiment files",
         "",
-        "Written by `python -m calstudy fields`; do not edit. An experiment file is YAML. Everything but `name` has a",
-        "default, which is the paper's value where the paper has one. Physical quantities are written with their unit",
-        '(`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a choice, its name alone stands for it with its defaults:',
-        "`beam: airy` is `beam: {kind: airy}`. Relative paths of input files start at the experiment file.",
+        "An experiment file is YAML. Everything but `name` has a default, which is the paper's value where the paper",
+        'has one. Physical quantities are written with their unit (`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a',
+        "choice, its name alone stands for it with its defaults: `beam: airy` is `beam: {kind: airy}`. Relative paths",
+        "of input files start at the experiment file. `calstudy fields SECTION` prints one section of this page.",
         "",
         *_section(Experiment, "", listed),
-        "## `variants`: each",
-        "",
-        *_section(Variant, "variants", listed),
-        "## `realizations`: each",
-        "",
-        *_section(RealizationBlock, "realizations", listed),
-        "## `instrument.antenna_beams`: each",
-        "",
-        *_plain_section(AntennaBeam),
-        "`beam` takes what `instrument.beam` does.",
-        "",
-        "## `instrument.as_built.dipoles.dead`: each",
-        "",
-        *_plain_section(DeadDipoles),
-        "# Collection files",
-        "",
-        "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run",
-        "folder, and figures and claims of all of them in the folder of the collection; `--scale` and `--set` go to",
-        "every member.",
-        "",
-        *_section(CollectionFile, "", listed),
-        "## `experiments`: each",
-        "",
-        *_section(Member, "experiments", listed),
-        "",
-        "# Comparison files",
-        "",
-        "A file with the key `calibrators` is a comparison. `python -m calstudy run` calibrates the data of each world",
-        "with each calibrator, and compares the results in tables and figures; `--set` changes the experiment of every",
-        "case.",
-        "",
-        *_section(ComparisonFile, "", listed),
-        "",
-        "# Run-time files",
-        "",
-        "A file with the key `runtime` is a run-time study. `python -m calstudy run` times the solvers here,",
-        "one array after the other; what it measured is kept under a key that names the machine.",
-        "",
-        *_section(RuntimeFile, "", listed),
-        "",
-        "# Files about measured data",
-        "",
-        "A file with the key `observed` is about measured data ([measured-data.md](measured-data.md)): these are",
-        "calibrated, have power spectra, and are calibrated again with an injected EoR.",
-        "",
-        *_section(ObservedFile, "", listed),
     ]
+    for kind in built_in_kinds():
+        if kind.heading:
+            lines += [f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed)]
     return "\n".join(lines).rstrip() + "\n"

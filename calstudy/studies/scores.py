@@ -17,6 +17,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.base.identity import digest_json, identity
 from calstudy.base.schema import Section
+from calstudy.base.table import Table, one_line, plain_text
 from calstudy.calibrate.interface import Status
 from calstudy.experiment.model import Experiment
 from calstudy.power.score import BANDS
@@ -28,11 +29,10 @@ from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import COUNTS, upper_limit
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
-from calstudy.studies.comparison import Comparison
 from calstudy.studies.export import Contents
 from calstudy.studies.folder import log_to
+from calstudy.studies.kinds.comparison import Comparison
 from calstudy.studies.study import Budget, make
-from calstudy.verdicts.tables import Table, one_line, plain_text
 
 LOG = "score.log"
 VERIFIED = "verified.txt"
@@ -135,11 +135,11 @@ def scoring_of(experiment: Experiment) -> str:
 def measure_scores(study: Comparison, budget: Budget, console: Console) -> Scores:
     """Return the scores of all cases of a comparison, and make products that are missing in the store.
 
-    The study comes from `calstudy.studies.worlds.load_worlds`.
+    The study comes from `calstudy.studies.kinds.comparison.load_worlds`.
     """
     for label in {study.name, *(label for case in study.cases for label in (case.world, case.calibrator))}:
         _require_label(label)
-    study, count = study.fitted(budget)
+    study, count = study.sized_to(budget)
     runs = study.outputs.runs.expanduser()
     runs.mkdir(parents=True, exist_ok=True)
     cases = [case for case in study.cases if not case.refusal]

@@ -14,13 +14,13 @@ from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory,
 from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
 from calstudy.report.headline import PLACE, read_signal
 from calstudy.report.page import REPORT
+from calstudy.results.folder import MANIFEST, RunFolder
 from calstudy.run.execution import largest_disk, schedule
 from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
-from calstudy.studies.folder import MANIFEST
 from calstudy.studies.study import Budget, Run, Study, said_of_other_code
-from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_JSON, CLAIMS_MARKDOWN, from_json, measured, tally
+from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_MARKDOWN, measured, tally
 
 NAMED = 8
 """Number of run folders that a plan names; it counts the others."""
@@ -45,9 +45,9 @@ def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[st
     InputError
         If the study does not fit, or store or run folders cannot be written.
     """
-    study, workers = study.fitted(budget)
+    study, workers = study.sized_to(budget)
     store = Store(study.outputs.store)
-    plan = schedule(study.targets, store, study.given, strict)
+    plan = schedule(study.targets, store, study.external_keys, strict)
     if plan.todo:
         require_writable(store.root, f"outputs.store = {str(store.root)!r}")
     require_writable(study.folder.parent, f"outputs.runs = {str(study.folder.parent)!r}")
@@ -84,7 +84,7 @@ def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[st
         "notes": notes,
         "sites": sites(study.tasks),
         "store": str(store.root),
-        "run_folders": [str(folder) for folder in study.folders],
+        "run_folders": [str(part.folder) for part in study.with_parts()],
     }
 
 
@@ -186,7 +186,7 @@ def _show_products(run: Run, console: Console) -> None:
 
 def _show_signal(folder: Path, console: Console) -> None:
     """Print T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
-    signal = read_signal(folder)
+    signal = read_signal(RunFolder(folder))
     if signal is None:
         return
     numbers = ", ".join(f"{number.name} {number.text}" for number in signal.numbers)
@@ -198,8 +198,7 @@ def _show_signal(folder: Path, console: Console) -> None:
 def _show_criteria(folder: Path, console: Console) -> None:
     """Print the verdicts on the criteria for the realizations of an experiment; nothing for other runs."""
     path = folder / "tables" / VERDICTS
-    if path.is_file():
-        verdicts = from_json(path.read_text(encoding="utf-8"))
+    if verdicts := RunFolder(folder).verdicts(path):
         for verdict in verdicts:
             text = f"{verdict.name}: {verdict.verdict}: {measured(verdict)}, must be {verdict.threshold}"
             console.print(text, markup=False)
@@ -208,15 +207,15 @@ def _show_criteria(folder: Path, console: Console) -> None:
 
 def _show_claims(folder: Path, console: Console) -> None:
     """Print the counts of claims of a run, the contradicted ones, and the file of all; nothing without claims."""
-    path = folder / CLAIMS_JSON
-    verdicts = from_json(path.read_text(encoding="utf-8")) if path.is_file() else []
+    finished = RunFolder(folder)
+    verdicts = finished.claims
     for verdict in verdicts:
         if verdict.verdict == "contradicted":
             text = f"claim contradicted: {verdict.name}: {measured(verdict)}, must be {verdict.threshold}"
             console.print(text, markup=False)
     if verdicts:
         console.print(f"claims: {tally(verdicts)}: {folder / CLAIMS_MARKDOWN}", markup=False)
-    elif path.is_file():
+    elif finished.has_claims:
         text = "claims: none, for the run plays no role in the papers that it names; for the reasons see"
         console.print(f"{text} {folder / CLAIMS_MARKDOWN}", markup=False)
     if (folder / BY_SOLVER_MARKDOWN).is_file():

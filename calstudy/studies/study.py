@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 import logging
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 from rich.console import Console
 
-from calstudy.base.errors import InputError
+from calstudy.base.identity import digest_json
+from calstudy.base.plugins import Registry
+from calstudy.base.schema import Section
+from calstudy.experiment.files import StudyFile, dump
+from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
 from calstudy.run.execution import Lifetimes, Schedule, Workers, drop, execute, found_of, schedule
 from calstudy.run.progress import report
 from calstudy.run.provenance import of_other_code, other_code
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
-from calstudy.studies.folder import LOG, log_to, open_folder
+from calstudy.studies.folder import (
+    EXPERIMENT,
+    LOG,
+    log_to,
+    open_folder,
+    product_entries,
+    publish,
+    write,
+    write_manifest,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +59,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Made:
+class RunProducts:
     """Products of a study.
 
     `products`, by key, are those that were made or looked up, and all others behind them that are still in the
@@ -55,11 +69,11 @@ class Made:
     products: Mapping[str, Product]
     tasks: tuple[Task, ...]
 
-    def of(self, tasks: Sequence[Task]) -> Made:
+    def subset(self, tasks: Sequence[Task]) -> RunProducts:
         """Return the products of some tasks."""
         keys = {task.key for task in tasks}
         products = {key: product for key, product in self.products.items() if key in keys}
-        return Made(products, tuple(task for task in self.tasks if task.key in keys))
+        return RunProducts(products, tuple(task for task in self.tasks if task.key in keys))
 
 
 @dataclass(frozen=True)
@@ -79,7 +93,7 @@ class Run:
     """
 
     folder: Path
-    made: Made
+    made: RunProducts
     tasks: tuple[Task, ...]
     parts: Mapping[str, Run]
 
@@ -94,64 +108,121 @@ class Run:
         ]
 
 
-class Folders(Protocol):
-    """Folders of the products and of the runs of a study."""
-
-    @property
-    def store(self) -> Path:
-        """Folder of products."""
-
-    @property
-    def runs(self) -> Path:
-        """Folder in which each run gets its own folder."""
-
-
 class Study(ABC):
-    """The content of a file: an experiment, a sweep, realizations, a collection, a run-time study and others.
+    """The content of a file: an experiment, a family of experiments, measured data, run times.
 
-    A new kind is a subclass, with the key of its files in `calstudy.studies.load`.
+    A kind of study is a subclass in a file of its own: a module of `calstudy.studies.kinds`, or a file or an
+    installed package that the key `study` of a file names.
+
+    Attributes
+    ----------
+    key
+        The key that marks a file of a built-in kind.
+    model
+        The content of a file.
+    heading, guide
+        Of the kind in the reference of all fields, and what is written there about its files.
+    subfolders
+        Folders in the run folder besides figures and tables.
+    has_reference
+        True if figures and claims of a run may be a reference for `calstudy regress`.
     """
 
-    name: str
-    description: str
+    key: ClassVar[str] = ""
+    model: ClassVar[type[Section]]
+    heading: ClassVar[str] = ""
+    guide: ClassVar[str] = ""
+    subfolders: ClassVar[tuple[str, ...]] = ()
+    has_reference: ClassVar[bool] = True
+
+    file: Any
+    """Content of the file: its model, with name, description and, if `outputs` is not replaced, outputs."""
+
+    @classmethod
+    @abstractmethod
+    def load(cls, file: StudyFile) -> Study:
+        """Return the study of a file; raises InputError or ExperimentError if it cannot be used."""
 
     @property
-    @abstractmethod
+    def name(self) -> str:
+        """The name of the study and its run folder."""
+        return self.file.name
+
+    @property
+    def description(self) -> str:
+        """The description in the file."""
+        return self.file.description
+
+    @property
     def outputs(self) -> Folders:
         """Store and folder of runs."""
-
-    @abstractmethod
-    def fitted(self, budget: Budget) -> tuple[Self, int]:
-        """Return the study fitted to a budget, and the number of workers; raises InputError if it does not fit."""
+        return self.file.outputs
 
     @property
     @abstractmethod
-    def targets(self) -> Sequence[Task]:
-        """Products that a run makes for its user; the others are made on the way."""
+    def content(self) -> Any:
+        """JSON-able content that decides what a run makes; its digest is part of the name of the run folder."""
+
+    @cached_property
+    def folder(self) -> Path:
+        """The run folder: the same study has the same one, and a changed study never overwrites it."""
+        runs = self.outputs.runs.expanduser().resolve()
+        return runs / f"{self.name}-{digest_json(self.content)[:8]}"
+
+    @abstractmethod
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study cut to a budget, and the number of workers; raises InputError if it does not fit."""
 
     @property
-    @abstractmethod
     def stand_ins(self) -> tuple[str, ...]:
         """Substitutions for the papers' own ingredients, printed with the results."""
-
-    @property
-    @abstractmethod
-    def folder(self) -> Path:
-        """The run folder."""
+        return ()
 
     @property
     def parts(self) -> Mapping[str, Study]:
         """Studies of which this one consists, with their own run folders, by name."""
         return {}
 
-    @abstractmethod
-    def fill(self, made: Made) -> None:
-        """Write figures, tables, claims, the manifest and the file itself to the run folder."""
+    @property
+    def figures(self) -> Sequence[Task]:
+        """The figures."""
+        return ()
+
+    @property
+    def tables(self) -> Sequence[Task]:
+        """The products whose files are the tables."""
+        return ()
+
+    @property
+    def claims(self) -> Task | None:
+        """The evaluated statements of papers, or None."""
+        return None
+
+    @property
+    def texts(self) -> Mapping[str, str]:
+        """Further files of the run folder, such as the resolved file: their content by relative path."""
+        named = "" if self.is_built_in() else f"{KINDS.tag}: {KINDS.reference_of(type(self))}\n"
+        return {EXPERIMENT: named + dump(self.file)}
+
+    @property
+    def entries(self) -> Mapping[str, Any]:
+        """Entries of the manifest besides those that all kinds have."""
+        return {}
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes of a plan on settings that are probably a mistake, of the study and its parts, once each."""
         return tuple(dict.fromkeys(note for part in self.parts.values() for note in part.notes))
+
+    @property
+    def own(self) -> list[Task]:
+        """The products that a run makes for its user, without those of the parts."""
+        return [*self.figures, *self.tables, *([self.claims] if self.claims else [])]
+
+    @property
+    def targets(self) -> list[Task]:
+        """The products that a run makes for its user; others are made on the way."""
+        return [*(task for part in self.parts.values() for task in part.targets), *self.own]
 
     @cached_property
     def tasks(self) -> list[Task]:
@@ -159,31 +230,72 @@ class Study(ABC):
         return unique(self.targets)
 
     @property
-    def given(self) -> frozenset[str]:
+    def recorded(self) -> Sequence[Task]:
+        """The tasks that the manifest lists: all, or, of a study with parts, those that are not in theirs."""
+        return self.own if self.parts else self.tasks
+
+    @property
+    def kept_tables(self) -> Sequence[Task]:
+        """Tables that the manifest lists with digests, so that another study can take them from the run folder."""
+        return ()
+
+    @property
+    def external_keys(self) -> frozenset[str]:
         """Keys of products that a run of this study needs but does not make."""
         return frozenset()
 
-    @property
-    def folders(self) -> list[Path]:
-        """The run folders of the study and of its parts."""
-        return [self.folder, *(folder for part in self.parts.values() for folder in part.folders)]
+    @classmethod
+    def is_built_in(cls) -> bool:
+        """Return whether the kind is one of calstudy's own, whose files have its key."""
+        return cls.__module__.startswith(f"{KINDS.package}.")
+
+    def with_parts(self) -> Iterator[Study]:
+        """Yield the study and all of its parts."""
+        yield self
+        for part in self.parts.values():
+            yield from part.with_parts()
+
+    def write_results(self, made: RunProducts) -> None:
+        """Write figures, tables, claims, texts and the manifest to the run folder."""
+        publish([made.products[task.key] for task in self.figures], self.folder / "figures")
+        if self.tables:
+            publish([made.products[task.key] for task in self.tables], self.folder / "tables")
+        if self.claims is not None:
+            publish([made.products[self.claims.key]], self.folder)
+        for name, text in self.texts.items():
+            (self.folder / name).parent.mkdir(exist_ok=True)
+            write(self.folder / name, text)
+        places = {name: os.path.relpath(part.folder, self.folder) for name, part in self.parts.items()}
+        entries = {
+            "description": self.description,
+            "stand_ins": list(self.stand_ins),
+            "captions": {task.label: task.settings["figure"].caption for task in self.figures},
+            **({"parts": places} if places else {}),
+            **self.entries,
+            "products": product_entries(self.recorded, made.products, made.tasks, self.kept_tables),
+        }
+        write_manifest(self.folder, self.name, entries)
 
 
-S = TypeVar("S", bound=Study)
+KINDS: Registry[Any] = Registry("kind", "calstudy.studies.kinds", "calstudy.studies.study:Study", tag="study")
 
 
-def fitted_parts(parts: Mapping[str, S], budget: Budget) -> dict[str, tuple[S, int]]:
-    """Return every part of a study fitted to a budget, with its number of workers; an InputError names the part."""
-    fits = {}
-    for name, part in parts.items():
-        try:
-            fits[name] = part.fitted(budget)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from None
-    return fits
+def built_in_kinds() -> list[type[Study]]:
+    """Return the built-in kinds of study."""
+    return [KINDS.find(name) for name in KINDS.built_in()]
 
 
-def make(targets: Sequence[Task], store: Store, workers: Workers, console: Console, strict: bool = False) -> Made:
+def kind_of(content: Mapping[str, Any], folder: Path | None = None) -> type[Study]:
+    """Return the kind of study of a file; a path of the key `study` starts at `folder`. InputError if there is none."""
+    if KINDS.tag in content:
+        return KINDS.class_of(content, None, folder)[0]
+    marked = [kind for kind in built_in_kinds() if kind.key in content and kind.model is not Experiment]
+    return marked[0] if marked else KINDS.find("experiment")
+
+
+def make(
+    targets: Sequence[Task], store: Store, workers: Workers, console: Console, strict: bool = False
+) -> RunProducts:
     """Make the products that are missing in the store with all their inputs, and report the progress.
 
     A read-only store is sufficient if nothing is missing. With `strict`, products of other code or other package
@@ -219,7 +331,7 @@ def make(targets: Sequence[Task], store: Store, workers: Workers, console: Conso
             console.print(text, markup=False)
 
         products = execute(plan.todo, store, workers, done, told, plan.again)
-    return Made({**found_of(unique(targets), store), **products}, plan.todo)
+    return RunProducts({**found_of(unique(targets), store), **products}, plan.todo)
 
 
 def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) -> list[str]:
@@ -252,19 +364,19 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
         input.
     """
     budget, console = budget or Budget(), console or Console(quiet=True)
-    study, count = study.fitted(budget)
+    study, count = study.sized_to(budget)
     store = Store(study.outputs.store)
     with ExitStack() as logs:
-        for folder in study.folders:
-            open_folder(folder)
-            logs.enter_context(log_to(folder / LOG))
+        for part in study.with_parts():
+            open_folder(part.folder, part.subfolders)
+            logs.enter_context(log_to(part.folder / LOG))
         made = make(study.targets, store, Workers(count, study.folder / LOG, budget.scheduler), console, strict)
         return _filled(study, made)
 
 
-def _filled(study: Study, made: Made) -> Run:
+def _filled(study: Study, made: RunProducts) -> Run:
     parts = {name: _filled(part, made) for name, part in study.parts.items()}
-    own = made.of(study.tasks)
-    study.fill(own)
+    own = made.subset(study.tasks)
+    study.write_results(own)
     write_report(study.folder)
     return Run(study.folder, own, tuple(study.tasks), parts)

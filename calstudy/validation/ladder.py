@@ -17,7 +17,7 @@ from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.run.task import Task, unique
 from calstudy.studies.folder import LOG, log_to, product_entries, publish, write_manifest
-from calstudy.studies.study import Made, make
+from calstudy.studies.study import RunProducts, make
 from calstudy.validation.outcomes import Outcome, failed, judge, write_tables
 from calstudy.validation.product import FINDINGS, measurement_task
 from calstudy.validation.steps import Step
@@ -71,15 +71,17 @@ def run_ladder(steps: Sequence[Step], store: Path, folder: Path, workers: int, c
     return LadderRun(folder, tuple(outcomes))
 
 
-def _make(tasks: Mapping[str, Task], store: Store, workers: Workers, console: Console) -> tuple[Made, dict[str, str]]:
+def _make(
+    tasks: Mapping[str, Task], store: Store, workers: Workers, console: Console
+) -> tuple[RunProducts, dict[str, str]]:
     """Make all measurements together; if one fails, make them one by one, so that only that one is lost."""
     try:
         return make(list(tasks.values()), store, workers, console), {}
     except InputError as error:
         logger.warning("%s", error)
         if len(tasks) == 1:
-            return Made({}, ()), dict.fromkeys(tasks, str(error))
-    all_made, reasons = Made({}, ()), {}
+            return RunProducts({}, ()), dict.fromkeys(tasks, str(error))
+    all_made, reasons = RunProducts({}, ()), {}
     for name, task in tasks.items():
         try:
             made = make([task], store, workers, console)
@@ -87,11 +89,11 @@ def _make(tasks: Mapping[str, Task], store: Store, workers: Workers, console: Co
             reasons[name] = str(error)
             console.print(f"step {name}: {error}", markup=False)
         else:
-            all_made = Made({**all_made.products, **made.products}, (*all_made.tasks, *made.tasks))
+            all_made = RunProducts({**all_made.products, **made.products}, (*all_made.tasks, *made.tasks))
     return all_made, reasons
 
 
-def _keep(outcome: Outcome, task: Task, made: Made, folder: Path) -> None:
+def _keep(outcome: Outcome, task: Task, made: RunProducts, folder: Path) -> None:
     """Write the folder of a step; a failed one twice, so that a later run does not replace it."""
     step = outcome.step
     own = folder / step.name

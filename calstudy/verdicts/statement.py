@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from calstudy.base.errors import InputError
 from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
 
 SIGMAS = 2.0
@@ -15,8 +16,8 @@ LAST_DIGIT = 1e-9
 """Fraction of that half width below which a difference is rounding."""
 
 
-class Unevaluated(Exception):
-    """A statement cannot be evaluated on a run; the message says what is missing."""
+class Unevaluated(InputError):
+    """A statement cannot be evaluated on a run, or a table is not there; the message says what is missing."""
 
 
 @dataclass(frozen=True)

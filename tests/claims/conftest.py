@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calstudy.claims.results import RunResults
 from calstudy.experiment.files import validate
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
+from calstudy.results.reader import Results
 
 SIGNAL = 1e7
 EDGES = 0.04 * np.arange(85)
@@ -175,10 +175,10 @@ KINDS = ("eor", "noise", "uncorrupted", "uncalibrated", "residual", "residual_wi
 
 
 @pytest.fixture
-def make_study(tmp_path) -> Callable[..., RunResults]:
+def make_study(tmp_path) -> Callable[..., Results]:
     """Return a maker of studies: `make(name, kinds, **facts of World)`."""
 
-    def make(name: str = "run", kinds: tuple[str, ...] = KINDS, seed: int = 1, **truth: Any) -> RunResults:
+    def make(name: str = "run", kinds: tuple[str, ...] = KINDS, seed: int = 1, **truth: Any) -> Results:
         world = World(**truth)
         folder = tmp_path / name
         folder.mkdir(parents=True)
@@ -199,6 +199,6 @@ def make_study(tmp_path) -> Callable[..., RunResults]:
         calibration = {"weights": "flags", **world.facts.get("calibration", {})}
         data = {"name": name, "papers": ["calamity2022"], **world.facts, "calibration": calibration}
         experiment = validate(data, tmp_path)
-        return RunResults(experiment, (folder,))
+        return Results((folder,), experiment)
 
     return make

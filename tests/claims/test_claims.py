@@ -636,6 +636,6 @@ def test_folders_that_cannot_be_evaluated_are_told(make_study, tmp_path):
     assert evaluate_folder(folder, ["calamity2022"]).claims
     with pytest.raises(InputError, match="'calamity' is not a paper"):
         evaluate_folder(folder, ["calamity"])
-    (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "points": []}))
-    with pytest.raises(InputError, match="is the folder of a sweep; give that of one of its points"):
+    (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "parts": {"a": "points/a"}}))
+    with pytest.raises(InputError, match="is the folder of several runs; give that of one of them"):
         evaluate_folder(folder)

@@ -9,16 +9,10 @@ from calstudy.base.errors import InputError
 from calstudy.experiment.files import apply_scale, dump, load, override, parse_override, validate
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import parse_yaml, read_mapping
-from calstudy.studies.collection import Collection
-from calstudy.studies.comparison import Comparison
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.collection import Collection
 from calstudy.studies.load import load_study
-from calstudy.studies.observed import ObservedStudy
 from calstudy.studies.preflight import require_calibration
-from calstudy.studies.realizations import Realizations
-from calstudy.studies.runtime import RuntimeStudy
 from calstudy.studies.study import Study
-from calstudy.studies.sweep import Sweep
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 HERE = Path(__file__).parent
@@ -37,12 +31,7 @@ def scales_of(study: Study) -> set[str]:
     """Return the names of the scales of a file, or of all members of a collection."""
     if isinstance(study, Collection):
         return set.intersection(*(set(experiment.scales) for experiment in study.members.values()))
-    if isinstance(study, RuntimeStudy | Comparison | ObservedStudy):
-        return set(study.file.scales)
-    if isinstance(study, Sweep):
-        return set(study.base.scales)
-    assert isinstance(study, ExperimentStudy | Realizations)
-    return set(study.experiment.scales)
+    return set(study.file.scales)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

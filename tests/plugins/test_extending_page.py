@@ -1,19 +1,18 @@
-"""Every example of docs/extending.md is run as it is printed: each section is one kind of thing."""
+"""Every example of docs/extending*.md is run as it is printed: each section is one kind of thing."""
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 import yaml
+from plugin_files import TEXT
 from tiny import tiny
 
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import plugin_reference
 from calstudy.studies.study import Budget, run_study
 
-PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", flags=re.MULTILINE | re.DOTALL)
 MOST_LINES = 40
 
@@ -21,7 +20,7 @@ MOST_LINES = 40
 def sections() -> dict[str, dict[str, str]]:
     """Return the blocks of each section that has some, by the section's title and the language of the block."""
     found = {}
-    for text in re.split(r"^## ", PAGE, flags=re.MULTILINE)[1:]:
+    for text in re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]:
         blocks = {match["language"]: match["text"] for match in BLOCK.finditer(text)}
         if blocks:
             found[text.splitlines()[0]] = blocks

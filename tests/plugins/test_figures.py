@@ -20,6 +20,7 @@ from calstudy.experiment.model import FIGURES
 from calstudy.regression.comparison import compare_figures, rules_of
 from calstudy.regression.reference import accept, read_reference, read_run
 from calstudy.report.contents import read_contents
+from calstudy.results.folder import RunFolder
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
@@ -43,10 +44,11 @@ class Broken(StudyFigure):
         raise KeyError("no such array")
 """
 SIZES = """
-from calstudy.figures import ComparisonFigure, Drawing
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 
-class Sizes(ComparisonFigure):
+class Sizes(StudyFigure):
+    of = ("collection",)
     caption = "Sizes."
     titles = {"small": "Small", "large": "Large"}
 
@@ -96,7 +98,7 @@ def test_it_is_drawn_into_the_run_folder_with_its_caption_in_the_order_of_the_fi
     captions = json.loads((finished.folder / "manifest.json").read_text())["captions"]
     assert list(captions) == ["wedge", NAME, "layout"]
     assert captions[NAME] == CAPTION
-    shown = {picture.name: picture.caption for picture in read_contents(finished.folder).pictures}
+    shown = {picture.name: picture.caption for picture in read_contents(RunFolder(finished.folder)).pictures}
     assert list(shown) == ["wedge", NAME, "layout"]
     assert f"{NAME}</strong>: {CAPTION}" in (finished.folder / "report.html").read_text()
 
@@ -133,7 +135,7 @@ def test_an_installed_one_is_used_by_its_name(folder, finished, monkeypatch, tmp
         ("none.py", {}, "cannot be read (No such file or directory)"),
         ("wegde", {}, "outputs.figures.1: 'wegde' is not a figure, did you mean 'wedge'? (there are: baselines, "),
         ("layout", {}, "outputs.figures.1: 'layout' cannot name a picture, or does so already"),
-        ("sizes.py", {}, "outputs.figures: asks for 'sizes', which compares the members of a collection"),
+        ("sizes.py", {}, "outputs.figures: asks for 'sizes', which is a figure for collection files"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_in_a_sentence(tmp_path, figure, changes, told):

@@ -19,6 +19,7 @@ from calstudy.claims.folders import evaluate_folder
 from calstudy.experiment.files import override, validate
 from calstudy.regression.reference import accept, read_reference
 from calstudy.report.contents import read_contents
+from calstudy.results.folder import RunFolder
 from calstudy.studies.load import load_study
 from calstudy.studies.show import show_run
 from calstudy.studies.study import Budget, Run, run_study
@@ -63,7 +64,7 @@ def test_its_statements_are_judged_as_they_come_out(folder):
     assert "no EoR is lost outside the wedge" in text
     assert "claim contradicted: signal-kept" in shown
     assert "claims: 2 sentences: 1 supported, 1 contradicted; 2 statements: 1 supported, 1 contradicted" in shown
-    (table,) = [table for table in read_contents(run.folder).tables if table.title == "Claims of the paper"]
+    (table,) = [table for table in read_contents(RunFolder(run.folder)).tables if table.title == "Claims of the paper"]
     assert [row[-1] for row in table.rows] == ["supported", "contradicted"]
 
 

@@ -12,7 +12,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, plain
 from calstudy.experiment.files import override, validate
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 
 BASE: dict[str, Any] = {
     "name": "fields",

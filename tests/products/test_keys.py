@@ -11,7 +11,7 @@ from calstudy.experiment.files import override, validate
 from calstudy.products import calibration, corruption, signal_loss, simulation, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task, unique
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 
 BASE = {
     "name": "keys",

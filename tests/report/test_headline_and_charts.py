@@ -1,74 +1,73 @@
 """The numbers on top of a report, and the arrays that its charts are drawn from."""
 
 import base64
-import csv
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calstudy.power.score import Score
+from calstudy.power.tables import save_spectrum
+from calstudy.products.score import BANDS
 from calstudy.report.charts import read_charts
-from calstudy.report.headline import read_excess, read_headline
+from calstudy.report.headline import read_headline, read_signal
+from calstudy.results.folder import RunFolder
 
-K = np.arange(0.05, 1, 0.1)
+EDGES = np.array([0.1, 0.2, 0.5, 1.0])
 SCALE = 1.1
 
 
-def spectrum_csv(path, power, modes, noise_error):
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["k [h/Mpc]", "power real [mK2 h-3 Mpc3]", "noise error [mK2 h-3 Mpc3]", "modes"])
-        writer.writerows(zip(K, power, noise_error, modes, strict=True))
+def scores(bias: float = 0.07, bias_error: float = 0.014) -> Score:
+    """Scores with these numbers between 0.2 and 0.5 h/Mpc, and others elsewhere."""
+
+    def bands(value: float, elsewhere: float) -> np.ndarray:
+        return np.array([elsewhere, value, elsewhere])
+
+    return Score(
+        k=(EDGES[1:] + EDGES[:-1]) / 2,
+        bin_edges=EDGES,
+        transfer=bands(0.757, 0.1),
+        transfer_error=bands(0.012, 0.5),
+        bias=bands(bias, 1e6),
+        bias_error=bands(bias_error, 1e-3),
+        recovered=bands(1.0, 2.0),
+        recovered_error=bands(0.1, 0.2),
+        flux_scale=SCALE,
+    )
 
 
-@pytest.fixture
-def tables(tmp_path):
-    """An EoR of 100, of which 0.5 and 0.8 are left, and a bias of 7 % of it at 0.2 to 0.5 h/Mpc."""
-    folder = tmp_path / "tables"
-    folder.mkdir()
-    modes = np.where(K < 0.3, 10, 30)
-    signal = np.where(K < 0.1, np.nan, 100.0)
-    spectrum_csv(folder / "eor.outside-wedge.csv", signal, modes, np.zeros(K.size))
-    residual = np.where((K > 0.2) & (K < 0.5), 7 / SCALE**2, 1e6)
-    spectrum_csv(folder / "residual_without_eor.outside-wedge.csv", residual, modes, np.full(K.size, 2 / SCALE**2))
-    with (folder / "transfer-bands.outside-wedge.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        names = ("transfer without flux scale", "transfer without flux scale error", "flux scale")
-        writer.writerow(["k from [h/Mpc]", "k to [h/Mpc]", *names])
-        for low, high, value in ((0.1, 0.2, 0.0), (0.2, 0.3, 0.5), (0.3, 0.5, 0.8), (0.5, 1.0, 9.0)):
-            writer.writerow([low, high, value, 0.07, SCALE])
-    return folder
+def finished_run(folder: Path, score: Score) -> RunFolder:
+    (folder / "tables").mkdir(exist_ok=True)
+    save_spectrum(folder / "tables" / BANDS, score)
+    return RunFolder(folder)
 
 
-def test_the_headline_pools_modes_of_its_band_and_is_free_of_the_flux_scale(tables):
-    numbers = {number.name: number.text for number in read_headline(tables.parent)}
-    # 10 modes of the first band, 60 of the second.
-    mean, error = (10 * 0.5 + 60 * 0.8) / 70, 0.07 * np.hypot(10, 60) / 70
-    assert numbers["T"] == f"{mean:.3f} ± {error:.3f}"
-    # 10, 30 and 30 modes, each with an error of 0.02 of the EoR.
-    assert numbers["bias"] == f"0.070 ± {0.02 * np.sqrt(10**2 + 2 * 30**2) / 70:.3f}"
-    assert numbers["flux scale"] == "1.1000"
-    assert "claims" not in numbers
+def test_the_headline_is_the_score_of_its_band(tmp_path):
+    numbers = {number.name: number.text for number in read_headline(finished_run(tmp_path, scores()))}
+    assert numbers == {"T": "0.757 ± 0.012", "bias": "0.070 ± 0.014", "flux scale": "1.1000"}
 
 
 @pytest.mark.parametrize(
-    ("power", "told"),
-    # The noise of the band is 0.014 of the EoR; a bias as large as the EoR, of either sign, is told.
-    [(7, None), (90, None), (3400, "34 times"), (-1e6, "10,000 times"), (1.2345e9, "12,000,000 times")],
+    ("bias", "expected"),
+    # A bias as large as the EoR, of either sign, is an excess.
+    [(0.07, None), (0.9, None), (34, "34 times"), (-1e4, "10,000 times"), (1.2345e7, "12,000,000 times")],
 )
-def test_a_residual_with_more_power_than_the_eor_is_told(power, told, tables):
-    residual = np.where((K > 0.2) & (K < 0.5), power / SCALE**2, 0)
-    modes = np.where(K < 0.3, 10, 30)
-    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", residual, modes, np.full(K.size, 2 / SCALE**2))
-    warnings = read_excess(tables.parent)
-    assert len(warnings) == (told is not None)
-    assert all(f"0.5 h/Mpc, the residual without EoR has {told} the power of the EoR" in text for text in warnings)
+def test_a_residual_with_more_power_than_the_eor_is_an_excess(bias, expected, tmp_path):
+    signal = read_signal(finished_run(tmp_path, scores(bias)))
+    if expected is None:
+        assert signal.excess is None
+    else:
+        assert f"0.5 h/Mpc, the residual without EoR has {expected} the power of the EoR" in signal.excess
 
 
-def test_noise_above_the_eor_is_no_excess(tables):
-    noisy, modes = np.full(K.size, 400 / SCALE**2), np.where(K < 0.3, 10, 30)
-    spectrum_csv(tables / "residual_without_eor.outside-wedge.csv", noisy, modes, np.full(K.size, 300 / SCALE**2))
-    assert read_excess(tables.parent) == []
+def test_noise_above_the_eor_is_no_excess(tmp_path):
+    assert read_signal(finished_run(tmp_path, scores(4, bias_error=1.5))).excess is None
+
+
+def test_a_run_without_scores_has_no_headline(tmp_path):
+    assert read_signal(RunFolder(tmp_path)) is None
+    assert read_signal(finished_run(tmp_path, scores(np.nan))) is None
 
 
 def test_the_headline_counts_verdicts(tmp_path):
@@ -79,7 +78,7 @@ def test_the_headline_counts_verdicts(tmp_path):
         for place, verdict in enumerate(words)
     ]
     (tmp_path / "claims.json").write_text(json.dumps(claims))
-    found = [(number.name, number.text) for number in read_headline(tmp_path)]
+    found = [(number.name, number.text) for number in read_headline(RunFolder(tmp_path))]
     assert found == [("claims", "2 supported, 1 contradicted, 1 undecided")]
 
 

@@ -2,17 +2,22 @@
 
 import base64
 import csv
+import dataclasses
 import html.parser
 import json
 import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calstudy.base.errors import InputError
+from calstudy.power.tables import save_spectrum
+from calstudy.power.transfer import TransferFunction
 from calstudy.report.contents import read_contents, with_error
 from calstudy.report.page import write_report
+from calstudy.results.folder import RunFolder
 
 # One red pixel.
 PNG = base64.b64decode(
@@ -122,10 +127,10 @@ def test_figures_are_in_the_page_as_they_are_in_the_folder(folder):
 def test_captions_and_their_order_are_those_of_the_manifest(folder):
     captions = {"zebra": "Stripes & all.", "wedge": "", "gone": "Not drawn."}
     (folder / "manifest.json").write_text(json.dumps({**MANIFEST, "captions": captions}))
-    found = [(picture.name, picture.caption) for picture in read_contents(folder).pictures]
+    found = [(picture.name, picture.caption) for picture in read_contents(RunFolder(folder)).pictures]
     assert found == [("zebra", "Stripes & all."), ("wedge", ""), ("spherical", "")]
     (folder / "manifest.json").write_text(json.dumps({"name": "old"}))
-    found = [(picture.name, picture.caption) for picture in read_contents(folder).pictures]
+    found = [(picture.name, picture.caption) for picture in read_contents(RunFolder(folder)).pictures]
     assert found == [("spherical", ""), ("wedge", ""), ("zebra", "")]
 
 
@@ -136,7 +141,9 @@ def test_text_of_a_run_is_text_and_not_markup(folder):
 
 
 def rows(folder: Path, title: str) -> list[tuple[str, ...]]:
-    return [tuple(row) for table in read_contents(folder).tables if table.title == title for row in table.rows]
+    return [
+        tuple(row) for table in read_contents(RunFolder(folder)).tables if table.title == title for row in table.rows
+    ]
 
 
 def test_convergence_simulation_and_stages_are_told(folder):
@@ -146,7 +153,7 @@ def test_convergence_simulation_and_stages_are_told(folder):
         ("eor", "not interpolated", ""),
     ]
     assert rows(folder, "Stages")[-1] == ("figure", "2", "2", "60 s", "2 min", "2.50 GB")
-    assert read_contents(folder).warnings == ["calibrate (V even): 1 of 8 solves did not converge"]
+    assert read_contents(RunFolder(folder)).warnings == ["calibrate (V even): 1 of 8 solves did not converge"]
 
 
 def test_claims_are_a_table_if_there_are_any(folder):
@@ -171,19 +178,21 @@ def test_a_run_without_a_role_has_a_sentence_in_place_of_the_table(folder):
     assert "Claims of the paper" not in page_of(folder).words
 
 
-def transfer_csv(path: Path, values: list[float]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        names = ("transfer", "transfer error", "squared coherence", "squared coherence error")
-        writer.writerow(["k from [h/Mpc]", "k to [h/Mpc]", *names])
-        for index, value in enumerate(values):
-            writer.writerow([0.1 * (index + 1), 0.1 * (index + 2), value, 0.01, value, 0.02])
+def save_transfer(path: Path, values: list[float]) -> None:
+    numbers, error = np.array(values), np.full(len(values), 0.01)
+    edges = 0.1 * np.arange(1, len(values) + 2)
+    found = TransferFunction(
+        **dict.fromkeys((item.name for item in dataclasses.fields(TransferFunction)), error)
+        | {"bin_edges": edges, "k": edges[1:], "transfer": numbers, "squared_coherence": numbers, "flux_scale": 1.0}
+        | {"squared_coherence_error": 2 * error}
+    )
+    save_spectrum(path, found)
 
 
 def test_signal_loss_is_a_table_if_it_was_measured(folder):
     assert rows(folder, "Signal loss") == []
-    transfer_csv(folder / "tables" / "transfer-bands.outside-wedge.csv", [0.25, 0.9])
-    transfer_csv(folder / "tables" / "transfer-bands.inside-wedge.csv", [0.03, float("nan")])
+    save_transfer(folder / "tables" / "transfer-bands.outside-wedge.h5", [0.25, 0.9])
+    save_transfer(folder / "tables" / "transfer-bands.inside-wedge.h5", [0.03, float("nan")])
     assert rows(folder, "Signal loss") == [
         ("0.1 to 0.2", "0.250 ± 0.010", "0.250 ± 0.020", "0.030 ± 0.010"),
         ("0.2 to 0.3", "0.900 ± 0.010", "0.900 ± 0.020", "no modes"),

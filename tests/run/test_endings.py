@@ -143,7 +143,7 @@ def test_leftovers_of_publishing_are_removed_from_run_folders(tmp_path):
         path.touch()
     os.utime(old, (0, 0))
     os.utime(other, (0, 0))
-    open_folder(tmp_path)
+    open_folder(tmp_path, ())
     assert [path.exists() for path in (old, new, other)] == [False, True, True]
 
 
@@ -188,9 +188,10 @@ def test_sigterm_ends_a_run_as_an_interrupt_with_a_status_of_its_own(tmp_path):
 @pytest.mark.parametrize("content", ["null", "[1]", '[{"verdict": "PA', '[{"section": "x"}]', "", "{}"])
 def test_damaged_claims_are_named(content, tmp_path):
     from calstudy.report.headline import read_headline
+    from calstudy.results.folder import RunFolder
 
     (tmp_path / "claims.json").write_text(content)
     with pytest.raises(InputError, match=r"claims.json: is damaged; write it again: calstudy claims"):
-        read_headline(tmp_path)
+        read_headline(RunFolder(tmp_path))
     (tmp_path / "claims.json").write_text(json.dumps([]))
-    assert read_headline(tmp_path) == []
+    assert read_headline(RunFolder(tmp_path)) == []

@@ -13,7 +13,7 @@ from calstudy.run import perform as performing
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.source import reached, source_of
 from calstudy.run.store import Store
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 
 RUNNER = ("calstudy.run.perform", "calstudy.base.resources")
 CODE = '''

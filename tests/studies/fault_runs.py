@@ -48,7 +48,7 @@ def run_in(
     """Run the study; exit with the status of the command line, the sentence in `folder`/message."""
     from calstudy.base.errors import InputError
     from calstudy.experiment.files import validate
-    from calstudy.studies.experiment import ExperimentStudy
+    from calstudy.studies.kinds.experiment import ExperimentStudy
     from calstudy.studies.study import Budget, run_study
 
     if user is not None:

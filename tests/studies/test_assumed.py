@@ -22,14 +22,15 @@ from calstudy.instrument.telescope import make_template
 from calstudy.products import calibration, simulation, sky_model
 from calstudy.products.graph import Graph
 from calstudy.report.contents import read_contents
+from calstudy.results.folder import RunFolder
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.run.task import Task
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.studies.kinds.sweep import Sweep
 from calstudy.studies.load import load_study
 from calstudy.studies.preflight import require_calibration
-from calstudy.studies.study import Budget, Made, Run, make, run_study
-from calstudy.studies.sweep import Sweep
+from calstudy.studies.study import Budget, Run, RunProducts, make, run_study
 
 RESIDUAL = "residual"
 
@@ -50,7 +51,7 @@ def calibrated(graph: Graph) -> Task:
     return calibration.calibration(graph, graph.experiment.variants[RESIDUAL], "even")
 
 
-def make_here(folder: Path, *tasks: Task) -> Made:
+def make_here(folder: Path, *tasks: Task) -> RunProducts:
     console = Console(file=io.StringIO())
     return make(tasks, Store(folder / "store"), Workers(1, folder / "run.log"), console)
 
@@ -204,7 +205,7 @@ def finished(folder) -> Run:
 def test_a_run_says_what_was_assumed(finished):
     told = "assumed: sky.foregrounds.count = 60, where 100 is true"
     assert json.loads((finished.folder / "manifest.json").read_text())["sky_model"] == told
-    contents = read_contents(finished.folder)
+    contents = read_contents(RunFolder(finished.folder))
     assert contents.facts["sky model of the calibrator"] == told
     assert told in next(table for table in contents.tables if table.title == "Solver convergence").note
     lines = (finished.folder / "tables" / "sky-model.csv").read_text().splitlines()
@@ -215,7 +216,7 @@ def test_a_run_says_what_was_assumed(finished):
 def test_a_run_says_that_its_sky_model_is_perfect(folder):
     study = ExperimentStudy(validate(sky_based(folder), folder))
     run = run_study(study, Budget(workers=1), Console(file=io.StringIO()))
-    assert read_contents(run.folder).facts["sky model of the calibrator"].startswith("perfect: ")
+    assert read_contents(RunFolder(run.folder)).facts["sky model of the calibrator"].startswith("perfect: ")
     assert "perfect" in (run.folder / "tables" / "sky-model.csv").read_text()
 
 

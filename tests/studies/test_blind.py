@@ -13,7 +13,7 @@ from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.studies.blind import BITS, write_recipe
 from calstudy.studies.export import CARRIER, Contents
-from calstudy.studies.worlds import load_worlds
+from calstudy.studies.kinds.comparison import load_worlds
 
 CHALLENGE = Path(__file__).parents[2] / "experiments" / "challenge.yaml"
 

@@ -14,10 +14,14 @@ from calstudy.products.calibration import CALIBRATE_CHUNK
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.studies import capacity
-from calstudy.studies.experiment import ExperimentStudy, experiment_folder, targets_of
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Budget
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+
+
+def targets_of(experiment: Experiment) -> list[Task]:
+    return ExperimentStudy(experiment).targets
 
 
 def fit(experiment: Experiment, *budget: int | str | None, targets: capacity.Targets = targets_of):
@@ -80,7 +84,7 @@ def test_smaller_pieces_are_the_same_products(paper):
     before, after = eor_of(paper), eor_of(little)
     assert before.key == after.key
     assert not {task.key for task in before.pieces.values()} & {task.key for task in after.pieces.values()}
-    assert experiment_folder(paper) == experiment_folder(little)
+    assert ExperimentStudy(paper).folder == ExperimentStudy(little).folder
 
 
 def test_what_cannot_fit_is_refused_in_one_sentence(paper):

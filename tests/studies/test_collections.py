@@ -24,9 +24,9 @@ from calstudy.products.spectra import power
 from calstudy.regression.reference import accept
 from calstudy.run.execution import schedule
 from calstudy.run.store import Store
-from calstudy.studies.collection import Collection
-from calstudy.studies.experiment import ExperimentStudy
 from calstudy.studies.finished import with_finished
+from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.show import describe_plan
 from calstudy.studies.study import Budget, Run, run_study
@@ -153,7 +153,10 @@ def test_scale_and_overrides_reach_every_member(folder):
         ({"experiments": [{"file": "hex.yaml", "nam": "a"}]}, "experiments.0.nam: unknown key, did you mean 'name'?"),
         ({"experiments": [{"name": "a"}]}, "experiments.0.file: missing, and it has no default"),
         ({"experiments": ["hex.yaml", "hex.yaml"]}, "experiments.1: a second 'hexagon'; give it a `name` of its own"),
-        ({"figures": ["layout"]}, "figures.0: 'layout' does not compare members, did you mean 'layouts'?"),
+        (
+            {"figures": ["layout"]},
+            "figures.0: 'layout' is a figure for experiment files, not for collection files, did you mean 'layouts'?",
+        ),
         ({"figures": ["layuot"]}, "figures.0: 'layuot' is not a figure, did you mean 'layout'?"),
         ({"roles": {"redundant": "line"}}, "roles.redundant = 'line': not a member (there are: hexagon, redundant)"),
         ({"roles": {"low_snr": "hexagon"}}, "roles.low_snr = 'hexagon': corruption.effects is per-channel-gains"),
@@ -179,7 +182,7 @@ def test_a_fault_is_told_in_the_files_own_terms(tmp_path, changes, told):
     ("changes", "told"),
     [
         ({"experiments": ["none.yaml"]}, r"experiments\.0 \(none\.yaml\): .*cannot be read"),
-        ({"experiments": ["pair.yaml"]}, r"experiments\.0 \(pair\.yaml\): is a collection itself"),
+        ({"experiments": ["pair.yaml"]}, r"experiments\.0 \(pair\.yaml\): has the key 'experiments'"),
     ],
 )
 def test_a_member_that_cannot_be_used_is_told(tmp_path, changes, told):

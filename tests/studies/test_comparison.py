@@ -151,7 +151,7 @@ def test_faults_name_the_case_and_the_field(tmp_path):
                 tmp_path, calibrators={"CALAMITY": {"calibrator": "calamity", "sovler": 1}}, worlds={"ideal": {}}
             )
         )
-    with pytest.raises(ExperimentError, match="'wedge' does not compare calibrators"):
+    with pytest.raises(ExperimentError, match="'wedge' is a figure for experiment files, not for comparison files"):
         load_study(comparison_file(tmp_path, figures=["wedge"]))
     with pytest.raises(ExperimentError, match="wrlds: unknown key, did you mean 'worlds'"):
         load_study(comparison_file(tmp_path, wrlds={}))
@@ -206,14 +206,14 @@ def test_worlds_and_calibrators_can_be_set_as_fields_of_the_experiment_can(tmp_p
 
 def test_the_file_in_the_run_folder_is_the_same_comparison(compared, tmp_path):
     again = load_study(compared.folder / "experiment.yaml")
-    assert again.table.key in compared.made.products
+    assert again.tables[0].key in compared.made.products
     assert again.folder.name == compared.folder.name
     # As a reference it has no folders of this machine, and can be made again with those of another.
     accept(compared.folder, tmp_path / "reference")
     text = (tmp_path / "reference" / "experiment.yaml").read_text()
     assert str(compared.folder.parent) not in text
     moved = load_study(tmp_path / "reference" / "experiment.yaml", overrides=[f"outputs.store={tmp_path}"])
-    assert moved.table.key == again.table.key
+    assert moved.tables[0].key == again.tables[0].key
     assert (tmp_path / "reference" / "comparison.md").is_file()
     reference = read_reference(tmp_path / "reference")
     found = compare_figures(reference.figures, read_run(compared.folder).figures, reference.tolerances)

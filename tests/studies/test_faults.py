@@ -18,7 +18,7 @@ from fault_runs import REFUSED, differences, finish, results, start, study
 from calstudy.experiment.files import validate
 from calstudy.run.execution import schedule
 from calstudy.run.store import RECORD, Store
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 
 NOBODY = 65534
 

@@ -14,6 +14,7 @@ from test_by_file import row
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal, read_gains
+from calstudy.base.table import Table, one_line
 from calstudy.base.visibilities import from_cube
 from calstudy.calibrate.exchange import MANIFEST, DataSet, Manifest, find_returned, read_manifest
 from calstudy.calibrate.sky_model import read_sky_model
@@ -22,7 +23,6 @@ from calstudy.realdata.reading import read_metadata, read_visibilities
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import FileSources
 from calstudy.studies.scores import Scores, leaderboard
-from calstudy.verdicts.tables import Table, one_line
 
 NAMES = [
     "../gains",

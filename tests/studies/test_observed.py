@@ -30,7 +30,7 @@ from calstudy.products.observed import observe
 from calstudy.products.observed import observed as observed_task
 from calstudy.products.selection import read_gains
 from calstudy.run.task import Job
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
@@ -306,7 +306,7 @@ def test_a_plan_refuses_to_look_for_interference_in_two_integrations(simulated, 
     measurement(simulated, "even").write_uvh5(folder / "short.uvh5", clobber=True)
     observed = {"data": "short.uvh5", "flag_interference": True, "select": {"times": "0..1"}}
     with pytest.raises(InputError, match=r"flag_interference: takes at least 3 integrations.*the data have 2 and 48"):
-        load_study(observed_file(folder, "short", observed)).fitted(Budget())
+        load_study(observed_file(folder, "short", observed)).sized_to(Budget())
 
 
 def test_false_and_null_are_no_search(simulated, folder):
@@ -402,7 +402,7 @@ def test_the_report_has_figures_and_numbers(one_file):
         ({"beam": "no-beam"}, {}, "observed.beam: 'no-beam' is not a beam"),
         ({}, {"calibration": {"integrations_per_solve": 4}}, "a half of the data has 2 integrations"),
         ({}, {"calibration": {"assumed": {"sky.diffuse": "none"}}}, "calibration.assumed: is for simulated data"),
-        ({}, {"outputs": {"figures": ["wedge"]}}, "'wedge' is no figure of measured data"),
+        ({}, {"outputs": {"figures": ["wedge"]}}, "'wedge' is a figure for experiment files, not for observed files"),
         ({}, {"outputs": {"figures": ["observed-signal-loss"]}}, "needs the section injection"),
         ({}, {"injection": {"level": -30}}, "injection.level"),
         ({"positions": "few.csv"}, {}, "has no antenna"),

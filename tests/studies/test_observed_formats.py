@@ -18,8 +18,8 @@ from calstudy.products.files import DATA
 from calstudy.products.observed import observe, observed
 from calstudy.realdata import reading
 from calstudy.run.task import Job
+from calstudy.studies.kinds.observed import ObservedStudy
 from calstudy.studies.load import load_study
-from calstudy.studies.observed import ObservedStudy
 from calstudy.studies.study import Budget
 
 # Antenna 3 shares no baseline with another pair: redundancy does not tie it to the others.
@@ -141,10 +141,10 @@ def test_a_plan_asks_the_calibrator(tmp_path, calibrator, layout, modelled, sent
     noise = {"foreground_prior": {"noise": "1 Jy"}} if calibrator == "unified" else {}
     found = study(tmp_path, section, calibrator=calibrator, **noise)
     if sentence is None:
-        found.fitted(Budget(workers=1))
+        found.sized_to(Budget(workers=1))
         return
     with pytest.raises(InputError) as caught:
-        found.fitted(Budget(workers=1))
+        found.sized_to(Budget(workers=1))
     assert sentence in str(caught.value)
 
 
@@ -164,4 +164,4 @@ def test_a_sky_model_of_other_antennas_is_refused(tmp_path):
     sky.write_uvh5(tmp_path / "sky.uvh5")
     found = study(tmp_path, {"data": "data.uvh5", "sky_model": "sky.uvh5"})
     with pytest.raises(InputError, match=r"observed.sky_model: .* has none of the cross-correlations of the data"):
-        found.fitted(Budget(workers=1))
+        found.sized_to(Budget(workers=1))

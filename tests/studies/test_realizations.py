@@ -23,10 +23,10 @@ from calstudy.products.signal_loss import transfer
 from calstudy.run.execution import largest_disk, schedule
 from calstudy.run.store import Store
 from calstudy.run.task import unique
-from calstudy.studies.collection import Collection
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.studies.kinds.realizations import Realizations
 from calstudy.studies.load import load_study
-from calstudy.studies.realizations import Realizations
 from calstudy.studies.show import describe_plan, show_plan, show_run
 from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
@@ -137,7 +137,7 @@ def test_a_second_run_makes_nothing_and_a_lost_product_comes_from_averages(finis
     study = Realizations(validate(small(folder), folder))
     assert run_study(study, Budget(workers=1)).made.tasks == ()
     store = Store(study.outputs.store)
-    for task in (inputs(study.graph)["spectra:2"], study.table):
+    for task in (inputs(study.graph)["spectra:2"], study.tables[0]):
         store.discard(task.stage.name, task.key)
     made = [
         task.stage.name
@@ -318,7 +318,7 @@ def test_an_experiment_without_realizations_has_none_and_cannot_draw_their_figur
     data.pop("realizations")
     with pytest.raises(InputError, match="has no realizations"):
         Realizations(validate(data, folder))
-    with pytest.raises(ExperimentError, match="pools the realizations of an experiment"):
+    with pytest.raises(ExperimentError, match="is a figure for realizations files"):
         validate(override(data, "outputs.figures", ["realizations"]), folder)
 
 
@@ -332,7 +332,7 @@ def test_a_file_with_realizations_is_a_study_of_its_own_also_in_a_collection(fol
     study = load_study(folder / "both.yaml")
     assert isinstance(study, Collection)
     assert [type(part) for part in study.parts.values()] == [Realizations, ExperimentStudy]
-    fitted, _ = study.fitted(Budget(workers=1))
+    fitted, _ = study.sized_to(Budget(workers=1))
     assert [type(part) for part in fitted.parts.values()] == [Realizations, ExperimentStudy]
     assert fitted.claims is None
 

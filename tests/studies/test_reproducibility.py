@@ -18,7 +18,7 @@ from calstudy.products.corruption import data
 from calstudy.products.graph import Graph
 from calstudy.run.execution import Workers, execute, schedule
 from calstudy.run.store import Product, Store
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 
 TOLERANCE = 1e-10
 
@@ -83,7 +83,7 @@ def test_another_process_finds_the_same_keys(tmp_path):
     path.write_text(yaml.safe_dump(tiny(tmp_path)))
     code = (
         "import sys; from pathlib import Path; from calstudy.experiment.files import load; "
-        "from calstudy.studies.experiment import ExperimentStudy; "
+        "from calstudy.studies.kinds.experiment import ExperimentStudy; "
         "print(*[task.key for task in ExperimentStudy(load(Path(sys.argv[1]))).tasks])"
     )
     found = subprocess.run(

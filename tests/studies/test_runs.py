@@ -23,7 +23,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.run.store import Store
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Budget, Run, run_study
 
 

@@ -17,8 +17,8 @@ from calstudy.claims.folders import evaluate_folder
 from calstudy.claims.run_times import machine_in_words
 from calstudy.products.step_times import Descent, StepTimes
 from calstudy.studies import runtime
+from calstudy.studies.kinds.runtime import RuntimeStudy
 from calstudy.studies.load import load_study
-from calstudy.studies.runtime import RuntimeStudy
 from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Budget, run_study
 
@@ -125,16 +125,16 @@ def test_a_gpu_is_compared_with_the_processor(study, monkeypatch):
 def test_a_gpu_that_is_not_there_is_a_sentence(study, monkeypatch):
     monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: [])
     with pytest.raises(InputError, match="finds no GPU"):
-        reload("runtime.devices=[gpu]").fitted(Budget())
+        reload("runtime.devices=[gpu]").sized_to(Budget())
 
 
 def test_what_would_spoil_the_times_is_refused(study):
-    assert study.fitted(Budget(1)) == (study, 1)
+    assert study.sized_to(Budget(1)) == (study, 1)
     for budget in (Budget(2), Budget(scheduler="tcp://somewhere:8786")):
         with pytest.raises(InputError, match="one after the other"):
-            study.fitted(budget)
+            study.sized_to(budget)
     with pytest.raises(InputError, match=r"the paper's solver needs about \d+\.\d GB, and there are 0\.5 GB"):
-        study.fitted(Budget(max_memory="500 MB"))
+        study.sized_to(Budget(max_memory="500 MB"))
 
 
 def test_a_plan_names_what_will_be_timed(study):

@@ -14,10 +14,10 @@ from calstudy.experiment.files import dump, load, override, validate
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction, TransferMap, pool
 from calstudy.products.signal_loss import transfer
-from calstudy.studies.experiment import ExperimentStudy
+from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.studies.kinds.sweep import Sweep, expand
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
-from calstudy.studies.sweep import Sweep, expand
 
 DRAWN = True
 

@@ -11,6 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from calstudy.base.table import Table, number
 from calstudy.verdicts.criterion import AtLeast, AtMost, Criterion, Equal, Finding, Within
 from calstudy.verdicts.sentences import outcomes_of_sentences, tally_of_sentences
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
@@ -19,10 +20,8 @@ from calstudy.verdicts.tables import (
     BY_SOLVER_MARKDOWN,
     CLAIMS_JSON,
     CLAIMS_MARKDOWN,
-    Table,
     from_json,
     measured,
-    number,
     show_verdicts,
     to_json,
     to_markdown,

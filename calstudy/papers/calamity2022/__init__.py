@@ -15,8 +15,8 @@ from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitution
 
 if TYPE_CHECKING:
     from calstudy.claims.realizations import PooledResults
-    from calstudy.claims.results import RunResults
     from calstudy.experiment.model import Experiment
+    from calstudy.results.reader import Results
     from calstudy.verdicts.statement import Statement
 
 REDUNDANT_FROM = 0.5
@@ -106,7 +106,7 @@ class Calamity2022(Paper):
         found = next((refusal for check in checks if (refusal := check(study, experiment)) is not None), None)
         return _other_solver(experiment) if found is None and role != study else found
 
-    def refusal_of_run(self, role: str, results: RunResults | PooledResults) -> str | None:
+    def refusal_of_run(self, role: str, results: Results | PooledResults) -> str | None:
         """Return in words an unsuitable setting of a run, or property of its array, for a role, or None."""
         refusal, study = self.refusal(role, results.experiment), _study(role)
         if refusal is not None or study == "low_snr":

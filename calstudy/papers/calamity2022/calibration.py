@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from calstudy.claims.results import RunResults
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source
 
@@ -13,7 +13,7 @@ SIMULATED = replace(RESULTS, tests_simulation=True)
 FACTOR_OF_TWO = "the paper's 'similar', 'about' and 'roughly' are read as within a factor of two"
 
 
-def _median(run: RunResults, name: str) -> Finding:
+def _median(run: Results, name: str) -> Finding:
     """Return the median over antennas or baselines, with their scatter."""
     found = run.measured(name)
     return Finding(found.value, found.scatter, "scatter")
@@ -29,14 +29,14 @@ GAINS_CAPTION = Sentence("gain-residuals", "their residuals are on the order of 
 @RESULTS.states(
     GAINS, "rms of g - ĝ over rms of g, free of phase and scale that no fit can know; median", AtMost(0.2), "≲ 20 %"
 )
-def gains_within_20_percent(run: RunResults) -> Finding:
+def gains_within_20_percent(run: Results) -> Finding:
     return _median(run, "gains_aligned")
 
 
 @RESULTS.states(
     GAINS, "rms of g - ĝ over rms of g, gains as fitted from a start at unity; median", AtMost(0.2), "≲ 20 %"
 )
-def gains_within_20_percent_raw(run: RunResults) -> Finding:
+def gains_within_20_percent_raw(run: Results) -> Finding:
     return _median(run, "gains_raw")
 
 
@@ -46,7 +46,7 @@ def gains_within_20_percent_raw(run: RunResults) -> Finding:
     AtMost(0.2),
     "≲ 20 %",
 )
-def gains_within_20_percent_at_typical_delay(run: RunResults) -> Finding:
+def gains_within_20_percent_at_typical_delay(run: Results) -> Finding:
     return _median(run, "gains_by_delay")
 
 
@@ -56,14 +56,14 @@ def gains_within_20_percent_at_typical_delay(run: RunResults) -> Finding:
     AtMost(0.2),
     "≲ 20 % on all delays",
 )
-def gains_within_20_percent_at_every_delay(run: RunResults) -> Finding:
+def gains_within_20_percent_at_every_delay(run: Results) -> Finding:
     return _median(run, "gains_worst_delay")
 
 
 @RESULTS.states(
     GAINS_CAPTION, "rms of g - ĝ over rms of g, free of phase and scale; median", Within(0.05, 0.2), FACTOR_OF_TWO
 )
-def gains_of_order_10_percent(run: RunResults) -> Finding:
+def gains_of_order_10_percent(run: Results) -> Finding:
     return _median(run, "gains_aligned")
 
 
@@ -78,7 +78,7 @@ GAINS_BY_DELAY = Sentence(
     Within(0.05, 0.2),
     FACTOR_OF_TWO,
 )
-def gains_of_order_10_percent_at_typical_delay(run: RunResults) -> Finding:
+def gains_of_order_10_percent_at_typical_delay(run: Results) -> Finding:
     return _median(run, "gains_raw_by_delay")
 
 
@@ -88,7 +88,7 @@ def gains_of_order_10_percent_at_typical_delay(run: RunResults) -> Finding:
     Within(0.05, 0.2),
     FACTOR_OF_TWO,
 )
-def gains_of_order_10_percent_at_every_delay(run: RunResults) -> Finding:
+def gains_of_order_10_percent_at_every_delay(run: Results) -> Finding:
     return _median(run, "gains_raw_worst_delay")
 
 
@@ -99,12 +99,12 @@ def gains_of_order_10_percent_at_every_delay(run: RunResults) -> Finding:
     Within(0.05, 0.2),
     FACTOR_OF_TWO,
 )
-def gains_of_order_10_percent_at_typical_delay_aligned(run: RunResults) -> Finding:
+def gains_of_order_10_percent_at_typical_delay_aligned(run: Results) -> Finding:
     return _median(run, "gains_by_delay")
 
 
 @RESULTS.states(GAINS_CAPTION, "rms of g - ĝ over rms of g, gains as fitted; median", Within(0.05, 0.2), FACTOR_OF_TWO)
-def gains_of_order_10_percent_raw(run: RunResults) -> Finding:
+def gains_of_order_10_percent_raw(run: Results) -> Finding:
     return _median(run, "gains_raw")
 
 
@@ -117,17 +117,17 @@ MODEL = Sentence(
 @RESULTS.states(
     MODEL, "rms of F - F̂ over rms of F, on the scale of the true gains; median", Within(0.05, 0.4), FACTOR_OF_TWO
 )
-def model_of_order_10_to_20_percent(run: RunResults) -> Finding:
+def model_of_order_10_to_20_percent(run: Results) -> Finding:
     return _median(run, "model_aligned")
 
 
 @RESULTS.states(MODEL, "rms of F - F̂ over rms of F, model as fitted; median", Within(0.05, 0.4), FACTOR_OF_TWO)
-def model_of_order_10_to_20_percent_raw(run: RunResults) -> Finding:
+def model_of_order_10_to_20_percent_raw(run: Results) -> Finding:
     return _median(run, "model_raw")
 
 
 @RESULTS.states(MODEL, "rms of F - F̂ over rms of N; median", AtLeast(2), "more than 'similar', a factor of two")
-def model_error_exceeds_noise(run: RunResults) -> Finding:
+def model_error_exceeds_noise(run: Results) -> Finding:
     return _median(run, "model_over_noise")
 
 
@@ -143,19 +143,19 @@ PRODUCT = Sentence(
     Within(0.5, 2),
     FACTOR_OF_TWO,
 )
-def product_at_noise(run: RunResults) -> Finding:
+def product_at_noise(run: Results) -> Finding:
     return _median(run, "product_over_noise")
 
 
 @RESULTS.states(
     PRODUCT, "rms of V - ĝĝ*F̂ over that of the noise, at the worst delay", AtMost(2), "at all delays; " + FACTOR_OF_TWO
 )
-def product_at_noise_at_every_delay(run: RunResults) -> Finding:
+def product_at_noise_at_every_delay(run: Results) -> Finding:
     return _median(run, "product_worst_delay")
 
 
 @RESULTS.states(PRODUCT, "rms of V - ĝĝ*F̂ over rms of V; median", AtMost(0.002), "0.1 %; " + FACTOR_OF_TWO)
-def product_at_tenth_of_percent(run: RunResults) -> Finding:
+def product_at_tenth_of_percent(run: Results) -> Finding:
     return _median(run, "product_over_data")
 
 
@@ -166,7 +166,7 @@ def product_at_tenth_of_percent(run: RunResults) -> Finding:
     AtLeast(10),
     "10 % over 0.1 % is a hundred; an order of magnitude is asked for",
 )
-def product_far_better_than_gains(run: RunResults) -> Finding:
+def product_far_better_than_gains(run: Results) -> Finding:
     gains, product = run.measured("gains_aligned"), run.measured("product_over_data")
     ratio = gains.value / product.value
     return Finding(ratio, ratio * product.scatter / product.value, "scatter")
@@ -178,7 +178,7 @@ def product_far_better_than_gains(run: RunResults) -> Finding:
     AtMost(2),
     FACTOR_OF_TWO,
 )
-def correction_is_smooth(run: RunResults) -> Finding:
+def correction_is_smooth(run: Results) -> Finding:
     return _median(run, "correction_over_noise_outside")
 
 
@@ -188,7 +188,7 @@ def correction_is_smooth(run: RunResults) -> Finding:
     Within(0.5, 2),
     FACTOR_OF_TWO,
 )
-def residual_at_noise_outside_wedge(run: RunResults) -> Finding:
+def residual_at_noise_outside_wedge(run: Results) -> Finding:
     return _median(run, "residual_over_noise_outside")
 
 
@@ -198,7 +198,7 @@ def residual_at_noise_outside_wedge(run: RunResults) -> Finding:
     AtMost(1, 2),
     "a reduction is noticeable if it exceeds twice the scatter over baselines",
 )
-def residual_reduced_inside_wedge(run: RunResults) -> Finding:
+def residual_reduced_inside_wedge(run: Results) -> Finding:
     return _median(run, "residual_over_noise_inside")
 
 
@@ -208,5 +208,5 @@ def residual_reduced_inside_wedge(run: RunResults) -> Finding:
     AtLeast(100),
     "orders of magnitude are two at least",
 )
-def residual_far_below_gain_features(run: RunResults) -> Finding:
+def residual_far_below_gain_features(run: Results) -> Finding:
     return _median(run, "data_over_residual_outside")

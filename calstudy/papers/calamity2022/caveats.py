@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from calstudy.claims.bins import difference_of_losses
-from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.method import HUNDREDTH, K_WINDOW
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Unevaluated
 
@@ -22,7 +22,7 @@ CAVEATS = Source("Caveats and Limitations", ("minimally_redundant",))
     AtLeast(HUNDREDTH),
     "depends is more than a hundredth of the EoR",
 )
-def loss_depends_on_channels(run: RunResults, other: RunResults) -> Finding:
+def loss_depends_on_channels(run: Results, other: Results) -> Finding:
     first, second = (item.experiment.instrument.channels for item in (run, other))
     if first.width == second.width or not np.isclose(first.width * first.count, second.width * second.count):
         raise Unevaluated("the runs have the same channels, or not the same band")
@@ -37,7 +37,7 @@ def loss_depends_on_channels(run: RunResults, other: RunResults) -> Finding:
     AtLeast(1, 2),
     "what is not corrected stays above the EoR",
 )
-def leakage_is_not_corrected(run: RunResults) -> Finding:
+def leakage_is_not_corrected(run: Results) -> Finding:
     raise Unevaluated("the simulated sky is not polarized")
 
 
@@ -48,5 +48,5 @@ def leakage_is_not_corrected(run: RunResults) -> Finding:
     AtMost(1, 2),
     "what is removed is below the EoR",
 )
-def filter_rescues_coupling(run: RunResults) -> Finding:
+def filter_rescues_coupling(run: Results) -> Finding:
     raise Unevaluated("there is no filter in fringe rate before calibration")

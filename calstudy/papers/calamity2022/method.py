@@ -10,9 +10,9 @@ from calstudy.calibrate.basis import delay_half_widths, make_basis
 from calstudy.calibrate.settings import ForegroundFit
 from calstudy.claims.bins import mean_of_common_errors
 from calstudy.claims.realizations import PooledResults
-from calstudy.claims.results import RunResults
 from calstudy.instrument.layouts import make_array
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtMost, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
 
@@ -30,7 +30,7 @@ VECTORS = Sentence(
 )
 
 
-def _vectors_over_bandwidth(run: RunResults, buffered: bool) -> Finding:
+def _vectors_over_bandwidth(run: Results, buffered: bool) -> Finding:
     """Return the number of vectors over 2 N Δν τ, median and scatter over baselines."""
     instrument, calibration = run.experiment.instrument, run.experiment.calibration
     if not isinstance(calibration, ForegroundFit):
@@ -52,7 +52,7 @@ def _vectors_over_bandwidth(run: RunResults, buffered: bool) -> Finding:
     Within(0.5, 2),
     FACTOR_OF_TWO,
 )
-def vectors_like_bandwidth_of_horizon(run: RunResults) -> Finding:
+def vectors_like_bandwidth_of_horizon(run: Results) -> Finding:
     return _vectors_over_bandwidth(run, buffered=False)
 
 
@@ -62,7 +62,7 @@ def vectors_like_bandwidth_of_horizon(run: RunResults) -> Finding:
     Within(0.5, 2),
     FACTOR_OF_TWO,
 )
-def vectors_like_bandwidth_of_basis(run: RunResults) -> Finding:
+def vectors_like_bandwidth_of_basis(run: Results) -> Finding:
     return _vectors_over_bandwidth(run, buffered=True)
 
 
@@ -73,7 +73,7 @@ def vectors_like_bandwidth_of_basis(run: RunResults) -> Finding:
     "none, to a hundredth",
     pooled=lambda run: _lost(run.mean("squared_coherence", "outside-wedge", FAR)),
 )
-def loss_limited_to_wedge(run: RunResults) -> Finding:
+def loss_limited_to_wedge(run: Results) -> Finding:
     found = run.transfer("outside-wedge")
     far = found.k >= FAR
     return _lost(mean_of_common_errors(found.squared_coherence[far], found.squared_coherence_error[far]))
@@ -89,7 +89,7 @@ def _lost(left: Finding) -> Finding:
     Within(2, 2),
     "the real and the imaginary part of one multiplier",
 )
-def one_complex_degeneracy(run: RunResults) -> Finding:
+def one_complex_degeneracy(run: Results) -> Finding:
     raise Unevaluated(
         "a run does not write the curvature of its cost; step 2.1 of the validation ladder finds that a phase of every "
         "channel, one real scale, a tilt over the array and what is as smooth as the foregrounds are free"
@@ -103,7 +103,7 @@ def one_complex_degeneracy(run: RunResults) -> Finding:
     Within(-50, -40),
     "≈ -45 dB, to half an order of magnitude of power",
 )
-def artefacts_at_minus_45_db(run: RunResults) -> Finding:
+def artefacts_at_minus_45_db(run: Results) -> Finding:
     raise Unevaluated(
         "all variants of a run have EoR or noise above that floor; 'calstudy check floor' measures it for every "
         "interpolation of the beam"
@@ -122,5 +122,5 @@ def _known_input(run: PooledResults) -> Finding:
     "negligible is less than a twentieth",
     pooled=_known_input,
 )
-def average_loses_nothing(run: RunResults) -> Finding:
+def average_loses_nothing(run: Results) -> Finding:
     raise Unevaluated("of one sky, P^S has the sample variance; needs realizations, which know the power put in")

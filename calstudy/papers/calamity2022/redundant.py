@@ -20,9 +20,9 @@ from calstudy.claims.bins import (
     used_bins,
 )
 from calstudy.claims.realizations import over_realizations
-from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
 from calstudy.papers.calamity2022.window import UNBIASED
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
 
@@ -34,7 +34,7 @@ K_LOSS = 0.3
 NO_EFFECT = 0.05
 
 
-def _lower(name: str, first: RunResults, second: RunResults) -> Finding:
+def _lower(name: str, first: Results, second: Results) -> Finding:
     """Return rms P of a variant in the first run over that in the second, outside the wedge, k >= 0.2."""
     spectra = [run.spherical(name, "outside-wedge") for run in (first, second)]
     used = used_bins(*spectra, k_min=K_MIN)
@@ -53,7 +53,7 @@ SUPPRESSED = Sentence(
     AtLeast(10),
     "one order of magnitude at least",
 )
-def uncalibrated_systematics_suppressed(minimal: RunResults, redundant: RunResults) -> Finding:
+def uncalibrated_systematics_suppressed(minimal: Results, redundant: Results) -> Finding:
     spectra = [run.spherical("uncalibrated", "outside-wedge") for run in (minimal, redundant)]
     used = used_bins(*spectra, k_min=K_MIN)
     first, second = (np.abs(spectrum.power.real[used]) for spectrum in spectra)
@@ -69,7 +69,7 @@ def uncalibrated_systematics_suppressed(minimal: RunResults, redundant: RunResul
     AtLeast(10),
     "one order of magnitude at least",
 )
-def calibrated_systematics_suppressed(minimal: RunResults, redundant: RunResults) -> Finding:
+def calibrated_systematics_suppressed(minimal: Results, redundant: Results) -> Finding:
     return _lower("residual_without_eor", minimal, redundant)
 
 
@@ -79,7 +79,7 @@ def calibrated_systematics_suppressed(minimal: RunResults, redundant: RunResults
     AtLeast(1, 2),
     "reduced beyond the errors",
 )
-def noise_reduced(minimal: RunResults, redundant: RunResults) -> Finding:
+def noise_reduced(minimal: Results, redundant: Results) -> Finding:
     return _lower("noise", minimal, redundant)
 
 
@@ -90,7 +90,7 @@ def noise_reduced(minimal: RunResults, redundant: RunResults) -> Finding:
     "95 % by chance alone; as for the minimally redundant array a tenth may miss",
     roles=("redundant",),
 )
-def redundant_signal_recovered(redundant: RunResults) -> Finding:
+def redundant_signal_recovered(redundant: Results) -> Finding:
     residual, signal = (redundant.spherical(name, "outside-wedge") for name in ("residual", "eor"))
     used = used_bins(residual, signal, k_min=K_LOSS)
     return fraction_within((residual.power - signal.power).real[used], residual.error[used])
@@ -104,13 +104,13 @@ def redundant_signal_recovered(redundant: RunResults) -> Finding:
     roles=("redundant",),
     pooled=over_realizations("ratio", "outside-wedge", K_LOSS),
 )
-def redundant_residual_unbiased(redundant: RunResults) -> Finding:
+def redundant_residual_unbiased(redundant: Results) -> Finding:
     return recovered(
         redundant.spherical("residual", "outside-wedge"), redundant.spherical("eor", "outside-wedge"), K_LOSS, np.inf
     )
 
 
-def _recovered_powers(minimal: RunResults, redundant: RunResults) -> tuple[RecoveredPower, RecoveredPower]:
+def _recovered_powers(minimal: Results, redundant: Results) -> tuple[RecoveredPower, RecoveredPower]:
     first, second = (
         RecoveredPower(
             run.spherical("residual", "outside-wedge"),
@@ -144,7 +144,7 @@ MOST = "in most of the region"
     AtLeast(0.5),
     MOST,
 )
-def less_power_below_0p3(minimal: RunResults, redundant: RunResults) -> Finding:
+def less_power_below_0p3(minimal: Results, redundant: Results) -> Finding:
     runs = _recovered_powers(minimal, redundant)
     used = _used_bins(runs, 0.0, K_LOSS)
     differences = [difference_of_ratios(*runs, np.arange(used.size) == place) for place in np.flatnonzero(used)]
@@ -158,7 +158,7 @@ def less_power_below_0p3(minimal: RunResults, redundant: RunResults) -> Finding:
     AtLeast(0.5),
     MOST,
 )
-def less_of_the_eor_below_0p3(minimal: RunResults, redundant: RunResults) -> Finding:
+def less_of_the_eor_below_0p3(minimal: Results, redundant: Results) -> Finding:
     first, second = (run.transfer("outside-wedge") for run in (minimal, redundant))
     difference = first.flux_scale * first.cross_transfer - second.flux_scale * second.cross_transfer
     error = np.hypot(first.flux_scale * first.cross_transfer_error, second.flux_scale * second.cross_transfer_error)
@@ -186,7 +186,7 @@ ALL_SCALES = Sentence(
     AtLeast(0, 2),
     "higher beyond the errors",
 )
-def more_loss_on_all_scales(minimal: RunResults, redundant: RunResults) -> Finding:
+def more_loss_on_all_scales(minimal: Results, redundant: Results) -> Finding:
     runs = _recovered_powers(minimal, redundant)
     return difference_of_ratios(*runs, _used_bins(runs, K_LOSS, np.inf))
 
@@ -198,7 +198,7 @@ def more_loss_on_all_scales(minimal: RunResults, redundant: RunResults) -> Findi
     AtLeast(0, 2),
     "higher beyond the errors",
 )
-def more_loss_on_all_scales_without_flux_scale(minimal: RunResults, redundant: RunResults) -> Finding:
+def more_loss_on_all_scales_without_flux_scale(minimal: Results, redundant: Results) -> Finding:
     return difference_of_losses(minimal, redundant, K_LOSS)
 
 
@@ -208,7 +208,7 @@ def more_loss_on_all_scales_without_flux_scale(minimal: RunResults, redundant: R
     AtLeast(0, 1),
     "larger by more than the bins resolve",
 )
-def bias_reaches_larger_k(minimal: RunResults, redundant: RunResults) -> Finding:
+def bias_reaches_larger_k(minimal: Results, redundant: Results) -> Finding:
     spectra = [[run.spherical(name, "outside-wedge") for name in ("residual", "eor")] for run in (minimal, redundant)]
     found = [bias_extent(*pair) for pair in spectra]
     if found[0].value <= spectra[0][0].bin_edges[np.argmax(used_bins(*spectra[0]))]:
@@ -226,7 +226,7 @@ SAME = Sentence("same-residual", "we get roughly the same residual when calibrat
     FACTOR_OF_TWO,
     roles=("redundant", "redundant_modelling"),
 )
-def redundant_modelling_same_visibilities(redundant: RunResults, modelling: RunResults) -> Finding:
+def redundant_modelling_same_visibilities(redundant: Results, modelling: Results) -> Finding:
     per_baseline, per_group = (run.measured("residual_over_noise_outside") for run in (redundant, modelling))
     found = ratio(Finding(per_group.value, per_group.scatter), Finding(per_baseline.value, per_baseline.scatter))
     return found._replace(kind="scatter")
@@ -239,7 +239,7 @@ def redundant_modelling_same_visibilities(redundant: RunResults, modelling: RunR
     FACTOR_OF_TWO,
     roles=("redundant", "redundant_modelling"),
 )
-def redundant_modelling_same_power(redundant: RunResults, modelling: RunResults) -> Finding:
+def redundant_modelling_same_power(redundant: Results, modelling: Results) -> Finding:
     return _lower("residual", modelling, redundant)
 
 
@@ -251,5 +251,5 @@ def redundant_modelling_same_power(redundant: RunResults, modelling: RunResults)
     "no effect, to a twentieth of the EoR",
     roles=("redundant", "redundant_modelling"),
 )
-def redundant_modelling_loses_the_same(redundant: RunResults, modelling: RunResults) -> Finding:
+def redundant_modelling_loses_the_same(redundant: Results, modelling: Results) -> Finding:
     return difference_of_losses(modelling, redundant, 0.0, K_LOSS - TINY)

@@ -14,10 +14,10 @@ from calstudy.claims.bins import (
     used_bins,
 )
 from calstudy.claims.realizations import over_realizations
-from calstudy.claims.results import RunResults
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS, SIMULATED
 from calstudy.power.delay import horizon_delay
 from calstudy.power.spectra import CylindricalSpectrum
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Equal, Finding, Within
 from calstudy.verdicts.statement import Sentence, Unevaluated
 
@@ -30,7 +30,7 @@ MAIN_LOBE = 4
 """Half-width of the Blackman-Harris main lobe in units of 1 / bandwidth."""
 
 
-def window(run: RunResults, wedge: CylindricalSpectrum) -> np.ndarray:
+def window(run: Results, wedge: CylindricalSpectrum) -> np.ndarray:
     """Return which modes are beyond horizon and buffer, or the taper's main lobe if that is wider, (Nb, Nd) bool.
 
     The horizon is that of the longest baseline of each bin.
@@ -48,7 +48,7 @@ def _rows(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return np.array([np.median(np.abs(row[mask])) for row, mask in zip(values, chosen, strict=True) if mask.any()])
 
 
-def _row_ratio(run: RunResults, above: str, below: tuple[str, ...]) -> Finding:
+def _row_ratio(run: Results, above: str, below: tuple[str, ...]) -> Finding:
     """Return the ratio of medians over the window, median and scatter over the bins of lengths."""
     upper = run.wedge(above)
     chosen = window(run, upper)
@@ -66,7 +66,7 @@ FILLED = Sentence("window-filled", "the entire EoR window is filled in with syst
     AtMost(2),
     "what is not contained adds to EoR and noise; " + FACTOR_OF_TWO,
 )
-def foregrounds_contained(run: RunResults) -> Finding:
+def foregrounds_contained(run: Results) -> Finding:
     return _row_ratio(run, "uncorrupted", ("eor", "noise"))
 
 
@@ -76,7 +76,7 @@ def foregrounds_contained(run: RunResults) -> Finding:
     AtLeast(0.95),
     "the entire window, but for chance crossings of zero",
 )
-def leakage_fills_window(run: RunResults) -> Finding:
+def leakage_fills_window(run: Results) -> Finding:
     upper, signal = run.wedge("uncalibrated"), run.wedge("eor")
     chosen = window(run, upper)
     above = (np.abs(upper.power.real) > np.abs(signal.power.real))[chosen]
@@ -89,7 +89,7 @@ def leakage_fills_window(run: RunResults) -> Finding:
     AtLeast(100),
     "systematics orders of magnitude above the signal: two at least",
 )
-def leakage_far_above_signal(run: RunResults) -> Finding:
+def leakage_far_above_signal(run: Results) -> Finding:
     return _row_ratio(run, "uncalibrated", ("eor",))
 
 
@@ -99,7 +99,7 @@ def leakage_far_above_signal(run: RunResults) -> Finding:
     AtLeast(100),
     "what is effectively removed is lower by two orders of magnitude at least",
 )
-def systematics_removed_from_window(run: RunResults) -> Finding:
+def systematics_removed_from_window(run: Results) -> Finding:
     return _row_ratio(run, "uncalibrated", ("residual",))
 
 
@@ -109,7 +109,7 @@ def systematics_removed_from_window(run: RunResults) -> Finding:
     Within(0.4, 0.6),
     "the product of independent noise has no preferred sign",
 )
-def noise_has_both_signs(run: RunResults) -> Finding:
+def noise_has_both_signs(run: Results) -> Finding:
     noise = run.wedge("noise")
     negative = noise.power.real[window(run, noise)] < 0
     return Finding(float(negative.mean()), float(0.5 / np.sqrt(negative.size)))
@@ -121,7 +121,7 @@ def noise_has_both_signs(run: RunResults) -> Finding:
     AtLeast(0.5),
     "most is more than half",
 )
-def calibrated_window_consistent(run: RunResults) -> Finding:
+def calibrated_window_consistent(run: Results) -> Finding:
     residual, signal, noise = (run.wedge(name) for name in ("residual", "eor", "noise"))
     chosen = window(run, residual)
     rows = chosen.any(axis=1)
@@ -151,7 +151,7 @@ UNBIASED = Sentence(
     AtLeast(0.9),
     "95 % by chance alone; broad agreement may miss a tenth",
 )
-def residual_agrees_outside_wedge(run: RunResults) -> Finding:
+def residual_agrees_outside_wedge(run: Results) -> Finding:
     residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
     used = used_bins(residual, signal, k_min=K_AGREEMENT)
     return fraction_within((residual.power - signal.power).real[used], residual.error[used])
@@ -164,7 +164,7 @@ def residual_agrees_outside_wedge(run: RunResults) -> Finding:
     FACTOR_OF_TWO,
     pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
-def residual_level_outside_wedge(run: RunResults) -> Finding:
+def residual_level_outside_wedge(run: Results) -> Finding:
     return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
 
 
@@ -175,7 +175,7 @@ def residual_level_outside_wedge(run: RunResults) -> Finding:
     "no bias beyond the errors",
     pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
-def residual_unbiased_outside_wedge(run: RunResults) -> Finding:
+def residual_unbiased_outside_wedge(run: Results) -> Finding:
     return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
 
 
@@ -190,7 +190,7 @@ BIAS_CAPTION = Sentence("biased-below-0p25", "our calibrated residual is biased 
     "a bias beyond the errors",
     pooled=over_realizations("ratio", "all-modes", 0.0, K_BIAS),
 )
-def residual_biased_with_wedge(run: RunResults) -> Finding:
+def residual_biased_with_wedge(run: Results) -> Finding:
     return recovered(run.spherical("residual", "all-modes"), run.spherical("eor", "all-modes"), 0.0, K_BIAS)
 
 
@@ -200,7 +200,7 @@ def residual_biased_with_wedge(run: RunResults) -> Finding:
     Within(0.2, 0.4),
     "≈ 0.3, within 0.1",
 )
-def bias_with_wedge_ends_near_0p3(run: RunResults) -> Finding:
+def bias_with_wedge_ends_near_0p3(run: Results) -> Finding:
     return bias_extent(*(run.spherical(name, "all-modes") for name in ("residual", "eor")))
 
 
@@ -210,7 +210,7 @@ def bias_with_wedge_ends_near_0p3(run: RunResults) -> Finding:
     Within(0.21, 0.29),
     "0.25, within one bin: without a bias there is no end of it",
 )
-def bias_with_wedge_ends_below_0p25(run: RunResults) -> Finding:
+def bias_with_wedge_ends_below_0p25(run: Results) -> Finding:
     return bias_extent(*(run.spherical(name, "all-modes") for name in ("residual", "eor")))
 
 
@@ -223,7 +223,7 @@ BELOW_FOREGROUNDS = Sentence(
 )
 
 
-def _without_eor(run: RunResults) -> Finding:
+def _without_eor(run: Results) -> Finding:
     residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
     used = used_bins(residual, signal, k_min=K_AGREEMENT)
     return ratio(rms_power(residual, used), Finding(float(np.mean(signal.power.real[used])), 0.0))
@@ -232,7 +232,7 @@ def _without_eor(run: RunResults) -> Finding:
 @RESULTS.states(
     NOISE_ONLY, "rms P^R without EoR over mean P^S, outside the wedge, k >= 0.2", AtMost(0.1), "an order of magnitude"
 )
-def residual_without_eor_tenfold_lower(run: RunResults) -> Finding:
+def residual_without_eor_tenfold_lower(run: Results) -> Finding:
     return _without_eor(run)
 
 
@@ -242,7 +242,7 @@ def residual_without_eor_tenfold_lower(run: RunResults) -> Finding:
     AtMost(10**-0.5),
     "an order of magnitude, to half an order",
 )
-def residual_without_eor_lower_within_half_an_order(run: RunResults) -> Finding:
+def residual_without_eor_lower_within_half_an_order(run: Results) -> Finding:
     return _without_eor(run)
 
 
@@ -252,7 +252,7 @@ def residual_without_eor_lower_within_half_an_order(run: RunResults) -> Finding:
     Within(0.5, 2),
     FACTOR_OF_TWO,
 )
-def residual_without_eor_at_noise(run: RunResults) -> Finding:
+def residual_without_eor_at_noise(run: Results) -> Finding:
     residual, noise = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "noise"))
     used = used_bins(residual, noise, k_min=K_AGREEMENT)
     rms = [np.sqrt(np.mean((item.power.real / item.noise_error)[used] ** 2)) for item in (residual, noise)]
@@ -267,7 +267,7 @@ def residual_without_eor_at_noise(run: RunResults) -> Finding:
     AtMost(-85),
     "≈ 90 dB, to half an order of magnitude; lower is better",
 )
-def residual_without_eor_90_db_below_foregrounds(run: RunResults) -> Finding:
+def residual_without_eor_90_db_below_foregrounds(run: Results) -> Finding:
     return _below_foregrounds(run)
 
 
@@ -278,11 +278,11 @@ def residual_without_eor_90_db_below_foregrounds(run: RunResults) -> Finding:
     Within(-95, -85),
     "≈ 90 dB, to half an order of magnitude",
 )
-def residual_without_eor_neither_more_nor_less_than_90_db_below(run: RunResults) -> Finding:
+def residual_without_eor_neither_more_nor_less_than_90_db_below(run: Results) -> Finding:
     return _below_foregrounds(run)
 
 
-def _below_foregrounds(run: RunResults) -> Finding:
+def _below_foregrounds(run: Results) -> Finding:
     residual = run.spherical("residual_without_eor", "outside-wedge")
     foregrounds = run.spherical("uncorrupted", "all-modes")
     found = rms_power(residual, used_bins(residual, k_min=K_AGREEMENT))
@@ -296,7 +296,7 @@ POSITIVE = Sentence(
 )
 
 
-def _positive_bias(run: RunResults) -> Finding:
+def _positive_bias(run: Results) -> Finding:
     residual = run.spherical("residual_without_eor", "outside-wedge")
     signal = run.spherical("eor", "outside-wedge")
     used = used_bins(residual, signal, k_max=K_SMALL)
@@ -312,7 +312,7 @@ def _positive_bias(run: RunResults) -> Finding:
     "positive beyond the errors",
     pooled=over_realizations("bias", "outside-wedge", 0.0, K_SMALL),
 )
-def positive_bias_at_small_k(run: RunResults) -> Finding:
+def positive_bias_at_small_k(run: Results) -> Finding:
     return _positive_bias(run)
 
 
@@ -323,7 +323,7 @@ def positive_bias_at_small_k(run: RunResults) -> Finding:
     "positive beyond the errors",
     roles=("paper_solver",),
 )
-def positive_bias_at_small_k_with_papers_solver(run: RunResults) -> Finding:
+def positive_bias_at_small_k_with_papers_solver(run: Results) -> Finding:
     return _positive_bias(run)
 
 
@@ -333,7 +333,7 @@ TAPERED = Sentence(
 )
 
 
-def _better_than_taper(run: RunResults, modes: str) -> Finding:
+def _better_than_taper(run: Results, modes: str) -> Finding:
     tapered, residual, signal = (run.spherical(name, modes) for name in ("uncorrupted", "residual", "eor"))
     used = used_bins(tapered, residual, signal, k_max=K_BIAS)
     errors = [np.sqrt(np.mean((item.power - signal.power).real[used] ** 2)) for item in (tapered, residual)]
@@ -347,7 +347,7 @@ def _better_than_taper(run: RunResults, modes: str) -> Finding:
     AtLeast(0, 2),
     "better beyond the errors",
 )
-def residual_beats_taper_outside_wedge(run: RunResults) -> Finding:
+def residual_beats_taper_outside_wedge(run: Results) -> Finding:
     return _better_than_taper(run, "outside-wedge")
 
 
@@ -357,5 +357,5 @@ def residual_beats_taper_outside_wedge(run: RunResults) -> Finding:
     AtLeast(0, 2),
     "better beyond the errors",
 )
-def residual_beats_taper_all_modes(run: RunResults) -> Finding:
+def residual_beats_taper_all_modes(run: Results) -> Finding:
     return _better_than_taper(run, "all-modes")

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import yaml
-from pydantic import Field, SerializeAsAny, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from calstudy.base.constants import SPEED_OF_LIGHT
-from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.plugins import Plugin
+from calstudy.base.errors import InputError
 from calstudy.base.quiet import require_tensorflow
 from calstudy.base.resources import free_memory, parse_memory
 from calstudy.base.schema import Section, fault
@@ -20,21 +17,16 @@ from calstudy.base.units import Length
 from calstudy.calibrate.settings import BasisSettings
 from calstudy.claims.paper import distinct_papers
 from calstudy.claims.product import run_time_claims
-from calstudy.experiment.files import apply_scale, override, parse_override
-from calstudy.experiment.messages import sentences
-from calstudy.experiment.model import FIGURES, PAPERS, StudyName
-from calstudy.figures import DRAW
+from calstudy.experiment.files import StudyFile
+from calstudy.experiment.model import FIGURES, Folders, Papers, StudyName
+from calstudy.figures import draw_task
 from calstudy.instrument.array_layouts.linear import LinearLayout
 from calstudy.instrument.array_layouts.rectangular import RectangularLayout
 from calstudy.instrument.settings import Channels
 from calstudy.products.run_times import COUNT_STEPS, SUMMARIZE, TIME_STEPS, TimedArray
 from calstudy.run.provenance import machine, package_versions
 from calstudy.run.task import Task
-from calstudy.studies.folder import EXPERIMENT, product_entries, publish, run_folder, write, write_manifest
-from calstudy.studies.study import Budget, Made, Study
-
-KEY = "runtime"
-"""Key that marks a file as a run-time study."""
+from calstudy.studies.study import Budget, Study
 
 
 def _require_increasing(sizes: Sequence[float]) -> None:
@@ -127,21 +119,14 @@ class RuntimeSettings(Section):
         return self
 
 
-class RuntimeOutputs(Section):
-    """Folders of products and runs."""
-
-    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
-    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
-
-
 class RuntimeFile(Section):
     """Steps of the paper's solver, of our Adamax and of the default solver, timed side by side on this machine."""
 
     name: StudyName
     description: str = ""
     runtime: RuntimeSettings
-    outputs: RuntimeOutputs = RuntimeOutputs()
-    papers: Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)] = Field(
+    outputs: Folders = Folders()
+    papers: Papers = Field(
         (), description="Published papers whose statements on run times are evaluated, such as [calamity2022]."
     )
     scales: dict[str, dict[str, Any]] = Field(
@@ -158,9 +143,21 @@ TIMED_WITH = ("tensorflow", "numpy", "scipy")
 class RuntimeStudy(Study):
     """Run times of solvers on this machine."""
 
+    key = "runtime"
+    model = RuntimeFile
+    heading = "Run-time files"
+    guide = (
+        "A file with the key `runtime` is a run-time study. `python -m calstudy run` times the solvers here, "
+        "one array after the other; what it measured is kept under a key that names the machine."
+    )
+
     def __init__(self, file: RuntimeFile) -> None:
         self.file = file
-        self.name, self.description = file.name, file.description
+
+    @classmethod
+    def load(cls, file: StudyFile) -> RuntimeStudy:
+        """Return the study of a file."""
+        return cls(file.read(RuntimeFile))
 
     @cached_property
     def timed_on(self) -> Mapping[str, Any]:
@@ -174,22 +171,11 @@ class RuntimeStudy(Study):
         return {**found, "gpu": _gpu()} if "gpu" in self.file.runtime.devices else found
 
     @property
-    def outputs(self) -> RuntimeOutputs:
-        """Store and folder of runs."""
-        return self.file.outputs
+    def content(self) -> Any:
+        """The content of the file without outputs, and the machine."""
+        return {**self.file.model_dump(mode="json", exclude={"outputs", "scales"}), "machine": self.timed_on}
 
-    @property
-    def stand_ins(self) -> tuple[str, ...]:
-        """No substitutions: run times need no sky."""
-        return ()
-
-    @property
-    def folder(self) -> Path:
-        """The run folder: the name, and a digest of the file's content and of the machine."""
-        content = {**self.file.model_dump(mode="json", exclude={"outputs", "scales"}), "machine": self.timed_on}
-        return run_folder(self.outputs.runs, self.name, content)
-
-    def fitted(self, budget: Budget) -> tuple[Self, int]:
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study and one worker; raises InputError for other workers, or too little memory."""
         if budget.scheduler is not None or budget.workers not in (None, 1):
             raise InputError(
@@ -272,7 +258,7 @@ class RuntimeStudy(Study):
     def _figure(self, panel: str) -> Task:
         figure = FIGURES.make({"kind": "runtime", "panel": panel})
         shown = {name: task for name, task in self.timings.items() if task.settings["panel"] == panel}
-        return Task(DRAW, figure.label, {"figure": figure, "notes": list(self.stand_ins)}, shown)
+        return draw_task(figure, shown, self.stand_ins, {})
 
     @cached_property
     def claims(self) -> Task | None:
@@ -280,43 +266,14 @@ class RuntimeStudy(Study):
         return run_time_claims(self.name, distinct_papers(self.file.papers), self.summary)
 
     @property
-    def targets(self) -> list[Task]:
-        """Figures, the table and claims."""
-        return [*self.figures, self.summary, *([self.claims] if self.claims else [])]
+    def tables(self) -> list[Task]:
+        """The table of all measurements."""
+        return [self.summary]
 
-    def fill(self, made: Made) -> None:
-        """Write figures, the table, claims, the file and the manifest."""
-        folder, products = self.folder, made.products
-        publish([products[task.key] for task in self.figures], folder / "figures")
-        publish([products[self.summary.key]], folder / "tables")
-        if self.claims is not None:
-            publish([products[self.claims.key]], folder)
-        text = yaml.safe_dump(self.file.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)
-        write(folder / EXPERIMENT, text)
-        figures = [task.settings["figure"] for task in self.figures]
-        fields = {
-            "description": self.description,
-            "kind": "runtime",
-            "stand_ins": list(self.stand_ins),
-            "captions": {figure.label: figure.caption for figure in figures},
-            "machine": self.timed_on,
-            "products": product_entries(self.tasks, made.products, made.tasks),
-        }
-        write_manifest(folder, self.name, fields)
-
-
-def load_runtime(
-    path: Path, data: Mapping[str, Any], scale: str | None = None, overrides: Sequence[str] = ()
-) -> RuntimeStudy:
-    """Validate the content of a run-time file; parameters and errors as for `calstudy.studies.load.load_study`."""
-    plain = apply_scale(data, scale)
-    for text in overrides:
-        plain = override(plain, *parse_override(text))
-    try:
-        file = RuntimeFile.model_validate(plain, context={"folder": path.resolve().parent})
-    except ValidationError as error:
-        raise ExperimentError(sentences(error, RuntimeFile, plain)) from None
-    return RuntimeStudy(file)
+    @property
+    def entries(self) -> Mapping[str, Any]:
+        """The kind and the machine."""
+        return {"kind": "runtime", "machine": self.timed_on}
 
 
 def _gpu() -> str:

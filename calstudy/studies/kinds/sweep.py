@@ -7,31 +7,31 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.claims.paper import stand_ins
-from calstudy.experiment.files import dump, override, short_names, validate
-from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment, Outputs
-from calstudy.figures import DRAW
+from calstudy.experiment.files import StudyFile, override, short_names, validate
+from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.figures.sweep import SUMMARY
 from calstudy.run.task import Task
-from calstudy.studies.experiment import ExperimentStudy, experiment_folder
-from calstudy.studies.folder import EXPERIMENT, POINTS, publish, write, write_manifest
-from calstudy.studies.study import Budget, Made, Study, fitted_parts
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, content_of
+from calstudy.studies.study import RunProducts
 
 SWEPT = ("instrument", "sky", "simulation", "corruption", "calibration", "power", "variants")
 """Sections whose fields can be varied."""
 LONGEST_LABEL = 72
 MOST_POINTS = 250
+POINTS = "points"
+"""Folder of the points in the run folder."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One experiment of a family, validated and without the sweep.
+    """One experiment of a sweep.
 
     The label, which names its folder, has its number and the changes: the varied fields (dotted path) and their
     values as text, as written in the file.
@@ -39,84 +39,74 @@ class Point:
 
     label: str
     changes: Mapping[str, str]
-    experiment: Experiment
 
 
-class Sweep(Study):
-    """A family of experiments.
+@dataclass(frozen=True, eq=False)
+class Sweep(Family):
+    """A family of experiments that differ in a few fields of `file`; members have the labels of the points.
 
-    Products that several points need have one key, and are made once. A block of the file's `sweep` has all
-    combinations of its values as points, with the last field varying fastest.
+    A block of the file's `sweep` has all combinations of its values as points, with the last field varying fastest.
     """
 
-    def __init__(self, base: Experiment, blocks: Sequence[Sequence[Point]]) -> None:
-        self.base, self.blocks = base, tuple(tuple(block) for block in blocks)
-        self.name, self.description = base.name, base.description
+    key = "sweep"
+    model = Experiment
+    subfolders = (POINTS,)
+    has_reference = False
+
+    blocks: Sequence[Sequence[Point]]
+
+    @classmethod
+    def load(cls, file: StudyFile) -> Sweep:
+        """Return the sweep of a file."""
+        return expand(file.experiment())
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Sweep:
+        """Return the family of an experiment; errors as for `expand`."""
+        return expand(experiment)
 
     @property
     def points(self) -> tuple[Point, ...]:
         """The points of all blocks."""
         return tuple(point for block in self.blocks for point in block)
 
-    @property
-    def outputs(self) -> Outputs:
-        """Store and folder of runs."""
-        return self.base.outputs
+    def member(self, label: str) -> ExperimentStudy:
+        """Return the study of a point, with a folder under ``points``."""
+        return ExperimentStudy(self.members[label], self.folder / POINTS / label)
 
     @property
-    def folder(self) -> Path:
-        """The run folder."""
-        return experiment_folder(self.base)
-
-    @cached_property
     def parts(self) -> Mapping[str, ExperimentStudy]:
-        """The points, each with a folder under ``points``."""
-        return {
-            point.label: ExperimentStudy(point.experiment, self.folder / POINTS / point.label) for point in self.points
-        }
+        """The points."""
+        return self.studies
 
-    def fitted(self, budget: Budget) -> tuple[Self, int]:
-        """Return the sweep with every point fitted, and the smallest number of workers of all."""
-        fits = fitted_parts(self.parts, budget)
-        blocks = [
-            [replace(point, experiment=fits[point.label][0].experiment) for point in block] for block in self.blocks
-        ]
-        return type(self)(self.base, blocks), min(count for _, count in fits.values())
+    @property
+    def content(self) -> Any:
+        """The varied experiment."""
+        return content_of(self.file)
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
         """Substitutions of the varied experiment for the papers' own ingredients."""
-        return stand_ins(self.base)
+        return stand_ins(self.file)
 
     @cached_property
-    def summary(self) -> Task:
-        """The signal loss of all points: a table and a figure."""
-        figure = FIGURES.make("sweep")
+    def figures(self) -> list[Task]:
+        """The signal loss of all points: a figure, and a table beside it."""
         blocks = [[{"label": point.label, "changes": dict(point.changes)} for point in block] for block in self.blocks]
-        settings = {"figure": figure, "notes": list(self.stand_ins), "blocks": blocks}
-        inputs = {label: figure.inputs(part.graph)["transfer"] for label, part in self.parts.items()}
-        return Task(DRAW, figure.label, settings, inputs)
+        return [self.draw(FIGURES.make("sweep"), {"blocks": blocks})]
 
     @property
-    def targets(self) -> list[Task]:
-        """The products of all points, and their comparison."""
-        return [*(task for part in self.parts.values() for task in part.targets), self.summary]
-
-    def fill(self, made: Made) -> None:
-        """Write the comparison, the experiment and the manifest."""
-        folder, summary = self.folder, made.products[self.summary.key]
-        publish([summary], folder / "figures")
-        (folder / "tables").mkdir(exist_ok=True)
-        (folder / "figures" / SUMMARY).replace(folder / "tables" / SUMMARY)
-        write(folder / EXPERIMENT, dump(self.base))
-        fields = {
-            "description": self.description,
-            "stand_ins": list(self.stand_ins),
-            "captions": {self.summary.label: self.summary.settings["figure"].caption},
-            "points": [{"folder": f"{POINTS}/{point.label}", "changes": dict(point.changes)} for point in self.points],
-            "products": [{name: summary.record[name] for name in ("stage", "label", "key", "seconds", "inputs")}],
+    def entries(self) -> Mapping[str, Any]:
+        """The folder and the changes of every point."""
+        return {
+            POINTS: [{"folder": f"{POINTS}/{point.label}", "changes": dict(point.changes)} for point in self.points]
         }
-        write_manifest(folder, self.name, fields)
+
+    def write_results(self, made: RunProducts) -> None:
+        """Write the comparison of all points, with its table in the folder of tables."""
+        super().write_results(made)
+        (self.folder / "tables").mkdir(exist_ok=True)
+        (self.folder / "figures" / SUMMARY).replace(self.folder / "tables" / SUMMARY)
 
 
 def expand(experiment: Experiment) -> Sweep:
@@ -145,21 +135,26 @@ def expand(experiment: Experiment) -> Sweep:
         raise ExperimentError(faults)
     plain = experiment.model_dump(mode="json", exclude_unset=True, exclude={"sweep", "scales"})
     numbers = itertools.count(1)
-    blocks = []
+    members, blocks = {}, []
     for block in experiment.sweep:
         points = []
         for values in itertools.product(*block.values()):
             changes = dict(zip(block, values, strict=True))
             named = {path: changes[path] for path in varied_fields(block)}
-            found = _point(plain, changes, _label(next(numbers), named))
-            if isinstance(found, Point):
-                points.append(found)
-            else:
+            texts = {path: text_of(value) for path, value in changes.items()}
+            points.append(Point(_label(next(numbers), named), texts))
+            words = ", ".join(f"{path} = {text}" for path, text in texts.items())
+            try:
+                members[points[-1].label] = _varied(plain, changes, words)
+            except ExperimentError as error:
+                found = [f"sweep ({words}): {fault}" for fault in error.faults]
                 faults += [fault for fault in found if fault not in faults]
+            except InputError as error:
+                faults.append(f"sweep ({words}): {error}")
         blocks.append(tuple(points))
     if faults:
         raise ExperimentError(faults)
-    return Sweep(experiment, blocks)
+    return Sweep(experiment, members, blocks)
 
 
 def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str]:
@@ -178,21 +173,14 @@ def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str
     return faults
 
 
-def _point(plain: Mapping[str, Any], changes: Mapping[str, Any], label: str) -> Point | list[str]:
-    """Return one point, or its faults."""
-    texts = {path: text_of(value) for path, value in changes.items()}
-    words = ", ".join(f"{path} = {text}" for path, text in texts.items())
-    try:
-        data = dict(plain)
-        for path, value in changes.items():
-            data = override(data, path, value)
-        data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
-        # The paths of input files were made absolute when the file was read.
-        return Point(label, texts, validate(data, Path("/")))
-    except ExperimentError as error:
-        return [f"sweep ({words}): {fault}" for fault in error.faults]
-    except InputError as error:
-        return [f"sweep ({words}): {error}"]
+def _varied(plain: Mapping[str, Any], changes: Mapping[str, Any], words: str) -> Experiment:
+    """Return the experiment of one point."""
+    data = dict(plain)
+    for path, value in changes.items():
+        data = override(data, path, value)
+    data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
+    # The paths of input files were made absolute when the file was read.
+    return validate(data, Path("/"))
 
 
 def text_of(value: Any) -> str:

@@ -1,0 +1,87 @@
+"""Tables of texts, for the terminal, as Markdown for documents, and in reports; numbers with their uncertainty."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as TerminalTable
+
+COLOURS = {
+    "PASS": "green",
+    "FAIL": "bold red",
+    "supported": "green",
+    "contradicted": "bold red",
+    "undecided": "yellow",
+    "not evaluated": "dim",
+    "same": "green",
+    "moved": "yellow",
+    "beyond": "bold red",
+}
+"""Terminal colours of verdicts, and of comparisons with a reference."""
+LARGE = 1e5
+"""Numbers above this are written with an exponent."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts; each row has as many cells as there are columns.
+
+    Cells with the name of an outcome are coloured. The note, which may be empty, is a sentence below the title.
+    Markdown has neither title nor note.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
+    note: str = ""
+
+    @property
+    def outcomes(self) -> list[str]:
+        """The outcomes in the table, once each."""
+        return sorted({cell for row in self.rows for cell in row} & set(COLOURS))
+
+    def show(self, console: Console, numbers: bool = True) -> None:
+        """Print it with coloured outcomes; with `numbers`, all columns but the first are aligned to the right."""
+        table = TerminalTable(title=escape(self.title), title_justify="left")
+        for index, column in enumerate(self.columns):
+            table.add_column(column, justify="right" if index and numbers else "left", overflow="fold")
+        for row in self.rows:
+            table.add_row(*(coloured(cell) for cell in row))
+        console.print(table)
+
+    def markdown(self, numbers: bool = True) -> str:
+        """Return it in Markdown; with `numbers`, all columns but the first are aligned to the right."""
+        marks = ["---", *["--:" if numbers else "---"] * (len(self.columns) - 1)]
+        rows = ([plain_text(cell).replace("|", "\\|") for cell in row] for row in (self.columns, marks, *self.rows))
+        return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def plain_text(text: str) -> str:
+    """Return a text in one line, without tags and entities of HTML but with its Markdown."""
+    text = "".join(letter if letter.isprintable() else " " for letter in text)
+    return re.sub(r"&(?=#?\w+;)", "&amp;", re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text))
+
+
+def one_line(text: str) -> str:
+    """Return a text of others as one line of at most 1000 characters, without HTML and with Markdown escaped."""
+    return re.sub(r"([\\`*_\[\]|!#~]|:(?=//))", r"\\\1", plain_text(text[:1000])).strip()
+
+
+def coloured(text: str) -> str:
+    """Return a cell as markup of the terminal, in its colour if it is the name of an outcome or a status."""
+    return f"[{COLOURS[text]}]{text}[/]" if text in COLOURS else escape(text)
+
+
+def number(value: float, uncertainty: float | None = None) -> str:
+    """Write a number with three digits, or with its uncertainty and the digits that are significant for it."""
+    if not uncertainty:
+        return f"{value:.3g}"
+    places = min(15, max(0, 1 - math.floor(math.log10(uncertainty))))
+    size = f"{value:.3g}" if abs(value) >= LARGE else f"{value:.{places}f}"
+    plain = uncertainty >= 100 and abs(value) < LARGE
+    return f"{size} ± {uncertainty:.0f}" if plain else f"{size} ± {uncertainty:.2g}"

@@ -1,0 +1,57 @@
+"""Options that several commands have, and the order of commands in ``calstudy --help``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+StudyFile = Annotated[
+    Path,
+    typer.Argument(
+        help="The file (YAML) of a study, or the name of a published one, such as quickstart.", show_default=False
+    ),
+]
+Scale = Annotated[str | None, typer.Option(help="Apply a named set of overrides of the file, such as 'small'.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set calibration.basis.buffer='200 ns'."),
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
+MaxMemory = Annotated[
+    str | None,
+    typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster in place of own workers.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
+
+SECTIONS = {
+    "Every day": ("init", "plan", "run", "calibrate", "report"),
+    "Results": ("claims", "compare-gains", "runs", "store"),
+    "Other programs": ("export", "score", "leaderboard"),
+    "Reference": ("examples", "fields", "schema", "data"),
+    "Checks": ("validate", "check", "regress"),
+}
+"""Commands by section of the help."""
+
+
+class Sections(TyperGroup):
+    """A group of commands whose help lists them by section."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands by section, and those of no section last."""
+        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        width = formatter.width - 6 - max(map(len, commands))
+        texts = {
+            name: found.get_short_help_str(width) for name, found in commands.items() if found and not found.hidden
+        }
+        listed = {name for names in SECTIONS.values() for name in names}
+        others = tuple(name for name in texts if name not in listed)
+        for title, names in {**SECTIONS, "Others": others}.items():
+            if rows := [(name, texts[name]) for name in names if name in texts]:
+                with formatter.section(title):
+                    formatter.write_dl(rows, col_max=16)

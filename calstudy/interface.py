@@ -1,0 +1,422 @@
+"""The Python interface: load, plan and run a study, and read its results.
+
+The command line calls the same functions. Results are labelled arrays of xarray with units in their attributes, tables
+of pandas, and the objects of pyuvdata::
+
+    import calstudy
+
+    study = calstudy.load("quickstart", **{"instrument.times.count": 8})
+    study.plan()
+    run = study.run(workers=2)
+    run.spectra["residual"]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import yaml
+
+from calstudy.base.errors import InputError, nearest
+from calstudy.experiment.files import StudyFile
+from calstudy.products import calibration, corruption
+from calstudy.products.files import DATA, GAINS, RESIDUAL
+from calstudy.report.headline import read_headline
+from calstudy.results.folder import EXPERIMENT, RunFolder
+from calstudy.results.reader import Tables
+from calstudy.run.store import Store
+from calstudy.run.task import Job, Task
+from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.studies.load import load_study, study_of
+from calstudy.studies.show import describe_plan, show_plan
+from calstudy.studies.study import Budget, Study, run_study
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+    from matplotlib.figure import Figure
+    from pyuvdata import UVCal, UVData
+    from rich.console import Console
+
+    from calstudy.experiment.model import Experiment, Variant
+    from calstudy.power.transfer import TransferFunction
+
+Half = Literal["even", "odd"]
+REGIONS = ("outside-wedge", "inside-wedge")
+
+
+def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
+    """Load a study.
+
+    Parameters
+    ----------
+    source
+        A YAML file, the name of a published experiment, such as "quickstart", or the content of a file, whose relative
+        paths start at the working directory.
+    scale
+        Name of a set of overrides in the file's `scales`.
+    **changes
+        Fields that are changed, by dotted path: ``**{"instrument.times.count": 8}``. Values are those that the file
+        could have: numbers, texts with units, lists and mappings.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a field is unknown or has a value that is not allowed.
+    """
+    texts = [f"{path}={yaml.safe_dump(value, default_flow_style=True)}" for path, value in changes.items()]
+    if isinstance(source, Mapping):
+        return LoadedStudy(study_of(StudyFile(Path("study.yaml"), source, scale, texts)))
+    return LoadedStudy(load_study(Path(source), scale, texts))
+
+
+def open_run(folder: str | Path) -> OpenRun:
+    """Open the folder of a finished run; raises InputError for another folder."""
+    return OpenRun(RunFolder(Path(folder)))
+
+
+class StudyPlan(Mapping[str, Any]):
+    """The products and the cost of a run as plain values; it is printed as a table."""
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self._content = dict(content)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._content[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._content)
+
+    def __len__(self) -> int:
+        return len(self._content)
+
+    @property
+    def stages(self) -> pandas.DataFrame:
+        """Products, products to make, seconds on one core, and bytes of memory and disk, by stage."""
+        import pandas
+
+        return pandas.DataFrame(self["stages"]).set_index("stage")
+
+    def __repr__(self) -> str:
+        return _printed(lambda console: show_plan(self._content, console))
+
+
+class LoadedStudy:
+    """A validated study: an experiment, a sweep, a collection, a comparison or measured data."""
+
+    def __init__(self, study: Study) -> None:
+        self._study = study
+
+    @property
+    def name(self) -> str:
+        """Name of the study."""
+        return self._study.name
+
+    @property
+    def folder(self) -> Path:
+        """The folder that a run fills."""
+        return self._study.folder
+
+    @property
+    def experiment(self) -> Experiment:
+        """The validated experiment, whose quantities are numbers in SI units; InputError if there are several."""
+        return _single(self._study).experiment
+
+    def plan(self, workers: int | None = None, max_memory: str | None = None) -> StudyPlan:
+        """Return the stages of a run with the estimated time, memory and disk.
+
+        Parameters
+        ----------
+        workers
+            Number of worker processes; by default one for each core, as far as the memory allows.
+        max_memory
+            Memory of all workers together, such as "6 GB"; by default all free memory.
+        """
+        return StudyPlan(describe_plan(self._study, Budget(workers, max_memory)))
+
+    def run(
+        self,
+        workers: int | None = None,
+        max_memory: str | None = None,
+        scheduler: str | None = None,
+        quiet: bool = False,
+    ) -> OpenRun:
+        """Make all products that are not in the store, and fill the run folder.
+
+        Parameters
+        ----------
+        workers, max_memory
+            As for `plan`.
+        scheduler
+            Address of a running dask scheduler, in place of own workers.
+        quiet
+            If true, no progress is printed.
+        """
+        from rich.console import Console
+
+        finished = run_study(self._study, Budget(workers, max_memory, scheduler), Console(quiet=quiet))
+        return open_run(finished.folder)
+
+    def __repr__(self) -> str:
+        figures = [task.label for task in _figures(self._study)]
+        return "\n".join(
+            (
+                f"study {self.name!r}: {self._study.description}",
+                f"figures: {', '.join(figures) or 'none'}",
+                f"run folder: {self.folder}",
+            )
+        )
+
+
+class ByVariant(Mapping[str, Any]):
+    """Results by variant of the data, which are read when they are asked for."""
+
+    def __init__(self, names: list[str], read: Callable[[str], Any]) -> None:
+        self._names, self._read = names, read
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._names:
+            raise KeyError(f"no variant {name!r}{nearest(name, self._names)} (there are: {', '.join(self._names)})")
+        return self._read(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return self._names
+
+    def __repr__(self) -> str:
+        return f"variants: {', '.join(self._names)}"
+
+
+class OpenRun:
+    """The results of a finished run.
+
+    Every property raises InputError, with the reason, if the run does not have what it returns.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self.name = folder.name
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self._folder.path
+
+    @property
+    def spectra(self) -> ByVariant:
+        """Spherical power spectra outside the wedge, by variant: datasets with `power` and errors against `k`."""
+        return self._by_variant(self._spherical("outside-wedge"))
+
+    @property
+    def spectra_of_all_modes(self) -> ByVariant:
+        """Spherical power spectra of all modes, by variant."""
+        return self._by_variant(self._spherical("all-modes"))
+
+    @property
+    def cylindrical(self) -> ByVariant:
+        """Cylindrical power spectra, by variant: datasets with `power` against `baseline_length` and `delay`."""
+        from calstudy.results.labelled import by_length_and_delay
+
+        return self._by_variant(lambda name: by_length_and_delay(self._tables.wedge(name)))
+
+    @property
+    def transfer(self) -> xarray.Dataset:
+        """The transfer function T of the calibration against `region` ("outside-wedge", "inside-wedge") and `k`."""
+        return self._by_region(self._tables.transfer)
+
+    @property
+    def transfer_in_bands(self) -> xarray.Dataset:
+        """The same in four wide bands of k."""
+        return self._by_region(self._tables.transfer_in_bands)
+
+    @property
+    def transfer_map(self) -> xarray.Dataset:
+        """The transfer function against `baseline_length` and `delay`."""
+        from calstudy.results.labelled import by_length_and_delay
+
+        return by_length_and_delay(self._tables.transfer_map())
+
+    @property
+    def scores(self) -> pandas.DataFrame:
+        """T and bias of the calibration in bands of k, with errors from leaving out antennas; one row for each band."""
+        import pandas
+
+        rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._tables.summary["bands"]]
+        return pandas.DataFrame(rows).drop(columns="k").set_index(["k_from", "k_to"])
+
+    @property
+    def claims(self) -> pandas.DataFrame:
+        """Statements of papers with the measured number and the verdict, by name; empty without papers."""
+        import pandas
+
+        columns = ("verdict", "measured", "uncertainty", "threshold", "quantity", "section", "sentence", "reason")
+        claims = self._folder.claims
+        rows = [[getattr(claim, column) for column in columns] for claim in claims]
+        return pandas.DataFrame(rows, pandas.Index([claim.name for claim in claims], name="claim"), columns)
+
+    @property
+    def products(self) -> pandas.DataFrame:
+        """The products of the run with the time that each took, and whether this run made it."""
+        import pandas
+
+        columns = ["stage", "label", "seconds", "cpu_seconds", "peak_memory_bytes", "made_by_this_run"]
+        return pandas.DataFrame([{name: entry.get(name) for name in columns} for entry in self._folder.products])
+
+    @property
+    def tables(self) -> list[str]:
+        """Names of the tables that `table` reads."""
+        return sorted(path.stem for path in self._tables.folders[0].glob("*.csv"))
+
+    def table(self, name: str) -> pandas.DataFrame:
+        """Return a table of the run, such as "comparison" or "eor.outside-wedge"."""
+        import pandas
+
+        listed = f"{nearest(name, self.tables)} (there are: {', '.join(self.tables)})"
+        return pandas.read_csv(self._tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}"))
+
+    @property
+    def parts(self) -> dict[str, OpenRun]:
+        """The members of a collection, or the points of a sweep, by name."""
+        return {name: OpenRun(folder) for name, folder in self._folder.parts.items()}
+
+    def gains(self, variant: str = "residual", half: Half = "even") -> UVCal:
+        """Return the gains of the calibration of a variant; "true" in place of a variant returns the true gains.
+
+        Parameters
+        ----------
+        variant
+            A calibrated variant.
+        half
+            Which of the two noise realizations.
+        """
+        from pyuvdata import UVCal
+
+        study = self._experiment
+        task = corruption.gains(study.graph) if variant == "true" else self._calibration(variant, half)
+        return UVCal.from_file(self._product(task, study) / GAINS)
+
+    def visibilities(self, variant: str, half: Half = "even") -> UVData:
+        """Return the visibilities of a variant: the residual if it is calibrated, else the simulated data.
+
+        Parameters
+        ----------
+        variant
+            A variant, such as "uncalibrated".
+        half
+            Which of the two noise realizations.
+        """
+        from calstudy.products.files import read_visibilities
+
+        study = self._experiment
+        if self._variant(variant).calibrate:
+            return read_visibilities(self._product(self._calibration(variant, half), study) / RESIDUAL)
+        data = corruption.data(study.graph, self._variant(variant), half)
+        return read_visibilities(self._product(data, study) / DATA)
+
+    @property
+    def figures(self) -> list[str]:
+        """Names of the figures."""
+        return sorted(path.stem for path in self._folder.figures.glob("*.png"))
+
+    def plot(self, name: str) -> Figure:
+        """Draw a figure of the study again from the products in the store; raises InputError if they are not there."""
+        study = self._study
+        tasks = {task.label: task for task in _figures(study)}
+        if name not in tasks:
+            raise InputError(
+                f"{name!r}: no figure of this study{nearest(name, list(tasks))}; it has {', '.join(tasks)}"
+            )
+        task = tasks[name]
+        inputs = {needed: self._product(other, study) for needed, other in task.needs.items()}
+        return task.settings["figure"].draw(Job(settings=task.settings, inputs=inputs, output=self.folder)).figure
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))
+        finished = self._manifest.get("finished", "at an unknown time")
+        lines = [f"run {self.name!r}, finished {finished}, in {self.folder}", f"figures: {', '.join(self.figures)}"]
+        return "\n".join([*lines, numbers] if numbers else lines)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(repr(self))}</pre>"
+
+    @property
+    def _manifest(self) -> Mapping[str, Any]:
+        return self._folder.manifest
+
+    @property
+    def _tables(self) -> Tables:
+        return self._folder.tables
+
+    @cached_property
+    def _study(self) -> Study:
+        return load_study(self.folder / EXPERIMENT)
+
+    @property
+    def _experiment(self) -> ExperimentStudy:
+        return _single(self._study)
+
+    def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
+        return ByVariant(self._tables.variants, read)
+
+    def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
+        from calstudy.results.labelled import by_wavenumber
+
+        return lambda name: by_wavenumber(self._tables.spherical(name, modes))
+
+    def _by_region(self, read: Callable[[str], TransferFunction]) -> xarray.Dataset:
+        import xarray
+
+        from calstudy.results.labelled import by_wavenumber
+
+        found = [by_wavenumber(read(region)) for region in REGIONS]
+        return xarray.concat(found, xarray.IndexVariable("region", list(REGIONS)), combine_attrs="override")
+
+    def _variant(self, name: str) -> Variant:
+        variants = self._experiment.experiment.variants
+        if name not in variants:
+            raise InputError(f"no variant {name!r}{nearest(name, list(variants))} (there are: {', '.join(variants)})")
+        return variants[name]
+
+    def _calibration(self, variant: str, half: Half) -> Task:
+        if not self._variant(variant).calibrate:
+            raise InputError(f"{variant!r} is not calibrated")
+        return calibration.calibration(self._experiment.graph, self._variant(variant), half)
+
+    def _product(self, task: Task, study: Study) -> Path:
+        store = Store(study.outputs.store)
+        product = store.find(task.stage.name, task.key)
+        if product is None:
+            raise InputError(
+                f"{task.stage.name} ({task.label}): is not in the store {store.root}, or was made by another version; "
+                "run the study again"
+            )
+        return product.path
+
+
+def _single(study: Study) -> ExperimentStudy:
+    if not isinstance(study, ExperimentStudy):
+        raise InputError(f"{study.name}: has several experiments; take one of its parts")
+    return study
+
+
+def _figures(study: Study) -> list[Task]:
+    return [task for task in study.tasks if task.stage.name == "figure"]
+
+
+def _printed(show: Callable[[Console], None]) -> str:
+    from rich.console import Console
+
+    text = StringIO()
+    show(Console(width=120, highlight=False, file=text))
+    return text.getvalue().rstrip()

@@ -1,0 +1,235 @@
+"""Collections: several experiments that are run together, share products, and are compared."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import Field, model_validator
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.identity import identity
+from calstudy.base.schema import Section, choice, fault
+from calstudy.claims.evaluation import members_by_role, refusal_of_role
+from calstudy.claims.paper import distinct_papers, unique_notes
+from calstudy.claims.product import combined_claims
+from calstudy.experiment.files import StudyFile, apply_scale, checked, override, validate
+from calstudy.experiment.model import Experiment, Figures, StudyName
+from calstudy.experiment.yaml_files import read_mapping
+from calstudy.figures import StudyFigure, figure_task, figures_for
+from calstudy.run.task import Task
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
+from calstudy.studies.study import KINDS, kind_of
+
+
+class Member(Section):
+    """One experiment of the collection; a file name alone is allowed in place of the block."""
+
+    file: Path = Field(strict=False, description="The experiment file; a relative path starts at the collection file.")
+    name: StudyName | None = Field(None, description="Replaces the experiment's own name.")
+    overrides: dict[str, Any] = Field(default_factory=dict, description="Fields to change (dotted path: value).")
+
+
+class CollectionFile(Section):
+    """Several experiments that are run together, share products, and are compared."""
+
+    name: StudyName = Field(description="Names the folder of the combined figures and claims.")
+    description: str = ""
+    experiments: Annotated[tuple[Annotated[Member, choice("file")], ...], Field(strict=False, min_length=1)] = Field(
+        description="Experiment files, each with its own run folder."
+    )
+    figures: Figures = Field((), description="Figures that compare members, such as layouts and spherical-comparison.")
+    roles: dict[str, str] = Field(
+        default_factory=dict,
+        description="Which member plays which role in the members' papers and in figures, where its name does not say.",
+    )
+
+    @model_validator(mode="after")
+    def _names_no_one_twice(self) -> CollectionFile:
+        names = [member.name for member in self.experiments if member.name]
+        for name in names:
+            if names.count(name) > 1:
+                raise fault("experiments", f"gives the name {name!r} twice")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Collection(Family):
+    """Several experiments, and the figures and claims that compare them.
+
+    `members` are in the order of the file, all with the same store and folder of runs; `roles` has the member by the
+    role that it plays in its papers. `finished` has the run folders of members that were run before and whose tables
+    are in the store: the collection does not run them, and needs nothing else of them.
+    """
+
+    key = "experiments"
+    model = CollectionFile
+    heading = "Collection files"
+    guide = (
+        "A file with the key `experiments` is a collection. `python -m calstudy run` makes every member in its own run "
+        "folder, and figures and claims of all of them in the folder of the collection; `--scale` and `--set` go to "
+        "every member."
+    )
+
+    roles: Mapping[str, str]
+    finished: Mapping[str, Path] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, file: StudyFile) -> Collection:
+        """Return the collection of a file, whose scale and overrides go to every member."""
+        content = checked(CollectionFile, file.content, file.folder)
+        members = _load_members(content, file)
+        roles = _roles(content, members)
+        for figure in figures_for("collection", content.figures, "figures"):
+            missing = [role for role in figure.roles(roles) if role not in roles]
+            if missing:
+                raise ExperimentError(
+                    [f"figures: asks for {figure.label!r}, which needs a member in the role(s) {', '.join(missing)}"]
+                )
+        return cls(content, members, roles)
+
+    def without(self, finished: Mapping[str, Path]) -> Self:
+        """Return the collection with members that need not be run; see `finished`."""
+        return replace(self, finished={**self.finished, **finished})
+
+    def member(self, label: str) -> ExperimentStudy:
+        """Return the study of a member, which may have realizations."""
+        return _member(self.members[label])
+
+    @property
+    def to_run(self) -> Mapping[str, ExperimentStudy]:
+        """The members that were not run before."""
+        return {name: study for name, study in self.studies.items() if name not in self.finished}
+
+    @property
+    def parts(self) -> Mapping[str, ExperimentStudy]:
+        """The members that are run."""
+        return self.to_run
+
+    @property
+    def external_keys(self) -> frozenset[str]:
+        """Keys of the tables of members that were run before."""
+        return frozenset(task.key for name in self.finished for task in self.studies[name].kept_tables)
+
+    @property
+    def content(self) -> Any:
+        """The run folders of the members, their roles, and the figures."""
+        members = {name: study.folder.name for name, study in self.studies.items()}
+        return {"members": members, "roles": self.roles, "figures": identity(self.file.figures)}
+
+    @property
+    def texts(self) -> Mapping[str, str]:
+        """Nothing: the members have their own files, and the manifest says which."""
+        return {}
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The figures that compare members."""
+        return [self._figure(figure) for figure in figures_for("collection", self.file.figures, "figures")]
+
+    def _figure(self, figure: StudyFigure) -> Task:
+        shown = figure.roles(self.roles)
+        compared = {role: self.studies[self.roles[role]] for role in shown} or dict(self.studies)
+        notes = unique_notes(note for study in compared.values() for note in study.stand_ins)
+        return figure_task(figure, {label: study.graph for label, study in compared.items()}, notes)
+
+    @cached_property
+    def claims(self) -> Task | None:
+        """The statements of the members' papers, each evaluated on the members that play its roles, or None."""
+        graphs = {name: study.graph for name, study in self.studies.items()}
+        papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
+        return combined_claims(self.name, graphs, papers, self.roles, self.stand_ins)
+
+    def _place(self, name: str) -> str:
+        """Return the path of a member's folder, relative to the folder of runs."""
+        if name in self.finished:
+            return os.path.relpath(self.finished[name].resolve(), self.folder.parent)
+        return self.studies[name].folder.name
+
+    @property
+    def recorded(self) -> list[Task]:
+        """The products of the collection itself, and those of members that were run before."""
+        return [*(task for name in self.finished for task in self.studies[name].targets), *self.own]
+
+    @property
+    def entries(self) -> Mapping[str, Any]:
+        """The folders of the members, relative to the folder of runs, their roles, and the figures."""
+        return {
+            "members": {name: self._place(name) for name in self.members},
+            "roles": self.roles,
+            "figures": [figure.model_dump(mode="json") for figure in self.file.figures],
+        }
+
+
+def _member(experiment: Experiment) -> ExperimentStudy:
+    study = study_of(experiment)
+    if not isinstance(study, ExperimentStudy):
+        raise InputError(
+            f"has a {study.key}; run it by itself, or leave the {study.key} out with overrides: {{{study.key}: []}}"
+        )
+    return study
+
+
+def _load_members(content: CollectionFile, file: StudyFile) -> dict[str, Experiment]:
+    members: dict[str, Experiment] = {}
+    faults = []
+    for index, member in enumerate(content.experiments):
+        try:
+            experiment = _load_member(member, file)
+        except ExperimentError as error:
+            faults += [f"experiments.{index} ({member.file}): {sentence}" for sentence in error.faults]
+            continue
+        except InputError as error:
+            raise InputError(f"experiments.{index} ({member.file}): {error}") from None
+        if experiment.name in members:
+            faults.append(f"experiments.{index}: a second {experiment.name!r}; give it a `name` of its own")
+        members[experiment.name] = experiment
+    if faults:
+        raise ExperimentError(faults)
+    first, *others = members.values()
+    for experiment, name in itertools.product(others, ("store", "runs")):
+        if getattr(experiment.outputs, name) != getattr(first.outputs, name):
+            raise ExperimentError(
+                [
+                    f"experiments: {experiment.name} and {first.name} have different outputs.{name}; members "
+                    f"share one (--set outputs.{name}=DIR sets it for all)"
+                ]
+            )
+    return members
+
+
+def _load_member(member: Member, file: StudyFile) -> Experiment:
+    path = file.folder / member.file.expanduser()
+    data = read_mapping(path)
+    if (kind := kind_of(data, path.parent)).model is not Experiment:
+        raise InputError(f"has the key {kind.key or KINDS.tag!r}; members must be experiments")
+    data = apply_scale(data, file.scale)
+    for dotted, value in member.overrides.items():
+        data = override(data, dotted, value)
+    if member.name:
+        data["name"] = member.name
+    changed = StudyFile(path, data, None, file.overrides)
+    experiment = validate(changed.changed(), changed.folder)
+    _member(experiment)
+    return experiment
+
+
+def _roles(file: CollectionFile, members: Mapping[str, Experiment]) -> dict[str, str]:
+    """Return the member for each role; raises ExperimentError if one is missing or cannot play its role."""
+    papers = distinct_papers(paper for experiment in members.values() for paper in experiment.papers)
+    shown = [role for figure in figures_for("collection", file.figures, "figures") for role in figure.titles]
+    known = list(dict.fromkeys([*(role for paper in papers for role in paper.roles), *shown]))
+    for role, name in file.roles.items():
+        if name not in members:
+            raise ExperimentError([f"roles.{role} = {name!r}: not a member (there are: {', '.join(members)})"])
+        if role not in known:
+            listed = ", ".join(known) or "none, for no member names a paper"
+            raise ExperimentError([f"roles.{role}: not a role of the members' papers or of a figure ({listed})"])
+        if (refusal := refusal_of_role(papers, role, members[name])) is not None:
+            raise ExperimentError([f"roles.{role} = {name!r}: {refusal}"])
+    return file.roles | members_by_role(papers, members, file.roles)

@@ -1,0 +1,422 @@
+"""Comparisons: several calibrators in several worlds, with the same scores."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import yaml
+from pydantic import Field, field_validator
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.identity import identity
+from calstudy.base.plugins import guarded
+from calstudy.base.schema import Section, choice, fault
+from calstudy.calibrate.interface import CALIBRATORS
+from calstudy.claims.paper import stand_ins
+from calstudy.experiment.files import StudyFile, apply_scale, checked, dump, override, parse_override, validate
+from calstudy.experiment.model import FIGURES, Experiment, Figures, StudyName
+from calstudy.experiment.yaml_files import read_mapping
+from calstudy.figures import StudyFigure, figures_for
+from calstudy.products import tolerances
+from calstudy.products.comparison import case_name, comparison
+from calstudy.products.graph import Graph, required
+from calstudy.products.score import score
+from calstudy.run.task import Task
+from calstudy.studies.folder import EXPERIMENT
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
+from calstudy.studies.preflight import refusal_of_calibrator
+from calstudy.studies.study import KINDS, Budget, kind_of
+
+LONGEST_LABEL = 40
+NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
+"""Keys of the experiment that the cases do not take from it."""
+OWN = ("name", "description", "calibrators", "worlds", "figures", "salt")
+"""Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
+VARIANTS_NEEDED = (
+    "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
+)
+
+Block = Annotated[dict[str, Any], choice("calibrator")]
+
+
+class ComparisonFile(Section):
+    """Calibrators times worlds, made from one experiment."""
+
+    name: StudyName
+    description: str = ""
+    experiment: Annotated[Path, Field(strict=False)] | dict[str, Any] = Field(
+        description="The experiment that all cases start from: a file, whose relative path starts at this one, or the "
+        "experiment itself."
+    )
+    overrides: dict[str, Any] = Field(
+        default_factory=dict, description="Fields of the experiment to change in all cases (dotted path: value)."
+    )
+    calibrators: dict[str, Block] = Field(
+        min_length=1,
+        description="A block `calibration` for each calibrator by a label, or the calibrator's name alone. It takes "
+        "the place of the experiment's own.",
+    )
+    worlds: dict[str, dict[str, Any]] = Field(
+        {"ideal": {}},
+        min_length=1,
+        description="Changes of the experiment by a label (dotted path: value): of what is true, or of what is assumed "
+        "(`calibration.assumed`). Neither the calibrator nor `power` may differ between worlds.",
+    )
+    figures: Figures = Field(
+        default_factory=lambda: tuple(FIGURES.make(name) for name in ("comparison-matrix", "comparison-spectra")),
+        description="Figures of all cases: comparison-matrix, comparison-spectra, comparison-curves.",
+    )
+    salt: str = Field(
+        "", description="Of a blind challenge (`calstudy export --blind`): digests of its data are made with it."
+    )
+    scales: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="Named sets of changes to this file; the experiment's own come first."
+    )
+
+    @field_validator("calibrators", "worlds")
+    @classmethod
+    def _has_plain_labels(cls, value: dict[str, Any]) -> dict[str, Any]:
+        for label in value:
+            if not 0 < len(label.strip()) <= LONGEST_LABEL or not re.search(r"\w", label):
+                raise fault("", f"the label {label!r} must have 1 to {LONGEST_LABEL} characters, one a letter or digit")
+        return value
+
+    @field_validator("worlds")
+    @classmethod
+    def _change_no_measurement(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        for label, changes in value.items():
+            for path, new in changes.items():
+                block, _, rest = path.partition(".")
+                if path in ("calibration", "calibration.calibrator"):
+                    raise fault("", f"{label!r} changes the calibrator, which each entry of calibrators names")
+                if block == "power":
+                    raise fault("", f"{label!r} changes {path}; all cases are measured alike, use overrides")
+                if not rest and isinstance(new, dict):
+                    fields = ", ".join(f"{path}.{name}" for name in new)
+                    raise fault("", f"{label!r} replaces all of {path}; give the fields that change ({fields})")
+        try:
+            tolerances.faults(list(value))
+        except InputError as error:
+            raise fault("", str(error)) from None
+        return value
+
+
+@dataclass(frozen=True)
+class Case:
+    """One calibrator in one world.
+
+    The refusal is the reason why the calibrator cannot work there; it is empty if it can.
+    """
+
+    calibrator: str
+    world: str
+    experiment: Experiment
+    refusal: str = ""
+
+    @property
+    def title(self) -> str:
+        """Calibrator and world."""
+        return f"{self.calibrator} in {self.world}"
+
+
+class _CaseStudy(ExperimentStudy):
+    """A case: its scores alone, without calibrated visibilities in the store because there are many cases."""
+
+    @cached_property
+    def graph(self) -> Graph:
+        """The products of the case."""
+        return Graph(self.experiment, keep_visibilities=False)
+
+    @property
+    def targets(self) -> list[Task]:
+        """The scores."""
+        return [required(score(self.graph))]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(Family):
+    """Calibrators in worlds, without those that cannot work in a world, for which the table has the reason.
+
+    Members are the experiments of all cases by `case_name`, ordered by world and then by calibrator, as in the file.
+    `refusals` has the reason of those that cannot work. `resolved` is the file with its experiment in it, and with all
+    changes applied.
+    """
+
+    key = "calibrators"
+    model = ComparisonFile
+    heading = "Comparison files"
+    guide = (
+        "A file with the key `calibrators` is a comparison. `python -m calstudy run` calibrates the data of each world "
+        "with each calibrator, and compares the results in tables and figures; `--set` changes the experiment of every "
+        "case."
+    )
+    subfolders = ("cases",)
+
+    refusals: Mapping[str, str]
+    resolved: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, file: StudyFile, calibrators: Mapping[str, Any] | None = None) -> Comparison:
+        """Return the comparison of a file.
+
+        Parameters
+        ----------
+        file
+            Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
+            `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others are
+            applied to the experiment of every case.
+        calibrators
+            In place of those of the file.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be read, or a scale or override cannot be applied.
+        ExperimentError
+            If fields are unknown, missing, or have values that are not allowed.
+        """
+        own = file.scale if file.scale in (file.content.get("scales") or {}) else None
+        data = apply_scale(file.content, own)
+        changes = dict(parse_override(text) for text in file.overrides)
+        for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
+            data = _changed(data, dotted, changes.pop(dotted))
+        if calibrators is not None:
+            data[cls.key] = dict(calibrators)
+        content = checked(ComparisonFile, data, file.folder)
+        figures = figures_for("comparison", content.figures, "figures")
+        base, origin = _base(content, file, optional=own is not None)
+        worlds = {world: {**fields, **changes} for world, fields in content.worlds.items()}
+        salted = {"salt": content.salt} if content.salt else {}
+        blocks = {
+            label: {**block, **(salted if block.get(CALIBRATORS.tag) == "by-file" else {})}
+            for label, block in content.calibrators.items()
+        }
+        resolved = {
+            "name": content.name,
+            "description": content.description,
+            "experiment": _complete(base, origin),
+            "worlds": worlds,
+            "calibrators": dict(content.calibrators),
+            "figures": [figure.model_dump(mode="json") for figure in figures],
+        }
+        members, refusals = _make_cases(blocks, worlds, base, origin)
+        return cls(content, members, refusals, resolved)
+
+    @cached_property
+    def cases(self) -> tuple[Case, ...]:
+        """All cases, in the order of the members."""
+        labels = itertools.product(self.file.worlds, self.file.calibrators)
+        return tuple(
+            Case(calibrator, world, experiment, self.refusals.get(label, ""))
+            for (world, calibrator), (label, experiment) in zip(labels, self.members.items(), strict=True)
+        )
+
+    @cached_property
+    def studies(self) -> Mapping[str, ExperimentStudy]:
+        """The cases that are not refused."""
+        return {label: _CaseStudy(self.members[label]) for label in self.members if label not in self.refusals}
+
+    def title(self, label: str) -> str:
+        """Return the calibrator and the world of a case."""
+        return self.cases[list(self.members).index(label)].title
+
+    @property
+    def content(self) -> Any:
+        """The experiments of the cases, as far as they decide what is made, and the figures."""
+        cases = [(case.world, case.calibrator, identity(_what_is_made(case.experiment))) for case in self.cases]
+        return {"cases": cases, "figures": identity(self.file.figures)}
+
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
+        """Return the comparison cut to the memory; raises InputError if no calibrator can work in any world."""
+        if not self.studies:
+            raise InputError(f"calibrators: all refuse; {self.cases[0].calibrator}: {self.cases[0].refusal}")
+        return super().sized_to(budget)
+
+    @cached_property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Substitutions of all cases for the papers' own ingredients; their worlds give those of single cases."""
+        first, *others = [stand_ins(case.experiment) for case in self.cases]
+        return tuple(note for note in first if all(note in found for found in others))
+
+    @property
+    def _labels(self) -> dict[str, Any]:
+        """Labels of calibrators and worlds, and refusals: world, calibrator and reason."""
+        return {
+            "calibrators": list(self.file.calibrators),
+            "worlds": list(self.file.worlds),
+            "refusals": [[case.world, case.calibrator, case.refusal] for case in self.cases if case.refusal],
+        }
+
+    @cached_property
+    def scores(self) -> dict[str, Task]:
+        """The scores of every case that is not refused."""
+        return {label: study.targets[0] for label, study in self.studies.items()}
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The table of all cases."""
+        return [comparison(self.name, self._labels, self.scores, self.stand_ins)]
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The requested figures."""
+        return [self._figure(figure) for figure in figures_for("comparison", self.file.figures, "figures")]
+
+    def _figure(self, figure: StudyFigure) -> Task:
+        with guarded(figure):
+            first, *others = [figure.settings(study.graph) for study in self.studies.values()] or [{}]
+        common = {key: value for key, value in first.items() if all(other.get(key) == value for other in others)}
+        return self.draw(figure, {**self._labels, **common})
+
+    @property
+    def _files(self) -> dict[str, Case]:
+        return {f"cases/{number:03d}.yaml": case for number, case in enumerate(self.cases)}
+
+    @property
+    def texts(self) -> Mapping[str, str]:
+        """The file with its experiment, and the experiment of every case."""
+        whole = yaml.safe_dump(self.resolved, sort_keys=False, allow_unicode=True, width=100)
+        return {EXPERIMENT: whole, **{name: dump(case.experiment) for name, case in self._files.items()}}
+
+    @property
+    def entries(self) -> Mapping[str, Any]:
+        """The files of the experiments of the cases, and the refusals."""
+        files = {case.title: name for name, case in self._files.items()}
+        return {"cases": files, "refusals": self._labels["refusals"]}
+
+
+def _what_is_made(experiment: Experiment) -> Experiment:
+    """Return an experiment without the settings of products that only its own run makes."""
+    return experiment.model_copy(update={"outputs": experiment.outputs.reset("store", "runs", "figures")}).reset(
+        "scales", "name", "description", "papers"
+    )
+
+
+def load_worlds(
+    path: Path, scale: str | None, overrides: Sequence[str], calibrators: Mapping[str, Any] | None
+) -> Comparison:
+    """Return calibrators in the worlds of a comparison, or in the one of an experiment.
+
+    Parameters
+    ----------
+    calibrators
+        Blocks `calibration` by label, in place of those of the file, with the assumptions of the experiment. None
+        for the file's own; that of an experiment has its own name as label.
+
+    Raises
+    ------
+    InputError
+        If the file is neither, or cannot be used.
+    """
+    file = StudyFile.open(path, scale, overrides)
+    kind = kind_of(file.content, file.folder)
+    if kind is Comparison:
+        return Comparison.load(file, calibrators)
+    if kind.model is Experiment:
+        experiment = file.experiment()
+        kind = type(study_of(experiment))
+    if kind is not ExperimentStudy:
+        raise InputError(
+            f"{file.path}: has the key {kind.key or KINDS.tag!r}; a single experiment or a comparison is needed"
+        )
+    plain = experiment.model_dump(mode="json")
+    own = plain["calibration"]
+    blocks = {own["calibrator"]: own} if calibrators is None else calibrators
+    content = {
+        "name": experiment.name,
+        "description": experiment.description,
+        "experiment": plain,
+        "calibrators": {label: {"assumed": own["assumed"], **_block(block)} for label, block in blocks.items()},
+        "worlds": {experiment.name[:LONGEST_LABEL]: {}},
+    }
+    return Comparison.load(StudyFile(file.path, content))
+
+
+def _block(block: Any) -> dict[str, Any]:
+    return {"calibrator": block} if isinstance(block, str) else dict(block)
+
+
+def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """Return a comparison's content with one of its own keys, an entry by its label, or a field of it changed.
+
+    Labels may contain dots. Fields of a world are dotted paths themselves.
+    """
+    key, _, rest = path.partition(".")
+    if not rest:
+        return {**data, key: value}
+    entries = data.get(key)
+    if key not in ("calibrators", "worlds") or not isinstance(entries, Mapping):
+        raise InputError(f"--set {path}: set {key} as a whole")
+    label = max((known for known in entries if f"{rest}.".startswith(f"{known}.")), key=len, default=rest)
+    field, entry = rest[len(label) + 1 :], entries.get(label)
+    if field and isinstance(entry, str):
+        entry = {CALIBRATORS.tag: entry}
+    if field:
+        value = {**(entry or {}), field: value} if key == "worlds" else override(entry or {}, field, value)
+    return {**data, key: {**entries, label: value}}
+
+
+def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return an experiment with its defaults and absolute paths, so that it does not depend on its folder."""
+    content = validate(base, folder).model_dump(mode="json")
+    return {key: value for key, value in content.items() if key not in NOT_SHARED}
+
+
+def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> tuple[dict[str, Any], Path]:
+    """Return the experiment from which all cases are made, and the folder of its relative paths.
+
+    If `optional`, the experiment may lack the scale, because the comparison has it.
+    """
+    scale, folder = file.scale, file.folder
+    if isinstance(content.experiment, dict):
+        base: dict[str, Any] = content.experiment
+    else:
+        source = folder / content.experiment.expanduser()
+        base, folder = read_mapping(source), source.resolve().parent
+    if (kind := kind_of(base, folder)).model is not Experiment:
+        raise ExperimentError([f"experiment: has the key {kind.key or KINDS.tag!r}, and is no single experiment"])
+    has_it = scale in (base.get("scales") or {})
+    base = apply_scale(base, scale if has_it or not optional else None)
+    base = {key: value for key, value in base.items() if key not in NOT_SHARED}
+    for dotted, value in content.overrides.items():
+        base = override(base, dotted, value)
+    return base, folder
+
+
+def _make_cases(
+    calibrators: Mapping[str, Block], worlds: Mapping[str, Mapping[str, Any]], base: Mapping[str, Any], folder: Path
+) -> tuple[dict[str, Experiment], dict[str, str]]:
+    """Return the experiments of all cases, and the refusals; raises ExperimentError with every fault once."""
+    members, refusals = {}, {}
+    faults: dict[str, list[str]] = {}
+    for (row, world), (column, calibrator) in itertools.product(enumerate(worlds), enumerate(calibrators)):
+        data = {**base, "calibration": {**base.get("calibration", {}), **calibrators[calibrator]}}
+        for dotted, value in worlds[world].items():
+            data = override(data, dotted, value)
+        try:
+            experiment = validate(data, folder)
+            found = [] if experiment.measures_signal_loss else [VARIANTS_NEEDED]
+        except ExperimentError as error:
+            found = error.faults
+        for sentence in found:
+            faults.setdefault(sentence, []).append(f"{calibrator} in {world}")
+        if not found:
+            label = case_name(row, column)
+            members[label] = experiment
+            if refusal := refusal_of_calibrator(experiment):
+                refusals[label] = refusal
+    if faults:
+        raise ExperimentError([f"{sentence} (in {_listed(found)})" for sentence, found in faults.items()])
+    return members, refusals
+
+
+def _listed(cases: Sequence[str]) -> str:
+    """Name the first of some cases, and count the others."""
+    others = len(cases) - 1
+    return f"{cases[0]!r}" + (f" and {others} other case{'s' if others > 1 else ''}" if others else "")

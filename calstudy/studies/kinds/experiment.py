@@ -1,0 +1,237 @@
+"""An experiment as a study, and families of experiments: figures, tables and claims."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+from calstudy.base.errors import InputError
+from calstudy.base.identity import identity
+from calstudy.claims.paper import stand_ins, unique_notes
+from calstudy.claims.product import claims
+from calstudy.experiment.files import StudyFile
+from calstudy.experiment.model import Experiment, Folders
+from calstudy.figures import StudyFigure, figure_task, figures_for
+from calstudy.instrument.as_built import COLUMNS, as_built_rows
+from calstudy.instrument.layouts import make_layout
+from calstudy.products import sky_model
+from calstudy.products.agreement import agreement
+from calstudy.products.graph import Graph
+from calstudy.products.score import score
+from calstudy.products.signal_loss import transfer
+from calstudy.products.spectra import spectra
+from calstudy.run.provenance import seeds
+from calstudy.run.task import Task
+from calstudy.studies.capacity import fit, require_data_fit
+from calstudy.studies.preflight import notes_of, require_possible
+from calstudy.studies.study import Budget, Study, built_in_kinds
+
+SKY_MODEL_TABLE = "sky-model.csv"
+AS_BUILT_TABLE = "as-built.csv"
+
+
+class ExperimentStudy(Study):
+    """One validated experiment; `folder` is its run folder if another study decides it."""
+
+    model = Experiment
+
+    def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
+        self.file = self.experiment = experiment
+        if folder is not None:
+            self.folder = folder
+
+    @classmethod
+    def load(cls, file: StudyFile) -> Study:
+        """Return the study of an experiment, which is of another kind if it has a sweep or realizations."""
+        return study_of(file.experiment())
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Study:
+        """Return the study of an experiment; raises ExperimentError if there is none of this kind."""
+        return cls(experiment)
+
+    @cached_property
+    def graph(self) -> Graph:
+        """The products of the experiment."""
+        return Graph(self.experiment)
+
+    @property
+    def content(self) -> Any:
+        """The experiment without scales and the folders of outputs."""
+        return content_of(self.experiment)
+
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study with simulations and solves cut to the memory, and the number of workers."""
+        require_data_fit(self.experiment, budget)
+        require_possible(self.experiment)
+        experiment, count = fit(self.experiment, budget, self._targets_of)
+        return self if experiment is self.experiment else type(self)(experiment, self.folder), count
+
+    def _targets_of(self, experiment: Experiment) -> list[Task]:
+        """Return the products of an experiment, without computing those of the study's own again."""
+        return self.targets if experiment is self.experiment else type(self)(experiment).targets
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of a plan on settings that are allowed, but probably a mistake."""
+        return notes_of(self.experiment)
+
+    @cached_property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Substitutions for the papers' own ingredients."""
+        return stand_ins(self.experiment)
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The requested figures."""
+        figures = figures_for("experiment", self.experiment.outputs.figures, "outputs.figures")
+        return [figure_task(figure, {"": self.graph}, self.stand_ins) for figure in figures]
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The products whose files are the tables of a run."""
+        graph = self.graph
+        error = sky_model.error(graph) if self.calibrates else None
+        found = (spectra(graph), agreement(graph), transfer(graph), score(graph), error)
+        return [task for task in found if task is not None]
+
+    @property
+    def kept_tables(self) -> list[Task]:
+        """All tables: a collection needs no more of a member."""
+        return self.tables
+
+    @cached_property
+    def calibrates(self) -> bool:
+        """True if any variant is calibrated."""
+        return any(variant.calibrate for variant in self.experiment.variants.values())
+
+    @cached_property
+    def claims(self) -> Task | None:
+        """The statements of the papers that the experiment names, or None."""
+        return claims(self.graph, self.stand_ins)
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The resolved experiment, the assumptions of the calibrator, and deviations of antennas."""
+        found = dict(super().texts)
+        if self.calibrates:
+            found[f"tables/{SKY_MODEL_TABLE}"] = self._sky_model_table()
+        if self.experiment.instrument.as_built.note:
+            found[f"tables/{AS_BUILT_TABLE}"] = self._as_built_table()
+        return found
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The sky model of the calibrator, and all seeds."""
+        described = {"sky_model": sky_model.described(self.graph)} if self.calibrates else {}
+        return {**described, "seeds": seeds(self.experiment.model_dump(mode="json"))}
+
+    def _as_built_table(self) -> str:
+        """Return as CSV the deviations of each antenna from the nominal instrument."""
+        instrument = self.experiment.instrument
+        numbers = make_layout(instrument.layout).numbers
+        table = io.StringIO()
+        rows = csv.writer(table, lineterminator="\n")
+        rows.writerow(("number", *COLUMNS))
+        found = as_built_rows(instrument.as_built, len(numbers))
+        rows.writerows((number, *row) for number, row in zip(numbers, found, strict=True))
+        return table.getvalue()
+
+    def _sky_model_table(self) -> str:
+        """Return as CSV the false assumptions of the calibrator, after a line that describes its sky model."""
+        table = io.StringIO()
+        table.write(f"# sky model: {sky_model.described(self.graph)}\n")
+        rows = csv.writer(table, lineterminator="\n")
+        rows.writerows([("field", "true", "assumed"), *sky_model.differences(self.graph)])
+        return table.getvalue()
+
+
+@dataclass(frozen=True, eq=False)
+class Family(Study):
+    """Several experiments, and the figures, tables and claims of all of them.
+
+    Products that several members need have one key, and are made once. If members have their own run folders, they are
+    the `parts` of a family.
+
+    Attributes
+    ----------
+    file
+        Content of the file.
+    members
+        The experiments by label, all with the same store and folder of runs.
+    """
+
+    file: Any
+    members: Mapping[str, Experiment]
+
+    def member(self, label: str) -> ExperimentStudy:
+        """Return the study of a member."""
+        return ExperimentStudy(self.members[label])
+
+    def title(self, label: str) -> str:
+        """Return the name of a member in messages."""
+        return label
+
+    @cached_property
+    def studies(self) -> Mapping[str, ExperimentStudy]:
+        """The studies of the members; a subclass may leave members out."""
+        return {label: self.member(label) for label in self.members}
+
+    @property
+    def to_run(self) -> Mapping[str, ExperimentStudy]:
+        """The members of which a run makes something."""
+        return self.studies
+
+    @property
+    def outputs(self) -> Folders:
+        """Store and folder of runs."""
+        return next(iter(self.members.values())).outputs
+
+    @property
+    def content(self) -> Any:
+        """The file without scales and outputs, and the names of the run folders of the members."""
+        names = [name for name in type(self.file).model_fields if name not in ("scales", "outputs")]
+        return {
+            "file": {name: identity(getattr(self.file, name)) for name in names},
+            "members": {name: study.folder.name for name, study in self.studies.items()},
+        }
+
+    @cached_property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Substitutions of any member for the papers' own ingredients."""
+        return unique_notes(note for study in self.studies.values() for note in study.stand_ins)
+
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
+        """Return the family with every member cut to the memory, and the smallest number of workers of all."""
+        members, counts = dict(self.members), []
+        for label, study in self.to_run.items():
+            try:
+                sized, count = study.sized_to(budget)
+            except InputError as error:
+                raise InputError(f"{self.title(label)}: {error}") from None
+            members[label] = sized.experiment
+            counts.append(count)
+        return replace(self, members=members), min(counts, default=1)
+
+    def draw(self, figure: StudyFigure, settings: Mapping[str, Any] | None = None) -> Task:
+        """Return the task of a figure of all members; parameters as for `calstudy.figures.figure_task`."""
+        return figure_task(
+            figure, {label: study.graph for label, study in self.studies.items()}, self.stand_ins, settings
+        )
+
+
+def content_of(experiment: Experiment) -> Any:
+    """Return the content that decides the run folder of an experiment."""
+    outputs = experiment.outputs.reset("store", "runs")
+    return identity(experiment.model_copy(update={"outputs": outputs}).reset("scales"))
+
+
+def study_of(experiment: Experiment) -> Study:
+    """Return the study of an experiment: of the kind whose key it has, such as `sweep`."""
+    special: list[Any] = [kind for kind in built_in_kinds() if kind.model is Experiment and kind.key]
+    return next((kind for kind in special if getattr(experiment, kind.key)), ExperimentStudy).of(experiment)

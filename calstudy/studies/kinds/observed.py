@@ -1,0 +1,129 @@
+"""Measured data as a study: calibration, power spectra of data and residual, and signal loss of an injected EoR."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, Self
+
+from pydantic import Field
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.identity import identity
+from calstudy.base.plugins import guarded
+from calstudy.experiment.files import StudyFile
+from calstudy.experiment.model import FIGURES
+from calstudy.figures import figure_task, figures_for
+from calstudy.instrument.interface import model_of
+from calstudy.power.settings import PowerSettings
+from calstudy.products.observed import ObservedGraph
+from calstudy.products.observed_injection import injection_tables
+from calstudy.products.observed_quality import quality
+from calstudy.products.observed_spectra import observed_spectra
+from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
+from calstudy.realdata.settings import InjectionSettings, ObservedSettings
+from calstudy.run.task import Task
+from calstudy.studies.calibration import DataFile, DataStudy, read_file, read_selected
+from calstudy.studies.study import Budget
+
+DEFAULT_FIGURES = ("diagnostics", "observed-wedge", "observed-spherical")
+INJECTION_FIGURES = ("observed-signal-loss",)
+
+
+class ObservedFile(DataFile):
+    """Measured data: their selection, calibration and power spectra, and an injected signal."""
+
+    observed: ObservedSettings
+    power: PowerSettings = PowerSettings()
+    injection: InjectionSettings | None = Field(None, description="Measure what the calibration loses; null: do not.")
+    scales: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
+    )
+
+
+class ObservedStudy(DataStudy):
+    """A study of measured data, from its file and the metadata of the two halves."""
+
+    key = "observed"
+    model = ObservedFile
+    heading = "Files about measured data"
+    guide = (
+        "A file with the key `observed` is about measured data ([measured-data.md](measured-data.md)): these are "
+        "calibrated, have power spectra, and are calibrated again with an injected EoR."
+    )
+
+    def __init__(self, file: ObservedFile, data: Parts) -> None:
+        super().__init__(file, data)
+        self.graph = ObservedGraph(file.observed, file.calibration, file.power, file.injection, data)
+
+    @classmethod
+    def load(cls, file: StudyFile) -> ObservedStudy:
+        """Return the study of a file, with the metadata of its data."""
+        content = read_file(ObservedFile, file)
+        for figure in figures_for("observed", content.outputs.figures or (), "outputs.figures"):
+            if content.injection is None and figure.needs_injection:
+                raise ExperimentError([f"outputs.figures: {figure.label!r} needs the section injection"])
+        return cls(content, _halves(content))
+
+    @property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Assumptions about the units of the power spectra."""
+        scale = self.file.observed.flux_scale
+        if scale is None or scale.kind == "factor":
+            return ()
+        return ("flux scale: autocorrelations at an assumed system temperature",)
+
+    @property
+    def content(self) -> Any:
+        """The content of the file without scales and the folders of outputs."""
+        outputs = self.file.outputs.reset("store", "runs")
+        return identity(self.file.model_copy(update={"outputs": outputs}).reset("scales"))
+
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study fitted to a budget, and the number of workers; also refuse a beam that cannot be made."""
+        beam = self.file.observed.beam
+        with guarded(beam):
+            model_of(beam).require_usable(self.data.facts["even"].channels)
+        return super().sized_to(budget)
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The requested figures."""
+        asked = self.file.outputs.figures
+        if asked is None:
+            names = DEFAULT_FIGURES + (INJECTION_FIGURES if self.file.injection else ())
+            asked = tuple(FIGURES.make(name) for name in names)
+        settings = {"wedge_buffer": self.graph.power.wedge_buffer}
+        shown = figures_for("observed", asked, "outputs.figures")
+        return [figure_task(figure, {"": self.graph}, self.stand_ins, settings) for figure in shown]
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The products whose files are the tables of a run."""
+        return [observed_spectra(self.graph), quality(self.graph), *injection_tables(self.graph)]
+
+
+def _halves(file: ObservedFile) -> Parts:
+    """Return the halves of the data from their metadata; raises InputError if they cannot be calibrated or crossed."""
+    section = file.observed
+    even = read_selected(file, section.data)
+    odd = read_selected(file, section.odd) if section.odd else even
+    if section.odd:
+        require_same_sky(even, odd)
+    elif even.times.size < 2:
+        raise InputError(
+            f"observed.data: {even.times.size} integration; two are needed, for even and odd, or other data of the "
+            "same sky as observed.odd"
+        )
+    if even.unit.lower() != "jy" and section.flux_scale is None and section.sky_model is None:
+        raise InputError(
+            f"observed.flux_scale: the data are in {even.unit!r}, and power spectra need Jy: give {{kind: factor, "
+            "unit: 1 Jy}, or system-temperature, or a sky model"
+        )
+    together = file.calibration.integrations_per_solve
+    halves = Parts({"even": even, "odd": odd})
+    shortest = min(len(halves.times(parity)) for parity in PARITIES)
+    if together > shortest:
+        raise InputError(
+            f"calibration.integrations_per_solve = {together}: a half of the data has {shortest} integrations"
+        )
+    return halves

@@ -1,0 +1,65 @@
+"""Realizations: one experiment with several draws of the EoR, the gains or the noise, pooled."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from calstudy.experiment.files import dump
+from calstudy.experiment.model import FIGURES, Experiment
+from calstudy.experiment.realizations import expand_realizations
+from calstudy.figures import figure_task
+from calstudy.products.pooled_realizations import pooled
+from calstudy.products.realizations import realization_graphs
+from calstudy.run.provenance import seeds
+from calstudy.run.task import Task
+from calstudy.studies.folder import EXPERIMENT
+from calstudy.studies.kinds.experiment import ExperimentStudy
+
+
+class Realizations(ExperimentStudy):
+    """An experiment whose EoR, gains or noise are drawn several times.
+
+    Products that several realizations need have one key, and are made once. The first realization is the experiment
+    itself, and shares its products with the experiment's own run.
+
+    Raises
+    ------
+    ExperimentError
+        With one sentence per fault of the realizations.
+    """
+
+    key = "realizations"
+
+    def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
+        expand_realizations(experiment)
+        super().__init__(experiment, folder)
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The figure of all realizations."""
+        return [figure_task(FIGURES.make("realizations"), {"": self.graph}, self.stand_ins)]
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The tables and verdicts of all realizations."""
+        return [pooled(self.graph)]
+
+    @property
+    def kept_tables(self) -> list[Task]:
+        """None: the members of a collection that have realizations are always run."""
+        return []
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The experiment."""
+        return {EXPERIMENT: dump(self.file)}
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The seeds of every realization."""
+        drawn = (item.realization for item in realization_graphs(self.graph))
+        return {
+            self.key: [{"label": item.label, **seeds(item.experiment.model_dump(mode="json"))} for item in drawn],
+        }

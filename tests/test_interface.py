@@ -1,0 +1,117 @@
+"""The Python interface returns what the files of a run hold, with labels and units."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from matplotlib.figure import Figure
+from tiny import tiny
+
+import calstudy
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
+from calstudy.power.tables import load_spectrum
+from calstudy.report.headline import read_signal
+from calstudy.results.folder import RunFolder
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("interface")
+    path = folder / "tiny.yaml"
+    path.write_text(yaml.safe_dump(tiny(folder)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(file):
+    return calstudy.load(file, **{"outputs.figures": ["wedge", "signal-loss"]}).run(workers=1, quiet=True)
+
+
+def test_the_import_is_light():
+    code = "import sys, calstudy; print(sorted({'numpy', 'pydantic', 'astropy', 'matplotlib'} & set(sys.modules)))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_changes_are_fields_and_faults_are_reported_together(file):
+    study = calstudy.load(file, **{"instrument.times.count": 3, "power.wedge_buffer": "250 ns"})
+    assert study.experiment.instrument.times.count == 3
+    assert study.experiment.power.wedge_buffer == pytest.approx(250e-9)
+    with pytest.raises(ExperimentError) as raised:
+        calstudy.load(file, **{"instrument.times.count": -1, "calibration.bsis": 1})
+    assert len(raised.value.faults) == 2
+
+
+def test_a_dictionary_is_the_content_of_a_file(file):
+    study = calstudy.load(yaml.safe_load(file.read_text()))
+    assert study.folder == calstudy.load(file).folder
+
+
+def test_a_plan_is_a_table_and_a_mapping(file):
+    plan = calstudy.load(file).plan(workers=1)
+    assert "plan for 1 worker(s)" in repr(plan)
+    assert plan.stages.loc["calibrate", "products"] == 4
+
+
+def test_spectra_are_those_of_the_tables(run):
+    found = run.spectra["residual"]
+    stored = load_spectrum(run.folder / "tables" / "residual.outside-wedge.h5", SphericalSpectrum)
+    np.testing.assert_array_equal(found.power, stored.power)
+    np.testing.assert_allclose(found.k, (found.k_from + found.k_to) / 2)
+    assert found.power.attrs["units"] == "mK2 h-3 Mpc3"
+    assert found.k.attrs["units"] == "h/Mpc"
+    assert found.attrs["wedge_excluded"]
+    with pytest.raises(KeyError, match="residual"):
+        run.spectra["residuel"]
+
+
+def test_cylindrical_spectra_have_lengths_and_delays(run):
+    found = run.cylindrical["eor"]
+    stored = load_spectrum(run.folder / "tables" / "eor.wedge.h5", CylindricalSpectrum)
+    assert found.power.dims == ("baseline_length", "delay")
+    np.testing.assert_array_equal(found.power, stored.power)
+    # The horizon is at |b| / c, and k_perp is proportional to |b|.
+    np.testing.assert_allclose(found.horizon_delay, found.baseline_length / 299_792_458.0)
+    assert float((found.k_perp / found.baseline_length).std()) < 1e-12
+
+
+def test_the_scores_are_the_headline_of_the_report(run):
+    signal = read_signal(RunFolder(run.folder))
+    band = run.scores.loc[(0.2, 0.5)]
+    assert band.transfer == pytest.approx(signal.transfer)
+    assert band.bias == pytest.approx(signal.bias)
+    # T s^2 of the transfer function in fine bins, which the band pools, surrounds it.
+    fine = run.transfer.sel(region="outside-wedge")
+    inside = fine.scale_free_transfer[(fine.k > 0.2) & (fine.k < 0.5)]
+    assert float(inside.min()) <= band.transfer <= float(inside.max())
+
+
+def test_gains_and_visibilities_are_those_of_pyuvdata(run):
+    true, fitted = run.gains("true"), run.gains("residual")
+    assert fitted.Nants_data == true.Nants_data == 7
+    # Per-channel gains of 10 %, which the fit finds up to an amplitude of each channel that free foregrounds absorb.
+    ratio = np.abs(fitted.gain_array[..., 0] / true.gain_array[..., :1, 0])
+    assert np.std(ratio / ratio.mean(axis=0)) < 0.1 * np.std(np.abs(true.gain_array))
+    data, residual = run.visibilities("uncalibrated"), run.visibilities("residual")
+    assert np.abs(residual.data_array).std() < 0.1 * np.abs(data.data_array).std()
+    with pytest.raises(InputError, match="'eor' is not calibrated"):
+        run.gains("eor")
+
+
+def test_figures_are_drawn_again(run):
+    assert run.figures == ["signal-loss", "wedge"]
+    assert isinstance(run.plot("wedge"), Figure)
+    with pytest.raises(InputError, match="wedge"):
+        run.plot("wedges")
+
+
+def test_what_a_run_lacks_has_a_reason(run, tmp_path):
+    assert run.claims.empty
+    assert run.parts == {}
+    with pytest.raises(InputError, match="no table 'comparison'"):
+        run.table("comparison")
+    with pytest.raises(InputError, match="not the folder of a finished run"):
+        calstudy.open_run(tmp_path)
+    assert "T " in repr(run)
