@@ -20,11 +20,9 @@ import typer
 from rich.console import Console
 
 from calstudy import __version__
-from calstudy.base import ranks
 from calstudy.base.errors import DiskError, ExperimentError, InputError, Terminated, exit_status, refusal_of_disk
 from calstudy.base.mwa_files import MWA_FILES
 from calstudy.cli.calibrate import calibrate
-from calstudy.cli.check import check_app
 from calstudy.cli.compare_gains import compare_gains
 from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
@@ -55,7 +53,6 @@ app.command()(init)
 app.command()(schema)
 app.command()(runs)
 app.command()(store)
-app.add_typer(check_app, name="check")
 
 EXIT_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -262,13 +259,9 @@ def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
     if not faulthandler.is_enabled():
         # The terminal shows the place of a library's crash: a run writes standard error itself to a file.
         faulthandler.enable(os.dup(2), all_threads=False)
-    if ranks.is_helper():
-        ranks.serve()
-        return
     termination = _Termination()
     try:
-        with ranks.leading():
-            app()
+        app()
     except InputError as error:
         for sentence in error.faults if isinstance(error, ExperimentError) else [str(error)]:
             typer.echo(f"calstudy: {sentence}", err=True)

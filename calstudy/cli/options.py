@@ -34,7 +34,7 @@ SECTIONS = {
     "Results": ("claims", "compare-gains", "runs", "store"),
     "Other programs": ("export", "score", "leaderboard"),
     "Reference": ("examples", "fields", "schema", "data"),
-    "Checks": ("validate", "check", "regress"),
+    "Checks": ("validate", "regress"),
 }
 """Commands by section of the help."""
 

@@ -69,6 +69,10 @@ class StudyFigure(Plugin):
         True if the experiment must calibrate data with the EoR and without.
     needs_least_squares
         True if the calibrator must fit by least squares: it is repeated, or its tangent space is needed.
+    needs_foregrounds
+        True if the sky must have foregrounds.
+    sections
+        Sections of the experiment that it reads; see `settings`.
     needs_injection
         True if a signal must be injected into measured data.
     shows_sky
@@ -86,6 +90,8 @@ class StudyFigure(Plugin):
     needs_calibration: ClassVar[bool] = False
     needs_signal_loss: ClassVar[bool] = False
     needs_least_squares: ClassVar[bool] = False
+    needs_foregrounds: ClassVar[bool] = False
+    sections: ClassVar[tuple[str, ...]] = ()
     needs_injection: ClassVar[bool] = False
     shows_sky: ClassVar[bool] = True
     tolerances: ClassVar[Rules] = ()
@@ -99,6 +105,8 @@ class StudyFigure(Plugin):
         missing = [name for name in self.variants if name not in experiment.variants]
         if missing:
             return f"needs the variant(s) {', '.join(missing)}"
+        if self.needs_foregrounds and not experiment.sky.has_foregrounds:
+            return "needs foregrounds, and sky.foregrounds is 'none'"
         residual = experiment.variants.get("residual")
         complete = residual and residual.effects and residual.calibrate and "foregrounds" in residual.components
         if self.needs_calibration and not complete:
@@ -134,9 +142,8 @@ class StudyFigure(Plugin):
         return {"spectra": spectra(graph)}
 
     def settings(self, graph: Any) -> Mapping[str, Any]:
-        """Return what else the figure needs of a run, or of one member: sections and JSON-able values."""
-        del graph
-        return {}
+        """Return what else the figure needs of a run, or of one member: by default its `sections`."""
+        return {name: getattr(graph.experiment, name) for name in self.sections}
 
     @abstractmethod
     def draw(self, job: Job) -> Drawing:

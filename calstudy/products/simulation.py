@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pyuvdata import UVData
 
     from calstudy.instrument.settings import InstrumentSettings
-    from calstudy.simulate.component import Component
+    from calstudy.simulate.chunks import Component
     from calstudy.simulate.floor import DelayFloor
     from calstudy.simulate.nodes import Accuracy
     from calstudy.simulate.settings import SimulationSettings
@@ -99,7 +99,7 @@ def _simulation(graph: Graph, component: str, settings: Mapping[str, Any]) -> Ta
 
 
 def _component(job: Job) -> Component:
-    from calstudy.simulate.component import Component
+    from calstudy.simulate.chunks import Component
 
     settings = job.settings
     return Component(

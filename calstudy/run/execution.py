@@ -13,7 +13,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calstudy.base import ranks
 from calstudy.base.errors import InputError
 from calstudy.base.identity import digest_json
 from calstudy.base.resources import cores
@@ -266,8 +265,6 @@ def execute(
     products: dict[str, Product] = {}
     if not tasks:
         return products
-    if ranks.count() > 1:
-        return _execute_here(tasks, store, done, again)
     from distributed import CancelledError, KilledWorker, as_completed
 
     with _client(workers) as client:
@@ -299,17 +296,6 @@ def execute(
             futures |= started
             completed.update(started)
             done(task, product)
-    return products
-
-
-def _execute_here(
-    tasks: Sequence[Task], store: Store, done: Callable[[Task, Product], None], again: Container[str]
-) -> dict[str, Product]:
-    """Make products in sequence in the main thread, where MPI may be used."""
-    products = {}
-    for task in tasks:
-        products[task.key] = perform(WorkOrder.of(task, store, task.key in again))
-        done(task, products[task.key])
     return products
 
 

@@ -63,17 +63,11 @@ class Engine(Plugin, ABC):
     """A simulator: computes visibilities from a sky and beams. Fields of a subclass are its settings.
 
     Its module is imported when an experiment file is read: import slow libraries inside the methods.
-
-    Attributes
-    ----------
-    shares_ranks
-        Whether it divides its work between MPI ranks (`calstudy.base.ranks`).
     """
 
     registry: ClassVar[Registry[Engine]] = Registry(
         "engine", "calstudy.simulate.engines", "calstudy.simulate.interface:Engine"
     )
-    shares_ranks: ClassVar[bool] = False
 
     kind: str = Field("", description="Name of an engine, or a file.py.")
 

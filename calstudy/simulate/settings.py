@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny
 
-from calstudy.base.schema import UNKEYED, Section, fault
+from calstudy.base.schema import UNKEYED, Section
 from calstudy.base.units import Length
 from calstudy.simulate.interface import Engine
 from calstudy.simulate.nodes import EXACT, Accuracy
@@ -70,13 +69,3 @@ class SimulationSettings(Section):
     def pieces(self, eor: bool) -> int:
         """Return the maximum number of chunks of the EoR, or of the foregrounds, which take a quarter of its time."""
         return self.chunks if eor else max(1, self.chunks // 4)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _precision_is_the_engines(cls, data: Any) -> Any:
-        if isinstance(data, Mapping) and "precision" in data:
-            named = data.get("engine", "auto")
-            kind = named if isinstance(named, str) else "auto"
-            sentence = f"is now a setting of the engine: engine: {{kind: {kind}, precision: {data['precision']}}}"
-            raise fault("precision", sentence)
-        return data

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, Protocol, Self, TypeVar
 
-from calstudy.base import ranks
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
@@ -56,17 +55,15 @@ def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -
     Raises
     ------
     InputError
-        If a single task is estimated to need more memory than there is, `max_memory` is not an amount of memory, or
-        MPI ranks cannot help; before any work starts.
+        If a single task is estimated to need more memory than there is, or `max_memory` is not an amount of memory;
+        before any work starts.
     """
     workers, scheduler = budget.workers, budget.scheduler
     _require_sane(budget)
-    if ranks.count() > 1:
-        _require_sharing(file, workers, scheduler)
     if scheduler is not None:
         return file, workers or 1
     memory = _memory(budget)
-    hoped = (workers or cores()) if ranks.count() == 1 else ranks.count()
+    hoped = workers or cores()
     lean = _stream(_cut(_Work(file, targets), memory / hoped), memory / hoped)
     return lean.file, _workers(lean.missing, memory, hoped, budget)
 
@@ -101,8 +98,6 @@ def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget)
         return budget.workers or hoped
     largest = max(needs, key=needs.__getitem__)
     _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
-    if ranks.count() > 1:
-        return 1
     if budget.workers is not None and budget.max_memory is None:
         return budget.workers
     return min(hoped, max(1, int(memory // needs[largest])))
@@ -124,22 +119,6 @@ def _require_room(largest: Task, need: float, budget: float, source: str) -> Non
         raise InputError(
             f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
             f"needs about {need / 1e9:.1f} GB; {more}use fewer antennas, channels, integrations or sources"
-        )
-
-
-def _require_sharing(file: Contents, workers: int | None, scheduler: str | None) -> None:
-    if not isinstance(file, Experiment):
-        raise InputError("mpiexec: measured data are not shared between MPI ranks; use --workers")
-    engine = file.simulation.engine
-    if not engine.shares_ranks:
-        raise InputError(
-            f"simulation.engine = {engine.label!r} does not share its work between MPI ranks; leave out "
-            "mpiexec and use --workers, or add --set simulation.engine=pyuvsim"
-        )
-    if scheduler is not None or workers not in (None, 1):
-        raise InputError(
-            "--workers and --scheduler: under mpiexec the ranks are the workers; leave both out and choose the number "
-            "of ranks with -n"
         )
 
 

@@ -1,116 +1,208 @@
-"""Run the validation ladder: make the products of its steps, measure, judge, and save all results with manifests."""
+"""The validation ladder as a study: its steps at one scale, their experiments, and the verdicts on their limits."""
 
 from __future__ import annotations
 
-import logging
-import shutil
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 from rich.console import Console
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.package_files import published
 from calstudy.claims.paper import stand_ins, unique_notes
+from calstudy.experiment.files import StudyFile, checked, override, validate
+from calstudy.experiment.model import Experiment, Outputs
 from calstudy.products.files import read_json
-from calstudy.run.execution import Workers
-from calstudy.run.store import Store
-from calstudy.run.task import Task, unique
-from calstudy.studies.folder import LOG, log_to, product_entries, publish, write_manifest
-from calstudy.studies.study import RunProducts, make
-from calstudy.validation.outcomes import Outcome, failed, judge, write_tables
-from calstudy.validation.product import FINDINGS, measurement_task
-from calstudy.validation.steps import Step
+from calstudy.run.task import Task
+from calstudy.studies.capacity import fit
+from calstudy.studies.folder import publish, write
+from calstudy.studies.study import Budget, RunProducts, Study, run_study
+from calstudy.validation.step import FINDINGS, MINREDUNDANT, STEPS, Case, Step, inputs_of, step_task
+from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, to_json, to_markdown
 
-logger = logging.getLogger(__name__)
-FAILED = "failed"
+SCALES = ("full", "small")
+NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
+Steps = tuple[tuple[Step, Mapping[str, Experiment]], ...]
 
 
-@dataclass(frozen=True)
-class LadderRun:
-    """A finished run of the ladder: its outcomes, and the folder that holds them."""
+class LadderFile(NamedTuple):
+    """Name and scale of a ladder, and the outputs that its experiments share."""
 
-    folder: Path
-    outcomes: tuple[Outcome, ...]
+    description: str
+    outputs: Outputs
+    name: str = "validation"
+
+
+@dataclass(frozen=True, eq=False)
+class Ladder(Study):
+    """Steps of the validation ladder, each with its experiments by name.
+
+    `failures` are the steps that could not be measured, by number, with the reason.
+    """
+
+    file: LadderFile
+    steps: Steps
+    failures: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, file: StudyFile) -> Self:
+        """Return the steps with the numbers, or in the Python files, of the key `steps`, or all built-in ones.
+
+        Scale and overrides are those of all experiments. Raises InputError if there is no such step, and
+        ExperimentError if fields of a step or an experiment are not allowed.
+        """
+        names, scale = file.content.get("steps", ()), file.scale or "full"
+        if scale not in SCALES:
+            raise InputError(f"--scale {scale}: not a scale of the ladder (allowed: {', '.join(SCALES)})")
+        built_in = {STEPS.find(name).number: name for name in STEPS.names()}
+        unknown = [name for name in names if name not in built_in and not name.endswith(".py")]
+        if unknown:
+            listed = ", ".join(sorted(built_in, key=float))
+            raise InputError(f"{unknown[0]}: not a step of the ladder (there are: {listed}; or a file.py)")
+        found = sorted((_make(built_in.get(name, name), scale) for name in names or built_in), key=_place)
+        load = partial(_experiment, scale, file.overrides)
+        steps = tuple((step, {name: load(name, case) for name, case in step.experiments.items()}) for step in found)
+        every = [experiment for _, experiments in steps for experiment in experiments.values()]
+        outputs = (every or [load("minredundant", MINREDUNDANT)])[0].outputs
+        return cls(LadderFile(f"Validation ladder, {scale} scale", outputs), steps)
 
     @property
-    def passed(self) -> bool:
-        """Whether every step passed."""
-        return all(outcome.passed for outcome in self.outcomes)
+    def content(self) -> Any:
+        """The keys of the measurements: other steps, settings or versions have another run folder."""
+        return {number: task.key for number, task in self.measurements.items()}
+
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
+        """Return the ladder with all experiments cut to the memory, and the smallest number of workers of all."""
+        steps, counts = [], []
+        for step, experiments in self.steps:
+            measured = {} if step.number in self.failures else experiments
+            sized = {name: fit(item, budget, partial(_products, step)) for name, item in measured.items()}
+            steps.append((step, {name: experiment for name, (experiment, _) in sized.items()}))
+            counts += [count for _, count in sized.values()]
+        return replace(self, steps=tuple(steps)), min(counts, default=budget.workers or 1)
+
+    @cached_property
+    def measurements(self) -> dict[str, Task]:
+        """The measurement of each step that can be measured, by its number."""
+        measured = [item for item in self.steps if item[0].number not in self.failures]
+        return {step.number: step_task(step, experiments) for step, experiments in measured}
+
+    @property
+    def own(self) -> list[Task]:
+        """The measurements."""
+        return list(self.measurements.values())
+
+    @cached_property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Substitutions of all experiments for the papers' ingredients."""
+        experiments = [item for _, named in self.steps for item in named.values()]
+        return unique_notes(note for experiment in experiments for note in stand_ins(experiment))
+
+    @property
+    def texts(self) -> Mapping[str, str]:
+        """Nothing: the steps are in the manifest."""
+        return {}
+
+    @property
+    def entries(self) -> Mapping[str, Any]:
+        """The resolved experiments of all steps."""
+        return {
+            "steps": {
+                step.number: {name: item.model_dump(mode="json") for name, item in experiments.items()}
+                for step, experiments in self.steps
+            }
+        }
+
+    def judge(self, made: RunProducts) -> list[tuple[Step, list[Verdict], list[str]]]:
+        """Return each step with the verdicts on its limits, and the remarks of its measurement."""
+        return [(step, *self._judged(step, made)) for step, _ in self.steps]
+
+    def _judged(self, step: Step, made: RunProducts) -> tuple[list[Verdict], list[str]]:
+        if (reason := self.failures.get(step.number)) is not None:
+            return [statement.unevaluated(reason) for statement in step.statements()], []
+        measured = read_json(made.products[self.measurements[step.number].key].path / FINDINGS)
+        return step.judge(measured["findings"]), measured["remarks"]
+
+    def write_results(self, made: RunProducts) -> None:
+        """Write the table of all limits, the files of each measurement, and the manifest."""
+        judged = self.judge(made)
+        verdicts = [verdict for _, found, _ in judged for verdict in found]
+        write(self.folder / CLAIMS_JSON, to_json(verdicts) + "\n")
+        text = to_markdown(verdicts, self.description, ("step", "proves"), tally(verdicts), self.stand_ins)
+        remarks = [f"- {step.number}: {remark}\n" for step, _, found in judged for remark in found]
+        write(self.folder / CLAIMS_MARKDOWN, "".join([text, "\n", *remarks]))
+        (self.folder / "tables").mkdir(exist_ok=True)
+        for number, task in self.measurements.items():
+            publish([made.products[task.key]], self.folder / "tables" / number)
+        super().write_results(made)
 
 
-def run_ladder(steps: Sequence[Step], store: Path, folder: Path, workers: int, console: Console) -> LadderRun:
-    """Measure steps of the ladder, all of one scale, and judge them, reusing every product in the store.
+def _place(step: Step) -> float:
+    return float(step.number)
 
-    `folder` receives the tables, and a folder per step with its measurement, figures and manifest. Those of a failed
-    step are also kept under ``failed/``, by step and key, and never overwritten by a later run. Raises InputError if
-    the store or the folder cannot be written. A step whose products cannot be made fails, with the reason.
+
+def _products(step: Step, experiment: Experiment) -> list[Task]:
+    return list(inputs_of(step, experiment).values())
+
+
+def passed(verdicts: Sequence[Verdict]) -> bool:
+    """Return true if every limit holds; a number that was not measured does not."""
+    return all(verdict.verdict == "PASS" for verdict in verdicts)
+
+
+def tally(verdicts: Sequence[Verdict]) -> str:
+    """Count steps and limits in one line."""
+    steps: dict[str, list[Verdict]] = {}
+    for verdict in verdicts:
+        steps.setdefault(verdict.name.partition(" ")[0], []).append(verdict)
+    held = sum(verdict.verdict == "PASS" for verdict in verdicts)
+    return f"{sum(map(passed, steps.values()))} of {len(steps)} steps pass, {held} of {len(verdicts)} criteria"
+
+
+def run_ladder(ladder: Ladder, budget: Budget, console: Console) -> tuple[Path, list[Verdict]]:
+    """Run a ladder, and return its folder and verdicts.
+
+    If a step cannot be measured, the steps are run one by one, so that it fails alone. Raises InputError as
+    `calstudy.studies.study.run_study`, if the only step cannot be measured.
     """
-    products = Store(store)
-    products.prepare()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / LOG).touch()
-    except OSError as error:
-        raise InputError(f"--output {str(folder)!r}: cannot be written ({error.strerror})") from None
-    with log_to(folder / LOG):
-        tasks = {step.name: measurement_task(step) for step in steps}
-        made, reasons = _make(tasks, products, Workers(workers, folder / LOG), console)
-        outcomes = []
-        for step in steps:
-            task = tasks[step.name]
-            if task.key in made.products:
-                outcome = judge(step, read_json(made.products[task.key].path / FINDINGS))
-            else:
-                outcome = failed(step, reasons[step.name])
-            outcomes.append(outcome)
-            _keep(outcome, task, made, folder)
-        experiments = [experiment for step in steps for experiment in step.experiments.values()]
-        notes = unique_notes(note for experiment in experiments for note in stand_ins(experiment))
-        write_tables(outcomes, steps[0].scale, folder, notes)
-    return LadderRun(folder, tuple(outcomes))
-
-
-def _make(
-    tasks: Mapping[str, Task], store: Store, workers: Workers, console: Console
-) -> tuple[RunProducts, dict[str, str]]:
-    """Make all measurements together; if one fails, make them one by one, so that only that one is lost."""
-    try:
-        return make(list(tasks.values()), store, workers, console), {}
+        run = run_study(ladder, budget, console)
     except InputError as error:
-        logger.warning("%s", error)
-        if len(tasks) == 1:
-            return RunProducts({}, ()), dict.fromkeys(tasks, str(error))
-    all_made, reasons = RunProducts({}, ()), {}
-    for name, task in tasks.items():
-        try:
-            made = make([task], store, workers, console)
-        except InputError as error:
-            reasons[name] = str(error)
-            console.print(f"step {name}: {error}", markup=False)
-        else:
-            all_made = RunProducts({**all_made.products, **made.products}, (*all_made.tasks, *made.tasks))
-    return all_made, reasons
+        if len(ladder.steps) == 1:
+            raise
+        console.print(f"{error}; the steps are run one by one", markup=False)
+        failures = {}
+        for step in ladder.steps:
+            try:
+                run_study(replace(ladder, steps=(step,)), budget, console)
+            except InputError as reason:
+                failures[step[0].number] = str(reason)
+        ladder = replace(ladder, failures=failures)
+        run = run_study(ladder, budget, console)
+    return run.folder, [verdict for _, found, _ in ladder.judge(run.made) for verdict in found]
 
 
-def _keep(outcome: Outcome, task: Task, made: RunProducts, folder: Path) -> None:
-    """Write the folder of a step; a failed one twice, so that a later run does not replace it."""
-    step = outcome.step
-    own = folder / step.name
-    own.mkdir(exist_ok=True)
-    for old in own.iterdir():
-        old.unlink()
-    if task.key in made.products:
-        publish([made.products[task.key]], own)
-    fields = ("quantity", "measured", "verdict", "reason")
-    manifest = {
-        "step": step.name,
-        "scale": step.scale,
-        "passed": outcome.passed,
-        "criteria": [{field: getattr(verdict, field) for field in fields} for verdict in outcome.verdicts],
-        "experiments": {name: experiment.model_dump(mode="json") for name, experiment in step.experiments.items()},
-        "products": product_entries(unique([task]), made.products, made.tasks),
-    }
-    write_manifest(own, f"step {step.name}", manifest)
-    if not outcome.passed:
-        shutil.copytree(own, folder / FAILED / f"{step.name}-{task.key[:8]}", dirs_exist_ok=True)
+def _make(reference: str, scale: str) -> Step:
+    found, reference = STEPS.class_of({STEPS.tag: reference}, None, None)
+    if not NUMBER.fullmatch(found.number) or not found.limits:
+        raise InputError(f"{reference}: a step must have a number, such as '2.1', and limits")
+    small = found.small_parameters if scale == "small" else {}
+    return checked(found, {STEPS.tag: reference, "scale": scale, **found.parameters, **small}, Path())
+
+
+def _experiment(scale: str, overrides: Sequence[str], name: str, case: Case) -> Experiment:
+    """Validate an experiment of a step; relative paths start at the folder of the published experiments."""
+    path, changes = (case.file, case.overrides) if scale == "full" else (case.small_file, case.small)
+    file = StudyFile.open(published("experiments") / path, None, overrides)
+    data = file.content
+    for dotted, value in changes.items():
+        data = override(data, dotted, value)
+    try:
+        return validate(replace(file, content=data).changed(), file.folder)
+    except ExperimentError as error:
+        raise ExperimentError([f"{name}: {sentence}" for sentence in error.faults]) from None

@@ -26,7 +26,7 @@ from calstudy.products.files import VISIBILITIES, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.products.selection import read_gains
 from calstudy.run.task import Task
-from calstudy.validation.measurement import Inputs, Measurement, required
+from calstudy.validation.step import MINREDUNDANT, Step, StepInput, only, required
 
 
 def first_integrations(uvd: UVData, count: int = 1) -> UVData:
@@ -50,21 +50,21 @@ class SingleIntegration:
     true_gains: np.ndarray
 
     @classmethod
-    def of(cls, inputs: Inputs, experiment: str) -> SingleIntegration:
+    def of(cls, run: StepInput) -> SingleIntegration:
         """Return the first integration of an experiment, from its products "foregrounds", "gains" and "levels"."""
         from calstudy.calibrate.structure import make_structure
 
-        foregrounds = first_integrations(read_visibilities(inputs.folder(experiment, "foregrounds") / VISIBILITIES))
-        settings, frame = inputs.calibration(experiment), Observation(foregrounds)
+        foregrounds = first_integrations(read_visibilities(run.products["foregrounds"] / VISIBILITIES))
+        settings, frame = run.experiment.calibration, Observation(foregrounds)
         if not isinstance(settings, ForegroundFit):
             raise InputError(f"{settings.label}: the measurement needs a calibrator with foregrounds, such as calamity")
-        gains = read_gains(inputs.folder(experiment, "gains"))
+        gains = read_gains(run.products["gains"])
         return cls(
             foregrounds=foregrounds,
             structure=make_structure(frame, settings),
             numbers=frame.numbers,
             settings=settings,
-            noise_std=inputs.levels(experiment).noise_std,
+            noise_std=run.levels.noise_std,
             true_gains=gains.at(0, frame.numbers),
         )
 
@@ -132,15 +132,16 @@ class SingleIntegration:
         return visibilities - self.products(gains) * to_cube(result.model)[0, :, :, 0]
 
 
-class SingleIntegrationMeasurement(Measurement):
-    """Base class of measurements on the first integration of the step's single experiment."""
+class SingleIntegrationStep(Step):
+    """Base class of steps that measure on the first integration of the step's single experiment."""
 
+    experiments: ClassVar = {"minredundant": MINREDUNDANT}
     sections: ClassVar = ("calibration",)
 
     antennas: int | None = Field(None, ge=3, description="How many are used, the first ones; null: all.")
     channels: int | None = Field(None, ge=1, description="How many are used, the first ones; null: all.")
 
-    def products(self, graph: Graph) -> Mapping[str, Task]:
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the tasks of foregrounds, gains and levels."""
         return {
             "foregrounds": required(simulation.foregrounds(graph), "foregrounds"),
@@ -148,6 +149,6 @@ class SingleIntegrationMeasurement(Measurement):
             "levels": corruption.levels(graph),
         }
 
-    def integration(self, inputs: Inputs) -> SingleIntegration:
+    def integration(self, runs: Mapping[str, StepInput]) -> SingleIntegration:
         """Return the first integration of the experiment, with the first antennas and channels."""
-        return SingleIntegration.of(inputs, inputs.only).first(self.antennas, self.channels)
+        return SingleIntegration.of(only(runs)).first(self.antennas, self.channels)

@@ -152,7 +152,7 @@ def test_a_table_has_no_processor_time_of_scores_that_do_not_tell():
     old = scores | {"seconds_per_integration": 4.5, "peak_memory": 2e9}
     by_file = scores | {"cpu_seconds_per_integration": None, "peak_memory": None}
     table = score_table({"new": new, "old": old, "by file": by_file})
-    place = table.headings.index("CPU s per integration")
-    assert table.headings[place + 1] == "memory"
+    place = table.columns.index("CPU s per integration")
+    assert table.columns[place + 1] == "memory"
     assert [row[place] for row in table.rows] == ["0.12", "-", "-"]
     assert [row[place + 1] for row in table.rows] == ["2.0 GB", "2.0 GB", "-"]

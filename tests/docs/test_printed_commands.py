@@ -15,7 +15,7 @@ from calstudy.base.package_files import experiment_names
 from calstudy.cli.main import app
 
 ROOT = Path(__file__).parents[2]
-COMMAND = re.compile(r"(?:mpiexec -n \d+ |timeout .* \d+ )?(?:\.venv/bin/)?(?:python -m )?calstudy (?P<rest>[a-z].*)")
+COMMAND = re.compile(r"(?:timeout .* \d+ )?(?:\.venv/bin/)?(?:python -m )?calstudy (?P<rest>[a-z].*)")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.ipynb")])
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from plugin_files import Plugged, make
 
-from calstudy.base import ranks
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import to_cube
 from calstudy.products import simulation
@@ -61,11 +60,3 @@ def test_it_refuses_in_a_sentence(plugged):
     task = simulation.foregrounds(Graph(with_engine(plugged, plugged.settings(), polarizations=["xx", "yy"])))
     with pytest.raises(InputError, match=r"simulation\.engine = '\w.*': needs an unpolarized sky in xx"):
         make([task], plugged.folder)
-
-
-def test_it_must_share_ranks_to_run_on_several(plugged, monkeypatch):
-    from calstudy.studies.capacity import Budget, fit
-
-    monkeypatch.setattr(ranks, "count", lambda: 2)
-    with pytest.raises(InputError, match="does not share its work between MPI ranks"):
-        fit(with_engine(plugged, plugged.settings()), Budget(), targets=lambda graph: [])

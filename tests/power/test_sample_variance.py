@@ -13,8 +13,7 @@ from calstudy.power.interface import estimate_spectra
 from calstudy.power.realizations import inside_bars
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.spherical import spherical_average
-from calstudy.simulate.chunks import simulate_chunk
-from calstudy.simulate.component import Component
+from calstudy.simulate.chunks import Component, simulate_chunk
 
 EXPERIMENT = Path(__file__).parents[2] / "experiments" / "redundant.yaml"
 SKIES = 12

@@ -12,13 +12,12 @@ from pyradiosky import SkyModel
 from calstudy.instrument import settings as instrument
 from calstudy.instrument.array_layouts.mwa import MwaLayout
 from calstudy.instrument.telescope import make_template, subset_template
-from calstudy.simulate.arguments import OPTIONAL, missing_package
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.fftvis import FftvisEngine
-from calstudy.simulate.engines.matvis import MatvisEngine
+from calstudy.simulate.engines.matvis import MatvisEngine, missing_package
 from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
 
-needs_engines = pytest.mark.skipif(any(map(missing_package, OPTIONAL)), reason="needs the extra [engines]")
+needs_engines = pytest.mark.skipif(any(map(missing_package, ("matvis", "fftvis"))), reason="needs the extra [engines]")
 FAST_ENGINES = [
     pytest.param(DenseEngine(), id="dense"),
     pytest.param(MatvisEngine(), id="matvis", marks=needs_engines),

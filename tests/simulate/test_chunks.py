@@ -12,8 +12,14 @@ from calstudy.experiment.files import validate
 from calstudy.instrument.telescope import subset_template
 from calstudy.products import simulation
 from calstudy.products.graph import Graph
-from calstudy.simulate.chunks import assemble, check_interpolation, plan_chunks, simulate_chunk, simulate_visibilities
-from calstudy.simulate.component import Component
+from calstudy.simulate.chunks import (
+    Component,
+    assemble,
+    check_interpolation,
+    plan_chunks,
+    simulate_chunk,
+    simulate_visibilities,
+)
 from calstudy.simulate.directions import SourceTracks, split_by_horizon
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.pyuvsim import PyuvsimEngine

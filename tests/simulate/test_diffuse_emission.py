@@ -13,8 +13,7 @@ from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.array_layouts.csv import CsvLayout
 from calstudy.instrument.beam_models.gaussian import GaussianBeam
 from calstudy.instrument.settings import Channels, InstrumentSettings, Site, Times
-from calstudy.simulate.chunks import simulate_visibilities
-from calstudy.simulate.component import Component
+from calstudy.simulate.chunks import Component, simulate_visibilities
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
 from calstudy.simulate.nodes import Accuracy

@@ -260,7 +260,8 @@ def test_a_file_with_a_sweep_is_a_sweep_and_one_without_is_none(folder):
 
 def test_blocks_as_values_vary_fields_together(folder):
     sweep = {"instrument.channels": [{"first": "170 MHz", "width": "200 kHz", "count": 64}]}
-    (point,) = expand(validate({**small(folder), "sweep": sweep}, folder)).points
-    assert point.experiment.instrument.channels.count == 64
+    family = expand(validate({**small(folder), "sweep": sweep}, folder))
+    (point,) = family.points
+    assert family.members[point.label].instrument.channels.count == 64
     assert point.changes == {"instrument.channels": "first 170 MHz, width 200 kHz, count 64"}
     assert point.label == "01-channels=first170MHzwidth200kHzcount64"

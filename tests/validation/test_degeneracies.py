@@ -14,8 +14,8 @@ from calstudy.calibrate.calibrators.calamity import Calamity
 from calstudy.calibrate.structure import make_structure
 from calstudy.corrupt.levels import rms
 from calstudy.instrument.telescope import make_template
-from calstudy.validation.measurements.degeneracies import EXCHANGES, best_misfit, narrow_model
 from calstudy.validation.single_integration import SingleIntegration
+from calstudy.validation.steps.degeneracies import EXCHANGES, best_misfit, narrow_model
 
 
 @pytest.fixture(scope="module")

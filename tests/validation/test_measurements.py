@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ladders import load_ladder
 
 from calstudy.base.errors import InputError
 from calstudy.power.spectra import DelaySpectra
+from calstudy.validation.ladder import SCALES, passed, tally
 from calstudy.validation.means import clustered_mean, pooled
-from calstudy.validation.measurements.steep_signal import windowed
-from calstudy.validation.product import measurement_task
-from calstudy.validation.steps import SCALES, load_ladder, load_step
+from calstudy.validation.steps.steep_signal import windowed
 from calstudy.verdicts.criterion import Finding
 
 DRAWN = True
@@ -88,61 +87,82 @@ def test_pooling_weights_by_inverse_variance():
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_all_steps_load_and_have_what_the_table_needs(scale):
-    steps = load_ladder(scale=scale)
+    steps = [step for step, _ in load_ladder(scale=scale).steps]
     assert len(steps) == 12
     for step in steps:
-        assert step.criteria
-        assert all(item.why and item.quantity for item in step.criteria.values())
+        assert step.statements()
+        assert all(item.why and item.quantity and item.sentence for item in step.statements())
 
 
 def test_full_scale_thresholds_are_those_of_the_table():
-    must = {(step.name, name): str(item.threshold) for step in load_ladder() for name, item in step.criteria.items()}
-    assert must["-1", "double_pyuvsim"] == "<= 1e-06"
-    assert must["0.0", "scatter_over_theory"] == "1 within 3 sigma"
-    assert must["0.1", "normalization"] == "from 0.99 to 1.01"
-    assert must["0.1", "exponential"] == ">= 0.01"
-    assert must["0.1", "imaginary"] == "from -0.015 to 0.015"
-    assert must["0.2", "normalization"] == "from 0.98 to 1.02"
-    assert must["1.0", "excess"] == must["1.0", "beyond_floor"] == "<= 0.01"
-    assert must["2.0", "single"] == "<= 1e-05"
-    assert must["2.0", "double"] == "<= 1e-09"
-    assert must["2.1", "exact"] == must["2.1", "fitted"] == "<= 1e-06"
-    assert must["2.2", "false_convergence"] == must["2.3", "influence"] == "<= 0"
-    assert must["2.3", "bias"] == "<= 2"
-    assert must["3.0", "left"] == "<= 1"
-    assert must["4.0", "minredundant_bars"] == must["4.0", "redundant_bars"] == ">= 0.9"
+    statements = [statement for step, _ in load_ladder().steps for statement in step.statements()]
+    must = {statement.name: str(statement.threshold) for statement in statements}
+    assert must["-1 double_pyuvsim"] == "<= 1e-06"
+    assert must["0.0 scatter_over_theory"] == "1 within 3 sigma"
+    assert must["0.1 normalization"] == "from 0.99 to 1.01"
+    assert must["0.1 exponential"] == ">= 0.01"
+    assert must["0.1 imaginary"] == "from -0.015 to 0.015"
+    assert must["0.2 normalization"] == "from 0.98 to 1.02"
+    assert must["1.0 excess"] == must["1.0 beyond_floor"] == "<= 0.01"
+    assert must["2.0 single"] == "<= 1e-05"
+    assert must["2.0 double"] == "<= 1e-09"
+    assert must["2.1 exact"] == must["2.1 fitted"] == "<= 1e-06"
+    assert must["2.2 false_convergence"] == must["2.3 influence"] == "<= 0"
+    assert must["2.3 bias"] == "<= 2"
+    assert must["3.0 left"] == "<= 1"
+    assert must["4.0 minredundant_bars"] == must["4.0 redundant_bars"] == ">= 0.9"
+    assert must["4.1 minredundant_worst_pull"] == must["4.1 redundant_worst_pull"] == "<= 3"
+
+
+def test_small_scale_has_limits_of_its_own_only_where_a_step_says_so():
+    full, small = (
+        {item.name: str(item.threshold) for step, _ in load_ladder(scale=scale).steps for item in step.statements()}
+        for scale in SCALES
+    )
+    assert full.keys() - small.keys() == {"1.0 excess"}
+    assert {name: limit for name, limit in small.items() if limit != full[name]} == {
+        "0.1 normalization": "1 within 3 sigma",
+        "0.1 imaginary": "0 within 3 sigma",
+        "0.2 normalization": "1 within 3 sigma",
+        "2.3 bias": "<= 3",
+    }
+
+
+def test_a_number_that_is_missing_or_not_finite_does_not_pass():
+    ((step, _),) = load_ladder(["0.0"]).steps
+    found = {"mean_real": {"value": 0.0, "uncertainty": 1.0}, "mean_imaginary": {"value": None, "uncertainty": 1.0}}
+    verdicts = step.judge(found)
+    assert [verdict.verdict for verdict in verdicts] == ["not evaluated", "PASS", "not evaluated"]
+    assert not passed(verdicts)
+    assert tally(verdicts) == "0 of 1 steps pass, 1 of 3 criteria"
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("body", "sentence"),
     [
-        ({"measurement": "ladder"}, "measurement: 'ladder' is not a measurement"),
-        ({"parameters": {"k_min": 0.3}}, r"parameters\.k_min: 0.3 is not a wavenumber"),
-        ({"parameters": {"banana": 1}}, r"parameters\.banana: unknown key"),
-        ({"criteria": []}, "at least 1"),
-        ({"criteria": [{"measures": "x", "quantity": "x", "must": {}, "why": "x"}]}, "exactly one of"),
-        ({"criteria": 2 * [{"measures": "x", "quantity": "x", "must": {"at_most": 1}, "why": "x"}]}, "a finding twice"),
-        ({"step": "one"}, "must match"),
-        ({"steps": 1}, "unknown key"),
-        ({"experiments": {"x": {"file": "nowhere.yaml"}}}, "nowhere.yaml"),
+        ('number = "9.9"', "limits"),
+        ('number = "nine"; limits = {"x": LIMIT}', "must have a number"),
+        ('number = "9.9"; limits = {"x": LIMIT}; parameters = {"banana": 1}', r"banana: unknown key"),
+        ('number = "9.9"; limits = {"x": LIMIT}; parameters = {"reach": 0.3}', r"reach: 0\.3 has no unit"),
+        ('number = "9.9"; limits = {"x": LIMIT}; experiments = {"x": Case("nowhere.yaml")}', "nowhere.yaml"),
     ],
 )
-def test_a_broken_step_is_refused_in_a_sentence(change, sentence, tmp_path):
-    good = {
-        "step": "9.9",
-        "title": "x",
-        "proves": "x",
-        "measurement": "end-to-end",
-        "criteria": [{"measures": "x", "quantity": "x", "must": {"at_most": 1}, "why": "x"}],
-    }
-    path = tmp_path / "step.yaml"
-    path.write_text(yaml.safe_dump({**good, **change}))
+def test_a_broken_step_is_refused_in_a_sentence(body, sentence, tmp_path):
+    imports = (
+        "from calstudy.base.units import Length\nfrom calstudy.validation.step import Case, Limit, Step\n"
+        "from calstudy.verdicts.criterion import AtMost\n\nLIMIT = Limit('x', AtMost(1), 'x')\n"
+    )
+    path = tmp_path / "step.py"
+    path.write_text(
+        f"{imports}\nclass Own(Step):\n    reach: Length = 1.0\n    {body}\n\n"
+        "    def measure(self, runs, output):\n        return None\n"
+    )
     with pytest.raises(InputError, match=sentence):
-        load_step(path)
+        load_ladder([str(path)])
 
 
 def test_a_step_says_what_its_experiment_lacks():
     without = ["sky.foregrounds=none", "corruption.eor_level=null", "variants={eor: {components: [eor]}}"]
-    (step,) = load_ladder(["2.3"], "small", [*without, "outputs.figures=[]"])
+    ladder = load_ladder(["2.3"], "small", [*without, "outputs.figures=[]"])
     with pytest.raises(InputError, match=r"step 2\.3: validation-small: the measurement needs foregrounds"):
-        measurement_task(step)
+        _ = ladder.measurements

@@ -1,51 +1,42 @@
-"""``calstudy validate``: exit status, table, and what is kept of failures, with a measurement of one's own."""
+"""``calstudy validate``: exit status, table, and what is kept of failures, with steps of one's own."""
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
 import pytest
-import yaml
+from ladders import load_ladder
 
 from calstudy.cli.main import main as cli
 
 OWN = """
 from calstudy.base.errors import InputError
-from calstudy.validation.measurement import Findings, Measurement
-from calstudy.verdicts.criterion import Finding
+from calstudy.validation.step import Findings, Limit, Step
+from calstudy.verdicts.criterion import AtMost, Finding
 
-class Pretended(Measurement):
-    value: float
-    broken: str = ""
+class Pretended(Step):
+    number = "{number}"
+    proves = "y"
+    limits = {{"number": Limit("a number", AtMost(1), "because")}}
 
-    def measure(self, inputs):
-        if self.broken == "refused":
-            raise InputError("this measurement cannot be made")
-        if self.broken == "error":
-            return [][0]
-        if self.broken == "wrong":
-            return {"number": 1.0}
-        return Findings({"number": Finding(self.value, 0.1)}, ("a remark",))
+    def measure(self, runs, output):
+        {body}
+        return Findings({{"number": Finding({value}, 0.1)}}, ("a remark",))
 """
 
 
-@pytest.fixture
-def ladder(tmp_path, monkeypatch) -> Path:
-    """A folder of steps beside a measurement of one's own."""
+@pytest.fixture(autouse=True)
+def _in_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folder = tmp_path / "ladder"
-    folder.mkdir()
-    (folder / "pretended.py").write_text(OWN)
-    return folder
 
 
-def step(folder: Path, name: str, value: float, broken: str = "") -> None:
-    criterion = {"measures": "number", "quantity": "a number", "must": {"at_most": 1}, "why": "because"}
-    content = {"step": name, "title": "x", "proves": "y", "measurement": "pretended.py"}
-    content["parameters"] = {"value": value, "broken": broken}
-    (folder / f"{name}.yaml").write_text(yaml.safe_dump({**content, "criteria": [criterion]}))
+def step(number: str, value: float, body: str = "pass") -> str:
+    path = Path(f"step{number}.py")
+    path.write_text(OWN.format(number=number, value=value, body=body))
+    return str(path)
 
 
 def validate(monkeypatch, capsys, *arguments: str) -> tuple[int, str, str]:
@@ -56,37 +47,44 @@ def validate(monkeypatch, capsys, *arguments: str) -> tuple[int, str, str]:
     return end.value.code or 0, written.out, written.err
 
 
-def test_passing_is_0_failing_is_1_and_failures_are_kept(ladder, monkeypatch, capsys):
-    step(ladder, "-1", 0.5)
-    assert validate(monkeypatch, capsys, "-1", "--ladder", str(ladder))[0] == 0
-    step(ladder, "0.0", 1.5)
-    status, out, _ = validate(monkeypatch, capsys, "--ladder", str(ladder))
+def test_passing_is_0_failing_is_1_and_failures_are_kept(monkeypatch, capsys):
+    first = step("-1", 0.5)
+    assert validate(monkeypatch, capsys, first)[0] == 0
+    status, out, _ = validate(monkeypatch, capsys, first, step("0.0", 1.5))
     assert status == 1
     assert "1 of 2 steps pass" in out
-    assert [path.name.partition("-")[0] for path in Path("validation/failed").iterdir()] == ["0.0"]
-    step(ladder, "0.0", 0.7)
-    assert validate(monkeypatch, capsys, "--ladder", str(ladder))[0] == 0
-    (kept,) = Path("validation/failed").iterdir()
-    manifest = json.loads((kept / "manifest.json").read_text())
-    assert manifest["criteria"] == [{"quantity": "a number", "measured": 1.5, "verdict": "FAIL", "reason": ""}]
-    assert "a remark" in Path("validation/validation.md").read_text()
+    (failed,) = [folder for folder in Path("runs").iterdir() if "FAIL" in (folder / "claims.md").read_text()]
+    assert validate(monkeypatch, capsys, first, step("0.0", 0.7))[0] == 0
+    # The step is another one now: its run has a folder of its own.
+    *_, verdict = json.loads((failed / "claims.json").read_text())
+    assert (verdict["quantity"], verdict["measured"], verdict["verdict"]) == ("a number", 1.5, "FAIL")
+    assert "- 0.0: a remark" in (failed / "claims.md").read_text()
+    assert (failed / "report.html").exists()
 
 
-def test_a_step_that_cannot_be_measured_fails_alone(ladder, monkeypatch, capsys):
-    step(ladder, "0.0", 0.5)
+def test_a_step_that_cannot_be_measured_fails_alone(monkeypatch, capsys):
     broken = {
-        "refused": "this measurement cannot be made",
-        "error": "pretended.py line 14, in measure: IndexError: list index out of range",
-        "wrong": "pretended: its measure returned a dict, expected Findings",
+        'raise InputError("this measurement cannot be made")': "this measurement cannot be made",
+        "[][0]": "step2.0.py line 12, in measure: IndexError: list index out of range",
+        'return {"number": 1.0}': "its measure returned a dict, expected Findings",
     }
-    for number, name in enumerate(broken, 1):
-        step(ladder, f"{number}.0", 0.5, name)
-    status, _, _ = validate(monkeypatch, capsys, "--ladder", str(ladder))
+    files = [step("0.0", 0.5), *(step(f"{number}.0", 0.5, body) for number, body in enumerate(broken, 1))]
+    status, out, _ = validate(monkeypatch, capsys, *files, "--json")
     assert status == 1
-    steps = {item["step"]: item for item in json.loads(Path("validation/validation.json").read_text())["steps"]}
-    assert {name for name, found in steps.items() if found["passed"]} == {"0.0"}
+    verdicts = {item["name"].partition(" ")[0]: item for item in json.loads(out)}
+    assert {name for name, verdict in verdicts.items() if verdict["verdict"] == "PASS"} == {"0.0"}
     for number, reason in enumerate(broken.values(), 1):
-        assert reason in steps[f"{number}.0"]["criteria"][0]["reason"]
+        assert reason in verdicts[f"{number}.0"]["reason"]
+
+
+def test_the_step_of_the_page_can_be_measured():
+    page = (Path(__file__).parents[2] / "docs" / "validation.md").read_text()
+    name, text = re.search(r"```python\n# (\S+)\n(.*?)```", page, re.DOTALL).groups()
+    Path(name).write_text(text)
+    ladder = load_ladder([name], "small")
+    assert list(ladder.measurements) == ["0.3"]
+    (statement,) = ladder.steps[0][0].statements()
+    assert str(statement.threshold) == "0.5 within 3 sigma"
 
 
 @pytest.mark.parametrize(
@@ -94,7 +92,7 @@ def test_a_step_that_cannot_be_measured_fails_alone(ladder, monkeypatch, capsys)
     [
         (["9.9"], "9.9: not a step of the ladder (there are: -1, 0.0"),
         (["--scale", "tiny"], "--scale tiny: not a scale of the ladder"),
-        (["--ladder", "nowhere"], "nowhere: holds no steps"),
+        (["nowhere.py"], "nowhere.py"),
         (["--banana"], "--banana: not a step"),
     ],
 )

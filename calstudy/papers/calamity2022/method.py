@@ -105,7 +105,7 @@ def one_complex_degeneracy(run: Results) -> Finding:
 )
 def artefacts_at_minus_45_db(run: Results) -> Finding:
     raise Unevaluated(
-        "all variants of a run have EoR or noise above that floor; 'calstudy check floor' measures it for every "
+        "all variants of a run have EoR or noise above that floor; the figure 'delay-floor' measures it for every "
         "interpolation of the beam"
     )
 

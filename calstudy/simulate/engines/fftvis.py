@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.resources import Cost
-from calstudy.base.visibilities import require_rectangular
+from calstudy.simulate.engines.matvis import call, refusal, select_polarizations
 from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ class FftvisEngine(Engine):
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
         from calstudy.instrument.antenna_beams import AntennaBeams
-        from calstudy.simulate.arguments import refusal
 
         if isinstance(beam, AntennaBeams) and (template.polarization_array < CROSS_HANDS).any():
             return "fftvis confuses the feeds of cross-hand polarizations if antennas have different beams"
@@ -45,18 +44,15 @@ class FftvisEngine(Engine):
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
         from fftvis.wrapper import simulate_vis
 
-        from calstudy.simulate import arguments
         from calstudy.simulate.brightness import stokes_i
 
-        require_rectangular(template)
-        beams, index = arguments.beam_arguments(beam, template)
+        arguments, beams, pairs = call(sky, beam, template)
         # One process and thread, because the caller distributes the work.
         visibilities = simulate_vis(
-            **arguments.common_arguments(sky, template),
+            **arguments,
             fluxes=np.ascontiguousarray(stokes_i(sky, template.freq_array).T),
             beam=beams,
-            beam_idx=index,
-            baselines=[tuple(pair) for pair in arguments.baseline_pairs(template).tolist()],
+            baselines=[tuple(pair) for pair in pairs.tolist()],
             precision=2,
             eps={"double": 1e-12, "single": 1e-6}[self.precision],
             flat_array_tol=FLATNESS,
@@ -66,7 +62,7 @@ class FftvisEngine(Engine):
             coord_method="CoordinateRotationAstropy",
         )
         # Shape (Nfreqs, Ntimes, feed, feed, Nbls).
-        return arguments.select_polarizations(visibilities.transpose(1, 4, 0, 3, 2), template).astype(np.complex128)
+        return select_polarizations(visibilities.transpose(1, 4, 0, 3, 2), template)
 
     def cost(self, size: SimulationSize) -> Cost:
         """Estimate the cost of a simulation; see `Engine.cost`."""

@@ -1,18 +1,13 @@
-"""pyuvsim: the simulator of the paper, and the reference for the other engines.
-
-In a run that was started with ``mpiexec`` every rank computes its share of the visibilities; see
-`calstudy.base.ranks`.
-"""
+"""pyuvsim: the simulator of the paper, and the reference for the other engines."""
 
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
 
-from calstudy.base import ranks
 from calstudy.base.resources import Cost
 from calstudy.base.visibilities import require_rectangular
 from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
@@ -28,8 +23,6 @@ if TYPE_CHECKING:
 
 class PyuvsimEngine(Engine):
     """All skies, beams and geometries that pyuvsim supports, one visibility at a time."""
-
-    shares_ranks: ClassVar[bool] = True
 
     precision: Literal["double"] = Field("double", description="pyuvsim has no other.")
 
@@ -54,23 +47,18 @@ class PyuvsimEngine(Engine):
         tabulated = [item.at(template.freq_array) for item in beams]
         products = _products(tabulated[0])
         columns = [products.index(number) for number in template.polarization_array]
-        cube = np.empty((template.Nblts, template.Nfreqs, len(products)), dtype=np.complex128)
-        for indices, values in ranks.share(_visibilities, sky, tabulated, index, template):
-            cube[tuple(indices.T)] = values
+        cube = _visibilities(sky, tabulated, index, template)
         return cube.reshape(template.Ntimes, template.Nbls, template.Nfreqs, -1)[..., columns]
 
     def cost(self, size: SimulationSize) -> Cost:
-        """Estimate the cost of a simulation in one process; see `Engine.cost`."""
+        """Estimate the cost of a simulation; see `Engine.cost`."""
         return Cost(2.8e-8 * size.sources * size.slots * size.antennas**2 / 2)
 
 
-def _visibilities(
-    rank: int, count: int, sky: SkyModel, beams: list, index: np.ndarray, template: UVData
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a rank's share: indices of sample and channel, (N, 2), and visibilities, (N, Nproducts) complex128.
+def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVData) -> np.ndarray:
+    """Return the visibilities, (Nblts, Nfreqs, Nproducts) complex128; antenna i has the beam ``beams[index[i]]``.
 
-    Antenna i of the telescope has the beam ``beams[index[i]]``. `pyuvsim.run_uvdata_uvsim` prints and installs an
-    excepthook; this is its loop, and gives the same bits.
+    `pyuvsim.run_uvdata_uvsim` prints and installs an excepthook; this is its loop, and gives the same bits.
     """
     from pyuvdata import BeamInterface
     from pyuvsim import BeamList
@@ -81,18 +69,16 @@ def _visibilities(
     use_bundled_earth_orientation()
     listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])
     by_antenna = dict(zip(template.telescope.antenna_names, index.tolist(), strict=True))
-    tasks = _share(range(template.Nblts * template.Nfreqs), rank, count)
-    indices, values = [], []
+    tasks = range(template.Nblts * template.Nfreqs)
+    cube = np.empty((template.Nblts, template.Nfreqs, len(_products(beams[0]))), dtype=np.complex128)
     engine = UVEngine()
     with warnings.catch_warnings():
         # A 21 cm sky is a brightness difference.
         warnings.filterwarnings("ignore", "Some Stokes I values are negative", UserWarning)
         for task in uvdata_to_task_iter(tasks, template, _catalog(sky, template.freq_array), listed, by_antenna):
             engine.set_task(task)
-            indices.append(task.uvdata_index[:2])
-            values.append(engine.make_visibility())
-    shape = (len(tasks), len(_products(beams[0])))
-    return np.array(indices, dtype=int).reshape(-1, 2), np.array(values, dtype=np.complex128).reshape(shape)
+            cube[tuple(task.uvdata_index[:2])] = engine.make_visibility()
+    return cube
 
 
 def _products(beam: UVBeam | AnalyticBeam) -> list[int]:
@@ -114,9 +100,3 @@ def _catalog(sky: SkyModel, frequencies: np.ndarray) -> SkyModelData:
     if sky.component_type == "healpix":
         sky.healpix_to_point()
     return SkyModelData(sky)
-
-
-def _share(tasks: range, rank: int, count: int) -> range:
-    """Return the share of a rank: a contiguous range, so that few ranks work on one time and evaluate its beam."""
-    edges = np.linspace(0, len(tasks), count + 1).astype(int).tolist()
-    return tasks[edges[rank] : edges[rank + 1]]

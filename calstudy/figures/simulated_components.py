@@ -1,0 +1,222 @@
+"""Check of a simulation: the wedge of F alone, P(k) of S alone over its input, and delay spectra of baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
+from calstudy.corrupt.levels import rms, set_levels
+from calstudy.experiment.model import Experiment
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.spherical import SIGMAS_95
+from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
+from calstudy.plotting import style
+from calstudy.plotting.cylinder import cells, draw_horizon, label_axes
+from calstudy.power.cylindrical import cylindrical_average
+from calstudy.power.delay import delay_transform, delays, horizon_delay
+from calstudy.power.drawn import input_power
+from calstudy.power.interface import estimate_spectra
+from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
+from calstudy.products import simulation
+from calstudy.products.files import VISIBILITIES, read_visibilities
+from calstudy.products.graph import Graph, required
+from calstudy.run.task import Job, Task
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from pyuvdata import UVData
+
+LENGTHS = (0.0, 0.5, 1.0)
+"""The baselines that are shown, as quantiles of length: shortest, median, longest."""
+MAX_DELAY = 2e-6
+WAVENUMBERS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, np.inf)
+"""Limits of the ranges of k, h/Mpc, for which the notes have a ratio."""
+
+
+@dataclass(frozen=True)
+class BaselineDelays:
+    """Rms over integrations of one baseline's delay transforms, first polarization, Jy Hz.
+
+    `delay` is ascending, in s, and `length` is |b| in m. S is scaled to the level that the experiment adds to the data.
+    """
+
+    antennas: tuple[int, int]
+    length: float
+    delay: np.ndarray
+    foregrounds: np.ndarray
+    eor: np.ndarray
+
+
+@dataclass(frozen=True)
+class SimulatedComponents:
+    """The simulated components of an experiment, each alone.
+
+    `wedge` is the cylindrical spectrum of F, and `eor` is P(k) of S as simulated, over all modes, with its sample
+    variance. `expected`, (Nk,), is the P(k) from which S was drawn, at the centres of the bins, mK^2 h^-3 Mpc^3.
+    `baselines` are a short, a median and a long one. `buffer` is the delay beyond the horizon at which the experiment's
+    window starts, s.
+    """
+
+    wedge: CylindricalSpectrum
+    eor: SphericalSpectrum
+    expected: np.ndarray
+    baselines: tuple[BaselineDelays, ...]
+    buffer: float
+
+    def ratio(self, low: float, high: float) -> tuple[float, float]:
+        """Return measured over expected power and its standard deviation, over bins with low < k <= high (h/Mpc).
+
+        Bins are weighted by their independent modes, because the sample variance is the only error.
+        """
+        modes = self.eor.sample_modes
+        chosen = (modes > 0) & (self.eor.k > low) & (self.eor.k <= high)
+        weights = modes[chosen]
+        if not weights.sum():
+            return np.nan, np.nan
+        ratios = self.eor.power.real[chosen] / self.expected[chosen]
+        return float(np.average(ratios, weights=weights)), float(1 / np.sqrt(weights.sum()))
+
+
+def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment) -> SimulatedComponents:
+    """Measure the spectra that are drawn, of F and S as simulated, Jy.
+
+    The beam, power section and levels are those of the experiment.
+    """
+    from calstudy.power.errors import with_errors
+    from calstudy.power.spherical import spherical_average
+
+    settings = experiment.power
+    levels = set_levels(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption)
+    of_foregrounds, of_eor = (_delay_spectra(data, experiment) for data in (foregrounds, eor))
+    spectrum = spherical_average(of_eor, settings, exclude_wedge=False)
+    return SimulatedComponents(
+        wedge=cylindrical_average(of_foregrounds, settings),
+        eor=with_errors(spectrum, signal=spectrum),
+        expected=input_power(experiment.sky.eor, spectrum.k, settings.cosmology),
+        baselines=_baselines(foregrounds, eor, levels.eor_factor, settings.taper),
+        buffer=settings.wedge_buffer,
+    )
+
+
+def _delay_spectra(data: UVData, experiment: Experiment) -> DelaySpectra:
+    from calstudy.instrument.beams import make_beam
+    from calstudy.power.average import fringe_stop_and_average
+
+    average = fringe_stop_and_average(data)
+    beam = make_beam(experiment.instrument.beam, experiment.instrument.channels)
+    return estimate_spectra(average, average, beam, experiment.power)
+
+
+def _baselines(foregrounds: UVData, eor: UVData, factor: float, taper: str) -> tuple[BaselineDelays, ...]:
+    lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
+    chosen = np.argsort(lengths, kind="stable")[[round(part * (len(lengths) - 1)) for part in LENGTHS]]
+    frequencies = foregrounds.freq_array
+    delay = delays(len(frequencies), float(np.diff(frequencies).mean()))
+
+    def spectrum(data: UVData, index: int) -> np.ndarray:
+        transform = delay_transform(to_cube(data)[:, index, :, 0], frequencies, taper)
+        return np.sqrt(np.mean(np.abs(transform) ** 2, axis=0))
+
+    return tuple(
+        BaselineDelays(
+            antennas=tuple(antenna_pairs(foregrounds)[index].tolist()),
+            length=float(lengths[index]),
+            delay=delay,
+            foregrounds=spectrum(foregrounds, index),
+            eor=factor * spectrum(eor, index),
+        )
+        for index in chosen
+    )
+
+
+@style.journal_style()
+def draw_components(components: SimulatedComponents, stand_ins: Sequence[str] = ()) -> Figure:
+    """Draw the wedge of F and P(k) of S above, and delay spectra of a short, a median and a long baseline below."""
+    figure = style.new_figure(style.TWO_COLUMNS, 5.2)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.25, 1)).ravel()
+    wedge, spherical = above.subplots(1, 2)
+    _draw_wedge(above, wedge, components)
+    _draw_power(spherical, components)
+    panels = below.subplots(1, len(components.baselines), sharey=True)
+    for axes, baseline in zip(panels, components.baselines, strict=True):
+        _draw_baseline(axes, baseline, components.buffer)
+    panels[0].set_ylabel(r"rms $|\widetilde{V}(\tau)|$ (Jy Hz)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    below.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_wedge(figure: Figure, axes: Axes, components: SimulatedComponents) -> None:
+    from matplotlib.colors import LogNorm
+
+    x, y, power = cells(components.wedge, np.abs(components.wedge.power.real))
+    shown = power[np.isfinite(power) & (power > 0)]
+    lowest, highest = 10 ** np.floor(np.log10(np.quantile(shown, 0.01))), 10 ** np.ceil(np.log10(shown.max()))
+    norm = LogNorm(lowest, highest)
+    axes.set_facecolor(EMPTY)
+    filled = np.ma.maximum(np.ma.masked_invalid(power), lowest)
+    mesh = axes.pcolormesh(x, y, filled, norm=norm, cmap=colour_map(POSITIVE), rasterized=True)
+    draw_horizon(axes, components.wedge, components.buffer)
+    label_axes(axes, components.wedge, MAX_DELAY)
+    axes.set_ylabel(style.K_PARALLEL)
+    axes.legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
+    bar = figure.colorbar(mesh, ax=axes, pad=0.02)
+    bar.set_label(rf"$|P^F|$ ({style.POWER_UNIT})")
+    bar.ax.tick_params(which="both", direction="out")
+
+
+def _draw_power(axes: Axes, components: SimulatedComponents) -> None:
+    spectrum = components.eor
+    finite = np.isfinite(spectrum.power.real)
+    ratio = spectrum.power.real[finite] / components.expected[finite]
+    half = SIGMAS_95 * spectrum.error[finite] / components.expected[finite]
+    axes.axhline(1, color=style.BLACK, linewidth=0.9, zorder=3)
+    axes.errorbar(spectrum.k[finite], ratio, half, fmt="o", color=style.BLUE, markersize=2.2, elinewidth=0.7)
+    reach = 1.05 * float(np.max(np.abs(ratio - 1) + half))
+    axes.set(xscale="log", xlabel=style.WAVENUMBER, ylabel=r"$P^S$ over its input", ylim=(1 - reach, 1 + reach))
+    style.label_one_two_five(axes.xaxis)
+    axes.set_title("bars: 95 % of the sample variance", fontsize=style.SMALL_SIZE)
+
+
+def _draw_baseline(axes: Axes, baseline: BaselineDelays, buffer: float) -> None:
+    nanoseconds = baseline.delay * 1e9
+    axes.plot(nanoseconds, baseline.foregrounds, color=style.RED, linewidth=0.9, label="$F$")
+    axes.plot(nanoseconds, baseline.eor, color=style.BLUE, linewidth=0.7, label="$S$, at the level on the data")
+    horizon = float(horizon_delay(baseline.length))
+    for extra, line, label in ((0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")):
+        for sign in (-1, 1):
+            where = sign * (horizon + extra) * 1e9
+            axes.axvline(where, color=style.BLACK, linestyle=line, linewidth=0.6, label=label if sign > 0 else None)
+    span = min(MAX_DELAY, float(baseline.delay[-1])) * 1e9
+    axes.set(yscale="log", xlabel=style.DELAY, xlim=(-span, span))
+    first, second = baseline.antennas
+    axes.set_title(rf"({first}, {second}), $|\mathbf{{b}}| = {baseline.length:.1f}$ m")
+
+
+class SimulatedComponentsFigure(StudyFigure):
+    """The simulated components alone: wedge of F, P(k) of S over its input, delay spectra of three baselines."""
+
+    caption = "Simulated components alone: wedge of F, P(k) of S over its input, and delay spectra of three baselines."
+    needs_foregrounds = True
+    sections = ("instrument", "sky", "corruption", "power")
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return both components."""
+        return {"foregrounds": required(simulation.foregrounds(graph)), "eor": simulation.eor(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Measure the spectra."""
+        experiment = cast(Experiment, SimpleNamespace(**{name: job.settings[name] for name in self.sections}))
+        foregrounds, eor = (read_visibilities(job.inputs[name] / VISIBILITIES) for name in ("foregrounds", "eor"))
+        found = measure_components(foregrounds, eor, experiment)
+        ratios = {f"{low:g} to {high:g}": found.ratio(low, high) for low, high in pairwise(WAVENUMBERS)}
+        measured = {k: list(ratio) for k, ratio in ratios.items() if np.isfinite(ratio[0])}
+        return Drawing(draw_components(found, job.settings["notes"]), found, {"eor_over_input": measured})

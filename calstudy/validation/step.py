@@ -1,0 +1,254 @@
+"""Steps of the validation ladder: papers of our own, whose statements are limits of numbers that a step measures.
+
+The built-in ones are the modules of `calstudy.validation.steps`; a user's own is the path of a Python file.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar, Literal, NamedTuple, cast
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import Registry, guarded
+from calstudy.base.resources import Cost
+from calstudy.base.schema import UNKEYED
+from calstudy.claims.paper import Paper
+from calstudy.corrupt.levels import Levels
+from calstudy.experiment.model import Experiment
+from calstudy.power.drawn import input_power
+from calstudy.power.spectra import DelaySpectra
+from calstudy.products.corruption import LEVELS
+from calstudy.products.files import read_json, write_json
+from calstudy.products.graph import Graph
+from calstudy.products.spectra import read_delay_spectra
+from calstudy.results.reader import Tables
+from calstudy.run.task import Job, Stage, Task
+from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
+from calstudy.verdicts.statement import Statement, Unevaluated
+
+STEPS: Registry[Step] = Registry("step", "calstudy.validation.steps", "calstudy.validation.step:Step")
+FINDINGS = "measurement.json"
+CHAIN = "validation/small/chain.yaml"
+"""The experiment of all steps at small scale."""
+ROLE = "measurement"
+"""The role that the numbers of a step play in its statements."""
+
+
+class Case(NamedTuple):
+    """An experiment of a step: the published file, or any other; at small scale `small_file` with other overrides."""
+
+    file: str
+    overrides: Mapping[str, Any] = {}
+    small: Mapping[str, Any] = {}
+    small_file: str = CHAIN
+
+
+MINREDUNDANT = Case("minredundant.yaml")
+SIXTEEN = {"instrument.layout": "mwa-compact-hex-east", "instrument.layout.count": 16}
+REDUNDANT = Case("redundant.yaml", small={**SIXTEEN, "power.pairs": "redundant-group"})
+
+
+class Limit(NamedTuple):
+    """The condition on a number, in words and as a threshold, and the reason for it.
+
+    At small scale, where sampling errors are larger, it may be another, or none ("full scale only").
+    """
+
+    quantity: str
+    threshold: Threshold
+    why: str
+    small: Threshold | Literal["the same", "full scale only"] = "the same"
+
+
+class LimitStatement(Statement):
+    """A limit of our own: it holds or not."""
+
+    def outcome(self, finding: Finding) -> Outcome:
+        """Return PASS or FAIL for a finite number."""
+        return Criterion.outcome(self, finding)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Numbers with their uncertainties, by the names of the step's limits, and remarks on them."""
+
+    values: Mapping[str, Finding]
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StepInput(Tables):
+    """What a step reads of one of its experiments: the sections that it names, and `products` by its names for them."""
+
+    experiment: Experiment
+    products: Mapping[str, Path]
+
+    @property
+    def levels(self) -> Levels:
+        """The levels of the components, from the product "levels"."""
+        return Levels(**read_json(self.products["levels"] / LEVELS))
+
+    @property
+    def flux_scale(self) -> float | None:
+        """The flux scale of the calibration, from the transfer function; None if it is not known."""
+        try:
+            scale = self.transfer("outside-wedge").flux_scale
+        except Unevaluated:
+            return None
+        return scale if np.isfinite(scale) else None
+
+    def input_power(self, k: np.ndarray) -> np.ndarray:
+        """Return the input P(k), scaled as the data are, mK^2 h^-3 Mpc^3, at `k` in h/Mpc."""
+        power = input_power(self.experiment.sky.eor, k, self.experiment.power.cosmology)
+        return self.levels.eor_factor**2 * power
+
+    def delay_spectra(self, product: str) -> DelaySpectra:
+        """Return the delay spectra of a `power` product."""
+        return read_delay_spectra(self.products[product])
+
+
+class Measured(NamedTuple):
+    """The numbers of a step, as its product has them: value and uncertainty, null if not finite, by name."""
+
+    name: str
+    findings: Mapping[str, Mapping[str, float | None]]
+
+    def finding(self, name: str) -> Finding:
+        """Return one of the numbers; raises Unevaluated if there is none."""
+        if name not in self.findings:
+            raise Unevaluated("not measured")
+        value, uncertainty = (math.nan if item is None else item for item in self.findings[name].values())
+        return Finding(value, uncertainty)
+
+
+class Step(Paper):
+    """Base class of the steps; fields of subclasses are parameters of their measurements.
+
+    Attributes
+    ----------
+    number, proves
+        Its place in the ladder, such as "2.1", and what it proves, in words.
+    experiments
+        The experiments on whose products it measures, by name.
+    sections
+        Sections of the experiments that the measurement itself reads; those that only affect products are not named.
+    parameters, small_parameters
+        Values of the fields, and others of these at small scale.
+    limits
+        The conditions on its numbers, by name.
+    """
+
+    registry: ClassVar = STEPS
+    roles: ClassVar[Mapping[str, str]] = {ROLE: "a measurement"}
+    number: ClassVar[str] = ""
+    proves: ClassVar[str] = ""
+    experiments: ClassVar[Mapping[str, Case]] = {}
+    sections: ClassVar[tuple[str, ...]] = ()
+    parameters: ClassVar[Mapping[str, Any]] = {}
+    small_parameters: ClassVar[Mapping[str, Any]] = {}
+    limits: ClassVar[Mapping[str, Limit]] = {}
+
+    scale: Literal["full", "small"] = Field("full", json_schema_extra=UNKEYED)
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the products of one experiment that the measurement reads, by names of its own."""
+        del graph
+        return {}
+
+    @abstractmethod
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Measure on the experiments, and write figures and tables, if any, to the folder `output`."""
+
+    def statements(self) -> list[Statement]:
+        """Return the limits that apply at the scale of the step."""
+        found: list[Statement] = []
+        for name, limit in self.limits.items():
+            threshold = limit.threshold if self.scale == "full" or limit.small == "the same" else limit.small
+            if not isinstance(threshold, str):
+                texts = (f"{self.number} {name}", "", self.proves, limit.quantity, threshold, limit.why)
+                found.append(LimitStatement(*texts, (ROLE,), partial(Measured.finding, name=name), ""))
+        return found
+
+    def judge(self, findings: Mapping[str, Any]) -> list[Verdict]:
+        """Return the verdicts on measured numbers, as `measure` of this module writes them."""
+        measured = Measured(", ".join(self.experiments) or self.label, findings)
+        return [statement.evaluate({ROLE: measured}, self.roles) for statement in self.statements()]
+
+
+def only(runs: Mapping[str, StepInput]) -> StepInput:
+    """Return the input of the single experiment of a step."""
+    (run,) = runs.values()
+    return run
+
+
+def required(task: Task | None, what: str) -> Task:
+    """Return a task, or raise InputError if the experiment does not have it."""
+    if task is None:
+        raise InputError(f"the measurement needs {what}, which the experiment does not have")
+    return task
+
+
+def inputs_of(step: Step, experiment: Experiment) -> Mapping[str, Task]:
+    """Return the products of an experiment that a step reads; raises InputError if it lacks one."""
+    try:
+        with guarded(step):
+            return step.inputs(Graph(experiment))
+    except InputError as error:
+        raise InputError(f"step {step.number}: {experiment.name}: {error}") from None
+
+
+def step_task(step: Step, experiments: Mapping[str, Experiment]) -> Task:
+    """Return the task that measures a step; raises InputError if an experiment lacks a product."""
+    settings = {
+        "measurement": step,
+        "version": step.version,
+        "experiments": {
+            name: {section: getattr(experiment, section) for section in step.sections}
+            for name, experiment in experiments.items()
+        },
+    }
+    inputs = {
+        f"{name}:{product}": task
+        for name, experiment in experiments.items()
+        for product, task in inputs_of(step, experiment).items()
+    }
+    return Task(VALIDATE, f"step {step.number}", settings, inputs)
+
+
+def measure(job: Job) -> Mapping[str, Any]:
+    """Write the numbers of a step to measurement.json, with its figures and tables.
+
+    Raises InputError if a user's own step fails, or does not return Findings.
+    """
+    step: Step = job.settings["measurement"]
+    runs = {}
+    for name, sections in job.settings["experiments"].items():
+        products = {key.partition(":")[2]: path for key, path in job.inputs.items() if key.startswith(f"{name}:")}
+        experiment = cast(Experiment, SimpleNamespace(name=name, **sections))
+        runs[name] = StepInput(tuple(products.values()), experiment, products)
+    with guarded(step):
+        found = step.measure(runs, job.output)
+    if not isinstance(found, Findings):
+        raise InputError(f"{step.label}: its measure returned a {type(found).__name__}, expected Findings")
+    findings = {
+        name: {"value": _json(finding.value), "uncertainty": _json(finding.uncertainty)}
+        for name, finding in found.values.items()
+    }
+    write_json(job.output / FINDINGS, {"findings": findings, "remarks": list(found.remarks)})
+    return {"findings": findings}
+
+
+def _json(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+VALIDATE = Stage(name="validate", version=4, make=measure, cost=lambda task: Cost(60, 3e9, 1e6))

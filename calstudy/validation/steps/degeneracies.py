@@ -1,0 +1,168 @@
+"""Step 2.1: directions of gains and foregrounds to which the data are insensitive.
+
+Each of these exchanges leaves g_a g_b* F_ab, and so the likelihood, unchanged:
+
+- *phase*: g_a -> g_a exp(i phi(nu)), any phase in every channel, the same for all antennas;
+- *scale*: g_a -> g_a sqrt(s), F -> F / s;
+- *tilt*: g_a -> g_a exp(i k.x_a), F_ab -> F_ab exp(i k.(x_b - x_a)): a shift of the sky;
+- *smooth*: g_a -> g_a s_a(nu), F_ab -> F_ab / (s_a s_b*), with s_a so smooth that the model stays within its basis.
+
+Two statements are measured, on noisy data:
+
+- at the true gains: the misfit V - g_a g_b* F with the best F of the basis is the same after the exchange (*exact*).
+  For the smooth exchange the true foregrounds are those of a narrower basis, without the buffer;
+- the fit: started from gains moved along the direction, it ends at the same residual (*fitted*). Phase and scale are
+  fixed by convention, so that R = V / (g_a g_b*) - F itself must be the same. Tilt and smooth exchanges are not fixed,
+  and R contains their factor; there V - g_a g_b* F, R times the gains by which it was divided, must be the same.
+
+Differences are rms over the rms of the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from calstudy.base.visibilities import baseline_vectors, to_cube
+from calstudy.calibrate.basis import dpss_vectors, make_basis
+from calstudy.calibrate.records import CalibrationResult
+from calstudy.corrupt.levels import rms
+from calstudy.validation.single_integration import SingleIntegration, SingleIntegrationStep
+from calstudy.validation.step import Findings, Limit, StepInput
+from calstudy.verdicts.criterion import AtMost, Finding
+
+SMALLEST_TOLERANCE = 1e-13
+"""Tolerance of the solver: residuals should agree to 1e-6 of the data, far below the noise."""
+SMOOTH_DELAY = 10e-9
+"""Largest delay of a smooth exchange, s: inside the buffer of the basis."""
+
+
+class Degeneracies(SingleIntegrationStep):
+    """The largest difference of any exchange, before and after a fit."""
+
+    number = "2.1"
+    proves = (
+        "overall phase, scale, tip-tilt and exchanges of smooth gains with foregrounds leave the residual unchanged"
+    )
+    small_parameters: ClassVar = {"draws": 5, "antennas": 10}
+    limits: ClassVar = {
+        "exact": Limit(
+            "rms change of V - g g* F by an exchange at the true gains, over rms V; largest value of all draws and "
+            "kinds",
+            AtMost(1e-6),
+            "the exchanges are exact; 1e-6 is far below noise and EoR",
+        ),
+        "fitted": Limit(
+            "rms change of the fitted residual when the fit starts along a degenerate direction, over rms V; largest "
+            "value of all kinds",
+            AtMost(1e-6),
+            "the fit must end with the same residual, wherever along the degeneracy it starts",
+        ),
+    }
+
+    draws: int = Field(20, ge=1, description="Random exchanges of each kind.")
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Compare exchanges at the true gains, and fits that start from exchanged gains."""
+        integration, rng = self.integration(runs), np.random.default_rng(20220422)
+        gains = integration.true_gains
+        noise = integration.noise_std * (rng.standard_normal((2, *integration.modelled.shape)) / np.sqrt(2))
+        visibilities = integration.products(gains) * narrow_model(integration) + noise[0] + 1j * noise[1]
+        solver = integration.settings.solver.model_copy(update={"tolerance": SMALLEST_TOLERANCE})
+        settings = integration.settings.model_copy(update={"solver": solver})
+        reference = integration.calibrate(visibilities, settings)
+        before = best_misfit(integration, visibilities, gains)
+        exact, fitted, remarks = dict.fromkeys(EXCHANGES, 0.0), {}, []
+        for kind, draw in EXCHANGES.items():
+            for _ in range(self.draws):
+                after = best_misfit(integration, visibilities, gains * draw(integration, rng))
+                exact[kind] = max(exact[kind], rms(after - before) / rms(visibilities))
+            moved = integration.calibrate(visibilities, settings, start=draw(integration, rng))
+            change = residual(integration, kind, moved, visibilities) - residual(
+                integration, kind, reference, visibilities
+            )
+            fitted[kind] = rms(change) / rms(visibilities)
+            record = moved.solutions[0]
+            remarks.append(
+                f"{kind}: exact {exact[kind]:.1e}, fitted {fitted[kind]:.1e} ({record.status}, {record.n_steps} steps)"
+            )
+        remarks.append(f"noise {integration.noise_std / rms(visibilities):.1e} of the data")
+        values = {"exact": max(exact.values()), "fitted": max(fitted.values())}
+        values |= {f"fitted_{kind}": value for kind, value in fitted.items()}
+        return Findings({name: Finding(value, 0.0) for name, value in values.items()}, tuple(remarks))
+
+
+def residual(
+    integration: SingleIntegration, kind: str, result: CalibrationResult, visibilities: np.ndarray
+) -> np.ndarray:
+    """Return the residual that an exchange must not change: R if its gauge is fixed, else V - g_a g_b* F."""
+    if kind in ("phase", "scale"):
+        return to_cube(result.residual)[0, :, :, 0]
+    return integration.misfit(result, visibilities)
+
+
+def narrow_model(integration: SingleIntegration) -> np.ndarray:
+    """Return the foregrounds in the basis without its buffer, (Nbls, Nfreqs)."""
+    settings = integration.settings.basis.model_copy(update={"buffer": 0.0})
+    lengths = np.linalg.norm(baseline_vectors(integration.foregrounds), axis=1)
+    cube = to_cube(integration.foregrounds)[0, :, :, 0]
+    projected = np.empty_like(cube)
+    for bucket in make_basis(lengths, integration.foregrounds.freq_array, settings).buckets:
+        projected[bucket.members] = cube[bucket.members] @ bucket.vectors @ bucket.vectors.T
+    return projected
+
+
+def best_misfit(integration: SingleIntegration, visibilities: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Return V - g_a g_b* F with the best-fitting F of the basis, (Nbls, Nfreqs), for gains (Nants, Nfreqs).
+
+    It is solved by linear least squares for each baseline, independently of the solvers.
+    """
+    products = integration.products(gains)
+    misfit = np.empty_like(visibilities)
+    for bucket in integration.structure.basis.buckets:
+        for baseline in bucket.members:
+            design = products[baseline][:, None] * bucket.vectors
+            orthonormal, _ = np.linalg.qr(design)
+            values = visibilities[baseline]
+            misfit[baseline] = values - orthonormal @ (orthonormal.conj().T @ values)
+    return misfit
+
+
+def _phase(integration: SingleIntegration, rng: np.random.Generator) -> np.ndarray:
+    phases = rng.uniform(0, 2 * np.pi, integration.structure.n_frequencies)
+    return np.exp(1j * np.tile(phases, (integration.structure.n_antennas, 1)))
+
+
+def _scale(integration: SingleIntegration, rng: np.random.Generator) -> np.ndarray:
+    shape = (integration.structure.n_antennas, integration.structure.n_frequencies)
+    return np.full(shape, np.exp(rng.uniform(-0.5, 0.5)), complex)
+
+
+def _tilt(integration: SingleIntegration, rng: np.random.Generator) -> np.ndarray:
+    telescope = integration.foregrounds.telescope
+    rows = np.searchsorted(telescope.antenna_numbers, integration.numbers)
+    east_north = telescope.get_enu_antpos()[rows, :2]
+    # At most one turn across 100 m.
+    slope = rng.uniform(-1, 1, 2) * 2 * np.pi / 100
+    return np.exp(1j * np.tile((east_north @ slope)[:, None], (1, integration.structure.n_frequencies)))
+
+
+def _smooth(integration: SingleIntegration, rng: np.random.Generator) -> np.ndarray:
+    count, n_frequencies = integration.structure.n_antennas, integration.structure.n_frequencies
+    width = float(np.diff(integration.foregrounds.freq_array).mean())
+    vectors = dpss_vectors(n_frequencies, n_frequencies * width * SMOOTH_DELAY, 0.5)
+    coefficients = rng.standard_normal((2, count, vectors.shape[1])) * 0.1 * np.sqrt(n_frequencies)
+    return np.exp((coefficients[0] + 1j * coefficients[1]) @ vectors.T / np.sqrt(vectors.shape[1]))
+
+
+EXCHANGES: dict[str, Callable[[SingleIntegration, np.random.Generator], np.ndarray]] = {
+    "phase": _phase,
+    "scale": _scale,
+    "tilt": _tilt,
+    "smooth": _smooth,
+}
+"""Random factors on the gains, (Nants, Nfreqs)."""

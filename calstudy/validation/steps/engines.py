@@ -1,0 +1,164 @@
+"""Step -1: simulation engines compared with pyuvsim, and with a closed form.
+
+The closed form: one source of flux I at s, seen by dishes of power beam A, gives V_ab = A(s) I exp(2 pi i b.s / lambda)
+/ 2. With a Gaussian beam A is known, and s is given by astropy's own transformation to the horizon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import AltAz, Longitude, SkyCoord
+from astropy.time import Time
+from pydantic import Field
+from pyradiosky import SkyModel
+from scipy.constants import speed_of_light
+
+from calstudy.base.visibilities import baseline_vectors
+from calstudy.corrupt.levels import rms
+from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.beam_models.gaussian import GaussianBeam
+from calstudy.instrument.beams import make_beam
+from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.simulate.interface import Engine
+from calstudy.simulate.nodes import integration_times
+from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.sky.settings import SyntheticSources
+from calstudy.validation.step import Findings, Limit, Step, StepInput
+from calstudy.verdicts.criterion import AtMost, Finding
+
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+REFERENCE = ("pyuvsim", "double")
+CANDIDATES = (
+    ("dense", "double"),
+    ("dense", "single"),
+    ("matvis", "double"),
+    ("fftvis", "single"),
+    ("fftvis", "double"),
+    REFERENCE,
+)
+"""Engines and precisions that are compared. matvis in single precision rounds its phases to 1e-4 and is left out."""
+FLUX = 3.0
+BEAM = GaussianBeam(kind="gaussian")
+OFFSETS = ((0.0, 0.0), (6.0, 20.0), (15.0, 200.0), (40.0, 310.0))
+"""Directions of the single source: degrees from the zenith, azimuth in degrees (north through east)."""
+
+
+class Engines(Step):
+    """The largest differences of the engines from pyuvsim, over the rms, and from the closed form."""
+
+    version: ClassVar[int] = 2
+    number = "-1"
+    proves = "simulation engines agree with pyuvsim and with closed forms"
+    parameters: ClassVar = {
+        "sources": 5000,
+        "antennas": 12,
+        "channels": 2,
+        "times": 2,
+        "engines": ["dense", "matvis", "fftvis", "pyuvsim"],
+    }
+    small_parameters: ClassVar = {"sources": 300, "antennas": 5, "times": 1, "engines": ["dense", "pyuvsim"]}
+    limits: ClassVar = {
+        "double_pyuvsim": Limit(
+            "largest difference of an engine in double precision from pyuvsim, over the rms of the visibilities",
+            AtMost(1e-6),
+            "-60 dB in brightness, 20 dB below the EoR",
+        ),
+        "double_closed_form": Limit(
+            "largest relative difference from A(s) I exp(2 pi i b.s) / 2 for single sources, double precision",
+            AtMost(1e-6),
+            "as above; only the coordinates of the sky are shared with the engines",
+        ),
+    }
+
+    engines: Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
+    sources: int = Field(ge=1, description="Brightest sources of the whole sky.")
+    antennas: int = Field(ge=2, le=36, description="First tiles of the minimally redundant array.")
+    channels: int = Field(ge=1, description="Spread over the paper's band.")
+    times: int = Field(ge=1, description="Integrations, spread over the paper's.")
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Run all engines on the same simulation, and on single sources."""
+        compared = [item for item in CANDIDATES if item[0] in self.engines]
+        errors, closed = self.errors(compared), {item: closed_form_error(*item) for item in compared}
+        both = {**errors, **{key: max(errors.get(key, 0.0), value) for key, value in closed.items()}}
+        values = {
+            f"{precision}_{what}": Finding(max(value for (_, kind), value in found.items() if kind == precision), 0.0)
+            for precision in ("double", "single")
+            for what, found in (("pyuvsim", errors), ("closed_form", closed))
+            if any(kind == precision for _, kind in found)
+        }
+        return Findings(
+            values, tuple(f"{name} ({kind}): {value:.1e} of the rms" for (name, kind), value in both.items())
+        )
+
+    def errors(self, compared: Sequence[tuple[str, str]]) -> dict[tuple[str, str], float]:
+        """Return the largest difference from pyuvsim over the rms of the visibilities, by engine and precision."""
+        instrument = InstrumentSettings(layout=MwaLayout(count=self.antennas))
+        whole = make_template(instrument)
+        times, channels = _spread(whole.Ntimes, self.times), _spread(whole.Nfreqs, self.channels)
+        template = subset_template(whole, integration_times(whole)[times], whole.freq_array[channels])
+        beam = make_beam(instrument.beam, instrument.channels)
+        sky = make_foregrounds(SyntheticSources(count=self.sources), whole.freq_array).sky
+        cubes = {item: _make(*item).simulate(sky, beam, template) for item in dict.fromkeys([*compared, REFERENCE])}
+        reference = cubes.pop(REFERENCE)
+        return {item: float(np.abs(cube - reference).max()) / rms(reference) for item, cube in cubes.items()}
+
+
+def _make(engine: str, precision: str) -> Engine:
+    return Engine.registry.make({"kind": engine, "precision": precision})
+
+
+def _spread(length: int, count: int) -> np.ndarray:
+    return np.unique(np.linspace(0, length - 1, count + 2).round().astype(int)[1:-1])
+
+
+def closed_form_error(engine: str, precision: str) -> float:
+    """Return the largest relative difference of visibilities of single sources from the closed form."""
+    settings = InstrumentSettings.model_validate(
+        {
+            "layout": {"kind": "mwa-compact-minredundant", "count": 4},
+            "beam": BEAM,
+            "channels": {"count": 8, "width": "3.84 MHz"},
+            "times": {"count": 1},
+        }
+    )
+    template = make_template(settings)
+    beam = make_beam(settings.beam, settings.channels)
+    simulator = _make(engine, precision)
+    worst = 0.0
+    for zenith_angle, azimuth in OFFSETS:
+        angles = np.radians([zenith_angle, azimuth])
+        sky = _source(template, *angles)
+        cube = simulator.simulate(sky, beam, template)[0, :, :, 0]
+        worst = max(worst, float(np.abs(cube / _closed_form(template, *angles) - 1).max()))
+    return worst
+
+
+def _source(template: UVData, zenith_angle: float, azimuth: float) -> SkyModel:
+    frame = AltAz(obstime=Time(template.time_array[0], format="jd", scale="utc"), location=template.telescope.location)
+    position = SkyCoord(
+        alt=(np.pi / 2 - zenith_angle) * units.rad, az=Longitude(azimuth * units.rad), frame=frame
+    ).transform_to("icrs")
+    stokes = np.zeros((4, 1, 1))
+    stokes[0] = FLUX
+    return SkyModel(name=["source"], skycoord=position.reshape(1), stokes=stokes * units.Jy, spectral_type="flat")
+
+
+def _closed_form(template: UVData, zenith_angle: float, azimuth: float) -> np.ndarray:
+    """Return A I exp(2 pi i b.s / lambda) / 2, (Nbls, Nfreqs)."""
+    direction = np.array(
+        [np.sin(zenith_angle) * np.sin(azimuth), np.sin(zenith_angle) * np.cos(azimuth), np.cos(zenith_angle)]
+    )
+    turns = (baseline_vectors(template) @ direction)[:, None] * template.freq_array / speed_of_light
+    # The width of the power beam is proportional to the wavelength.
+    width = np.radians(BEAM.fwhm_deg) * BEAM.reference_frequency / template.freq_array
+    power = np.exp(-4 * np.log(2) * (zenith_angle / width) ** 2)
+    return power * FLUX / 2 * np.exp(2j * np.pi * turns)

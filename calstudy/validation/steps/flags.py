@@ -1,0 +1,134 @@
+"""Step 2.3: flagged samples must have no influence, and the others must be calibrated without bias.
+
+*influence*: the data are calibrated twice, with different values under the flags; the largest difference of any gain,
+model or residual must be exactly zero.
+
+*bias*: foregrounds and noise are calibrated for two realizations of the noise. The part that both residuals share is
+not noise: the mean of Re R_even* R_odd over unflagged samples, in units of its standard error (each baseline one
+sample), is the residual of the foregrounds due to gain errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+from pyuvdata import UVData
+
+from calstudy.base.visibilities import flag_cube, to_cube
+from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.interface import Calibrator
+from calstudy.calibrate.records import CalibrationResult
+from calstudy.experiment.model import Variant
+from calstudy.products import corruption, simulation
+from calstudy.products.corruption import PARITIES
+from calstudy.products.files import DATA, VISIBILITIES, read_visibilities
+from calstudy.products.graph import Graph
+from calstudy.run.task import Task
+from calstudy.validation.means import clustered_mean
+from calstudy.validation.single_integration import first_integrations
+from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only, required
+from calstudy.verdicts.criterion import AtMost, Finding
+
+HUGE = 1e6
+
+
+class Flags(Step):
+    """The largest influence, and the largest bias in sigma, of all patterns of flags."""
+
+    number = "2.3"
+    proves = "flagged data (single channels, bands, 30 % at random) have no influence, and the residual is unbiased"
+    experiments: ClassVar = {"minredundant": MINREDUNDANT}
+    sections: ClassVar = ("calibration",)
+    parameters: ClassVar = {"integrations": 4}
+    small_parameters: ClassVar = {"integrations": 1}
+    limits: ClassVar = {
+        "influence": Limit(
+            "largest change of any gain, model or residual if flagged data have other values (1e6, NaN)",
+            AtMost(0),
+            "the influence must be exactly zero",
+        ),
+        "bias": Limit(
+            "|mean Re R_even* R_odd| without EoR, in standard errors; largest value of all patterns",
+            AtMost(2),
+            "a part common to both realizations is not noise; 2 sigma, at small scale 3 for a single integration",
+            small=AtMost(3),
+        ),
+    }
+
+    integrations: int = Field(1, ge=1, description="How many are calibrated, the first ones.")
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the foregrounds alone, and with gains and noise in both realizations."""
+        variant = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
+        data = {parity: corruption.data(graph, variant, parity) for parity in PARITIES}
+        return {"foregrounds": required(simulation.foregrounds(graph), "foregrounds"), **data}
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Calibrate both realizations with all patterns of flags."""
+        run = only(runs)
+        settings = run.experiment.calibration
+        data = {parity: self._read(run.products[parity] / DATA) for parity in PARITIES}
+        sky = self._read(run.products["foregrounds"] / VISIBILITIES)
+        influence, biases, remarks = 0.0, {}, []
+        for pattern, flags in patterns(data["even"]).items():
+            results = {parity: run_calibrator(settings, flagged(uvd, flags), sky) for parity, uvd in data.items()}
+            influence = max(influence, _influence(data["even"], flags, results["even"], settings, sky))
+            biases[pattern] = bias(results["even"].residual, results["odd"].residual)
+            statuses = {record.status for result in results.values() for record in result.solutions}
+            remarks.append(
+                f"{pattern} ({100 * flags.mean():.0f} % flagged): bias {biases[pattern].value:.2f} sigma, "
+                f"{', '.join(sorted(statuses))}"
+            )
+        worst = max(biases.values(), key=lambda finding: abs(finding.value))
+        values = {"influence": Finding(influence, 0.0), "bias": Finding(abs(worst.value), worst.uncertainty)}
+        return Findings(values, tuple(remarks))
+
+    def _read(self, path: Path) -> UVData:
+        return first_integrations(read_visibilities(path), self.integrations)
+
+
+def patterns(data: UVData) -> dict[str, np.ndarray]:
+    """Return the patterns of flags, (Ntimes, Nbls, Nfreqs) each: single channels, bands, 30 % at random."""
+    shape = to_cube(data).shape[:3]
+    single, bands = np.zeros(shape, bool), np.zeros(shape, bool)
+    single[..., [shape[2] // 5, shape[2] // 2, (4 * shape[2]) // 5]] = True
+    for start in (shape[2] // 4, (2 * shape[2]) // 3):
+        bands[..., start : start + max(2, shape[2] // 32)] = True
+    random = np.random.default_rng(7).random(shape) < 0.3
+    return {"single channels": single, "bands": bands, "30 % at random": random}
+
+
+def flagged(data: UVData, flags: np.ndarray, value: complex | None = None) -> UVData:
+    """Return a copy of data with additional flags, (Ntimes, Nbls, Nfreqs), and `value` (Jy) under them if given."""
+    changed = data.copy()
+    flag_cube(changed)[flags] = True
+    if value is not None:
+        to_cube(changed)[flags] = value
+    return changed
+
+
+def _influence(data: UVData, flags: np.ndarray, result: CalibrationResult, settings: Calibrator, sky: UVData) -> float:
+    largest = 0.0
+    for value in (HUGE * (1 + 2j), complex(np.nan, np.nan)):
+        other = run_calibrator(settings, flagged(data, flags, value), sky)
+        for mine, its in (
+            (result.gains.gain_array, other.gains.gain_array),
+            (result.model.data_array, other.model.data_array),
+            (result.residual.data_array, other.residual.data_array),
+        ):
+            largest = max(largest, float(np.abs(mine - its).max()))
+    return largest
+
+
+def bias(even: UVData, odd: UVData) -> Finding:
+    """Return the mean of Re R_even* R_odd over unflagged samples in units of its standard error."""
+    used = ~(flag_cube(even) | flag_cube(odd))
+    product = np.where(used, (to_cube(even).conj() * to_cube(odd)).real, np.nan)
+    # One sample per baseline: its times and channels share gains and model.
+    samples = product.transpose(1, 0, 2, 3).reshape(product.shape[1], -1)
+    found = clustered_mean(samples)
+    return Finding(found.value / found.uncertainty, 1.0)

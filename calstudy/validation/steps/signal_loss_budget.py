@@ -1,0 +1,185 @@
+"""Step 4.1: the signal-loss budget: the part of the EoR that each stage removes, per band of k.
+
+The spectrum of the EoR alone is followed through the chain, with each entry in units of the input:
+
+- *sky*: P_in - P of the middle integration by itself, without taper: this sky is a sample;
+- *averaging*: all integrations averaged without fringe stopping: fringes wash out;
+- *fringe-stop*: the gain from stopping the fringes first;
+- *taper*: the window instead of none;
+- *calibration*: absorption by the fit: the EoR is replaced by T s^2 of it, the response D of the residual
+  (`calstudy.power.transfer`) without the flux scale s;
+- *flux-scale*: the effect of the flux scale of the fit: T in place of T s^2;
+- *mask*: modes outside the wedge in place of all modes of the band;
+- *left*: the residual without EoR, noise and foregrounds, which is in P^R but is no signal (negative).
+
+The end-to-end loss is measured separately: P_in - P^R, from the residual of the whole chain. The sum must agree
+with it. The difference is the cross term of the EoR's response and the residual without EoR. Its mean is zero, and its
+error comes from leaving out antennas (`calstudy.power.clusters`).
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from calstudy.base.visibilities import to_cube
+from calstudy.experiment.model import Variant
+from calstudy.instrument.beams import make_beam
+from calstudy.power.average import fringe_stop_and_average
+from calstudy.power.clusters import Clusters
+from calstudy.power.interface import estimate_spectra
+from calstudy.power.spectra import DelaySpectra, outside_wedge
+from calstudy.power.transfer import BANDS
+from calstudy.products import corruption, signal_loss, spectra
+from calstudy.products.files import DATA, read_visibilities
+from calstudy.products.graph import Graph
+from calstudy.run.task import Task
+from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Findings, Limit, Step, StepInput, required
+from calstudy.verdicts.criterion import AtMost, Finding
+
+STAGES = ("sky", "averaging", "fringe-stop", "taper", "calibration", "flux-scale", "mask", "left")
+
+
+@dataclass(frozen=True)
+class Band:
+    """The budget of one band of k (h/Mpc), in units of P_in.
+
+    `losses` are those of the `STAGES`, and `total` is their sum. `measured` is 1 - P^R / P_in, with the error of its
+    difference from the sum.
+    """
+
+    low: float
+    high: float
+    losses: tuple[float, ...]
+    total: float
+    measured: Finding
+
+    @property
+    def pull(self) -> float:
+        """Difference of sum and end-to-end loss in units of its error."""
+        return (self.measured.value - self.total) / self.measured.uncertainty
+
+
+class SignalLossBudget(Step):
+    """The largest pull of any band of k, for every experiment."""
+
+    number = "4.1"
+    proves = "the EoR losses of all stages add up to the end-to-end loss"
+    experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
+    sections: ClassVar = ("instrument", "power", "sky")
+    limits: ClassVar = {
+        "minredundant_worst_pull": Limit(
+            "minimally redundant array, |sum of the stages - end-to-end loss| in sigma; largest value of all bands of "
+            "k",
+            AtMost(3),
+            "within the errors; 3 sigma, for the largest of four bands",
+        ),
+        "redundant_worst_pull": Limit("redundant array, the same", AtMost(3), "as above"),
+    }
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the EoR before averaging, its transfer function, and spectra of EoR, response, and both residuals."""
+        eor = Variant(components=("eor",))
+        transfer = required(signal_loss.transfer(graph), "the variants of signal loss")
+        return {
+            "levels": corruption.levels(graph),
+            "data": corruption.data(graph, eor, "even"),
+            "eor": spectra.variant_power(graph, "eor", eor),
+            "residual": spectra.power(graph, "residual"),
+            "left": spectra.power(graph, "residual_without_eor"),
+            "transfer": transfer,
+            "response": transfer.inputs["response"],
+        }
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Compute the budgets and write them to signal_loss_budget.csv."""
+        values, remarks, rows = {}, [], []
+        for name, run in runs.items():
+            bands = budget(run)
+            rows += [(name, band) for band in bands]
+            worst = max(bands, key=lambda band: abs(band.pull))
+            values[f"{name}_worst_pull"] = Finding(abs(worst.pull), 1.0)
+            remarks += [f"{name}: {_sentence(band)}" for band in bands]
+        with (output / "signal_loss_budget.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["experiment", "k from [h/Mpc]", "k to [h/Mpc]", *STAGES, "sum", "end to end", "error"])
+            writer.writerows(
+                [name, band.low, band.high, *band.losses, band.total, band.measured.value, band.measured.uncertainty]
+                for name, band in rows
+            )
+        return Findings(values, tuple(remarks))
+
+
+def _sentence(band: Band) -> str:
+    parts = ", ".join(f"{stage} {100 * loss:.1f} %" for stage, loss in zip(STAGES, band.losses, strict=True))
+    return (
+        f"k from {band.low:g} to {band.high:g} h/Mpc: {parts}; sum {100 * band.total:.1f} %, end to end "
+        f"{100 * band.measured.value:.1f} ± {100 * band.measured.uncertainty:.1f} %"
+    )
+
+
+def budget(run: StepInput) -> list[Band]:
+    """Return the budget of one experiment, band by band."""
+    settings = run.experiment.power
+    followed = [*_before_calibration(run), run.delay_spectra("eor")]
+    response, residual, left = (run.delay_spectra(product) for product in ("response", "residual", "left"))
+    # Without a known flux scale, its share is reported as loss of the calibration.
+    scale = run.flux_scale or 1.0
+    outside = outside_wedge(response, settings.wedge_buffer)
+    k = np.hypot(response.k_perp[:, None], response.k_parallel)
+    bands = []
+    for low, high in itertools.pairwise(BANDS):
+        inside = (k > low) & (k <= high)
+        if not (inside & outside).any():
+            continue
+        put_in = float(run.input_power(np.array((low + high) / 2)))
+        powers = [1.0, *(_mean(modes, inside).value / put_in for modes in followed)]
+        after = _mean(response, inside).value / put_in
+        powers += [after * scale**2, after]
+        powers.append(_mean(response, inside & outside).value / put_in)
+        powers.append(powers[-1] + _mean(left, inside & outside).value / put_in)
+        difference = _mean(residual, inside & outside, minus=(response, left))
+        total = 1 - powers[-1]
+        bands.append(
+            Band(
+                low,
+                high,
+                tuple(before - after for before, after in itertools.pairwise(powers)),
+                total,
+                Finding(total - difference.value / put_in, difference.uncertainty / put_in),
+            )
+        )
+    return bands
+
+
+def _mean(modes: DelaySpectra, used: np.ndarray, minus: Sequence[DelaySpectra] = ()) -> Finding:
+    """Return the mean power of the chosen modes, each once per pair, and its error by leaving out antennas."""
+    bins = np.where(used, 0, -1)
+    clusters = Clusters.of(modes, bins, np.broadcast_to(np.arange(len(bins))[:, None], bins.shape), 1)
+    power = clusters.powers(modes)
+    for other in minus:
+        power = power - clusters.powers(other)
+    value, error = power.ratio(clusters.counts)
+    return Finding(float(value[0]), float(error[0]))
+
+
+def _before_calibration(run: StepInput) -> list[DelaySpectra]:
+    """Return the EoR's spectra without taper: one integration, the plain average, the fringe-stopped average."""
+    data = read_visibilities(run.products["data"] / DATA)
+    stopped, cube = fringe_stop_and_average(data), to_cube(data)
+    plain = stopped.copy()
+    versions = []
+    for values in (cube[len(cube) // 2], cube.mean(axis=0)):
+        version = plain.copy()
+        version.data_array = values.astype(complex)
+        versions.append(version)
+    settings = run.experiment.power.model_copy(update={"taper": "none"})
+    instrument = run.experiment.instrument
+    beam = make_beam(instrument.beam, instrument.channels)
+    return [estimate_spectra(version, version, beam, settings) for version in (*versions, stopped)]
