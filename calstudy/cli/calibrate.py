@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.cli.options import MaxMemory
 
 EXIT_UNCONVERGED = 3
 # More unconverged solves than this are counted instead of named.
@@ -53,9 +54,6 @@ Output = Annotated[Path, typer.Option(help="Folder for the results.")]
 Calfits = Annotated[bool, typer.Option("--calfits", help="Also write the gains as calfits.")]
 ExpectedLoss = Annotated[
     bool, typer.Option("--expected-loss", help="Also write the signal loss that the fit is expected to cause.")
-]
-MaxMemory = Annotated[
-    str | None, typer.Option(metavar="SIZE", help="Memory to use at most, such as '6 GB'; by default what is free.")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Read and check everything, say what would be done, and stop.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of an earlier calibration.")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 from calstudy.base.errors import InputError
@@ -96,28 +95,16 @@ outputs:
 SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: factor, unit: 1 Jy}"
 
 
-@dataclass(frozen=True)
-class DataSet:
-    """Entries of a new file on measured data: path as it is written, a sentence, and the ends of the band.
+def observed_text(name: str, schema: Path, beam: str, in_jansky: bool, searchable: bool, **entries: str) -> str:
+    """Return the text of a file about measured data; see `starter_text`.
 
-    `in_jansky` is true for data in Jy, and `searchable` if they are enough for a search for interference.
+    `beam` is the name of a beam, `in_jansky` is true for data in Jy, and `searchable` for those that are enough for a
+    search for interference. The entries are ``path`` as it is written, ``summary``, a sentence, and ``first`` and
+    ``last``, the ends of the band.
     """
-
-    path: str
-    summary: str
-    first: str
-    last: str
-    in_jansky: bool
-    searchable: bool
-
-
-def observed_text(name: str, schema: Path, data: DataSet, beam: str) -> str:
-    """Return the text of a file about measured data, with the name of a beam; see `starter_text`."""
     _require_name(name)
-    scale = "# " + SCALE if data.in_jansky else SCALE
-    values = {"summary": data.summary, "path": data.path, "first": data.first, "last": data.last}
-    values["search"] = "" if data.searchable else "# "
-    return f"{MODELINE}{schema}\n{OBSERVED.format(name=name, beam=beam, scale=scale, **values)}"
+    optional = {"scale": "# " + SCALE if in_jansky else SCALE, "search": "" if searchable else "# "}
+    return f"{MODELINE}{schema}\n{OBSERVED.format(name=name, beam=beam, **optional, **entries)}"
 
 
 def starter_text(name: str, schema: Path) -> str:

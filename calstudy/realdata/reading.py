@@ -35,8 +35,12 @@ LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e6, 1e12
 EVERYTHING = Selection()
 
 
-def read_visibilities(paths: Sequence[Path]) -> UVData:
-    """Read one data set from a file or folder, or from several that belong together.
+# Readers of eight formats raise any error of their libraries; the user must repair a file that cannot be read.
+UNREADABLE = (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError)
+
+
+def read_visibilities(paths: Sequence[Path], read_data: bool = True) -> UVData:
+    """Read one data set from a file or folder, or from several that belong together; or its metadata alone.
 
     Raises
     ------
@@ -44,39 +48,31 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
         If a path does not exist, pyuvdata cannot read it, or its antennas have no positions.
     """
     _require_readable(paths)
-    names = [str(path) for path in paths]
+    names = ", ".join(map(str, paths))
     keep_compiled_pyuvdata()
+    data = UVData()
     try:
-        data = UVData.from_file(names[0] if len(names) == 1 else names)
-    # Readers of eight formats raise any error of their libraries; the user must repair a file that cannot be read.
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError) as error:
-        raise InputError(f"{', '.join(names)}: cannot be read as visibilities ({_first_sentence(error)})") from None
-    if data.data_array is None:
-        raise InputError(f"{', '.join(names)}: holds no visibilities")
+        data.read(str(paths[0]) if len(paths) == 1 else [str(path) for path in paths], read_data=read_data)
+    except UNREADABLE as error:
+        raise InputError(f"{names}: cannot be read as visibilities ({_first_sentence(error)})") from None
+    if read_data and data.data_array is None:
+        raise InputError(f"{names}: holds no visibilities")
+    # The times of Miriad folders come with the visibilities.
+    if not read_data and data.time_array is None:
+        return read_visibilities(paths)
     if not np.isfinite(data.telescope.antenna_positions).all():
-        raise InputError(f"{', '.join(names)}: antenna positions are not finite")
-    _require_plausible(data, ", ".join(names))
+        raise InputError(f"{names}: antenna positions are not finite")
+    _require_plausible(data, names)
     return data
 
 
 def read_metadata(paths: Sequence[Path]) -> UVData:
     """Read a data set as `read_visibilities` does, but without visibilities where the format allows it."""
-    _require_readable(paths)
-    names = [str(path) for path in paths]
-    data = UVData()
-    keep_compiled_pyuvdata()
     try:
-        data.read(names[0] if len(names) == 1 else names, read_data=False)
-    # As above; a file that cannot be read in parts may be readable as a whole.
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError):
+        return read_visibilities(paths, read_data=False)
+    except InputError:
+        # A file that cannot be read in parts may be readable as a whole.
         return read_visibilities(paths)
-    # The times of Miriad folders come with the visibilities.
-    if data.time_array is None:
-        return read_visibilities(paths)
-    if not np.isfinite(data.telescope.antenna_positions).all():
-        raise InputError(f"{', '.join(names)}: antenna positions are not finite")
-    _require_plausible(data, ", ".join(names))
-    return data
 
 
 def _require_readable(paths: Sequence[Path]) -> None:

@@ -90,15 +90,15 @@ DataFiles = Annotated[
 ]
 
 
-def _can_be_a_range(value: str) -> str:
+def _require_selection(key: str, value: str) -> str:
     try:
-        parse_values({"frequencies": value}, "")
+        parse_values({key: value}, "")
     except InputError as error:
         raise fault("", f"{value!r}: {str(error).partition(': ')[2]}") from None
     return value
 
 
-FrequencyRange = Annotated[str, AfterValidator(_can_be_a_range)]
+FrequencyRange = Annotated[str, AfterValidator(lambda value: _require_selection("frequencies", value))]
 
 
 class Select(Section):
@@ -113,12 +113,7 @@ class Select(Section):
     @field_validator("*")
     @classmethod
     def _can_be_read(cls, value: str | None, info: ValidationInfo) -> str | None:
-        if value is not None:
-            try:
-                parse_values({str(info.field_name): value}, "")
-            except InputError as error:
-                raise fault("", f"{value!r}: {str(error).partition(': ')[2]}") from None
-        return value
+        return value if value is None else _require_selection(str(info.field_name), value)
 
     @property
     def selection(self) -> Selection:
