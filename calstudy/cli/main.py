@@ -217,6 +217,12 @@ def fields(
         typer.echo(plugin_reference(Path(section)) if is_file else section_reference(section), nl=False)
 
 
+@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def check() -> None:
+    """Name what took the place of this command."""
+    raise InputError("check: its checks are figures: calstudy run checks, or --set outputs.figures='[delay-floor]'")
+
+
 @data_app.command()
 def fetch(
     name: Annotated[str, typer.Argument(help="What to fetch: gleam, beam, g4jy or haslam.")],

@@ -95,7 +95,7 @@ def test_a_run_compares_engines_and_shows_the_components_from_one_simulation(tmp
     """What a run has simulated is used, and a difference beyond the tolerance is a warning."""
     engines = {"kind": "engine-agreement", "node_tolerance": 1e-6, "tolerance": 1e-17}
     outputs = {"store": str(tmp_path / "store"), "runs": str(tmp_path), "figures": [engines, "simulated-components"]}
-    study = ExperimentStudy(validate({**SMALL, "outputs": outputs}, tmp_path))
+    study = ExperimentStudy.of(validate({**SMALL, "outputs": outputs}, tmp_path))
     assert [task.label for task in study.tasks if task.stage.name == "simulate"] == [
         "foregrounds",
         "foregrounds",

@@ -11,8 +11,10 @@ from typing import Any, Literal, get_args, get_origin
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, plain
+from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.files import override, validate
 from calstudy.studies.kinds.experiment import ExperimentStudy
+from calstudy.validation.step import Step
 
 BASE: dict[str, Any] = {
     "name": "fields",
@@ -33,6 +35,8 @@ REQUIRED: dict[str, Any] = {
 }
 """What blocks need besides their names, or to have all their fields."""
 OTHER: dict[str, list[Any]] = {
+    "EngineAgreementFigure.against": ["fftvis"],
+    "EngineAgreementFigure.node_tolerance": [1e-6],
     "InstrumentSettings.antenna_beams": [{"set": {"antennas": [0], "beam": "airy"}}],
     "InstrumentSettings.polarizations": [["yy"]],
     "DipoleErrors.dead": [{"set": {"antennas": [0], "x": [1]}}],
@@ -67,8 +71,8 @@ SAME: dict[str, str] = {
     "Experiment.description": "words",
     "Experiment.scales": "are applied before",
     "Experiment.sweep": "makes other experiments of this one",
-    "Outputs.store": "where products go",
-    "Outputs.runs": "where products go",
+    "Folders.store": "where products go",
+    "Folders.runs": "where products go",
     "GainFit.models_at_once": "how much is worked on at a time",
     "PyuvsimEngine.precision": "has one value",
     "MwaEmbeddedBeam.path": "a file, which counts by its content",
@@ -83,12 +87,20 @@ NOT_TRIED = {
     "asks for foregrounds, but": "the variants of the base have foregrounds",
     "asks for noise, but": "the variants of the base have noise",
     "cannot be drawn": "figures of other studies",
+    "asks for 'beam-fit'": "the beam of the base is a formula",
+    "asks for 'delay-floor'": "the bandwidth of the base is too small",
     "weights that stay as they are": "in the other experiment",
     "must be null where foregrounds are fitted": "tried with other calibrators",
 }
 """Blocks that are not tried, by what they are refused with, and why."""
-UNKEYED = {("SimulationSettings", "chunks"), ("GainFit", "models_at_once"), ("ByFile", "salt")}
-"""How results are made; `chunks` is in the keys of the pieces, and a salt finds files that count by their content."""
+UNKEYED = {
+    ("SimulationSettings", "chunks"),
+    ("GainFit", "models_at_once"),
+    ("ByFile", "salt"),
+    (Step.__name__, "scale"),
+}
+"""How results are made; `chunks` is in the keys of the pieces, a salt finds files that count by their content, and the
+scale of a step is in its experiments."""
 
 
 def keys(data: dict[str, Any]) -> set[str]:
@@ -213,6 +225,9 @@ def test_every_field_changes_a_key_or_is_known_not_to():
 
 
 def test_no_other_field_is_left_out_of_keys():
+    # Plug-ins are imported when they are found.
+    for name in CALIBRATORS.built_in():
+        CALIBRATORS.find(name)
     waiting, found = [Section], set()
     while waiting:
         section = waiting.pop()

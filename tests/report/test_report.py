@@ -204,6 +204,8 @@ def test_a_sweep_and_a_collection_lead_to_the_reports_of_their_parts(folder):
     members = {"hex": "hex-12345678", "kept": "kept"}
     for name in members.values():
         (folder.parent / name).mkdir()
+    (folder / "points" / "01-buffer=0ns").mkdir(parents=True)
+    (folder / "points" / "01-buffer=0ns" / "report.html").touch()
     # A reference has no page.
     (folder.parent / "hex-12345678" / "report.html").touch()
     (folder / "manifest.json").write_text(

@@ -16,7 +16,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.claims.folders import evaluate_folder
 from calstudy.claims.run_times import machine_in_words
 from calstudy.products.step_times import Descent, StepTimes
-from calstudy.studies import runtime
+from calstudy.studies.kinds import runtime
 from calstudy.studies.kinds.runtime import RuntimeStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.show import describe_plan, show_plan
