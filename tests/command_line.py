@@ -28,6 +28,12 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 def run_command(capsys, *arguments: object) -> tuple[int, str]:
     """Run ``calstudy ARGUMENTS``; return its exit status and what it wrote to standard error."""
+    status, written = run_and_read(capsys, *arguments)
+    return status, written.err
+
+
+def run_and_read(capsys, *arguments: object):
+    """Run ``calstudy ARGUMENTS``; return its exit status and what it wrote to standard output and error."""
     before = sys.argv
     sys.argv = ["calstudy", *map(str, arguments)]
     try:
@@ -37,4 +43,4 @@ def run_command(capsys, *arguments: object) -> tuple[int, str]:
         status = int(end.code or 0)
     finally:
         sys.argv = before
-    return status, capsys.readouterr().err
+    return status, capsys.readouterr()

@@ -5,7 +5,7 @@
 It has a line for each experiment and stage: how many products there are, a digest of the labels and keys of all of
 them, and their cost in a plan: seconds, the largest memory and the disk, bytes. A change of the code that moves no line
 makes the same products with the same names from the same settings. Run times are left out: they have the machine in
-their keys.
+their keys. So are comparisons with a calibrator whose package is not installed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ HEADING = (
 
 def now() -> dict[tuple[str, str], str]:
     """Return the lines of the table as they are now, by experiment and stage, in the order of the stages."""
+    studies = {name: load_study(Path(name)) for name in experiment_names() if name != "runtime"}
     return {
         (name, stage): _line(tasks)
-        for name in experiment_names()
-        if name != "runtime"
-        for stage, tasks in _by_stage(load_study(Path(name)).tasks).items()
+        for name, study in studies.items()
+        if not any("not installed" in reason for reason in getattr(study, "refusals", {}).values())
+        for stage, tasks in _by_stage(study.tasks).items()
     }
 
 

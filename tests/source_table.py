@@ -25,7 +25,7 @@ import calstudy
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
 from calstudy.experiment.model import Experiment
-from calstudy.measured.settings import InjectionSettings, ObservedSettings
+from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.source import reached
 from calstudy.run.task import Stage
 

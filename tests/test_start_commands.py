@@ -239,4 +239,4 @@ def test_a_file_about_measured_data_is_valid_and_names_their_band(here, capsys, 
     assert [error.message for error in schema.iter_errors(content)] == []
     assert content["observed"]["select"]["frequencies"] == "137.500 MHz..162.403 MHz"
     study = load_study(here / "mine.yaml")
-    assert study.graph.halves.facts["even"].frequencies.size == 256
+    assert study.graph.parts.facts["even"].frequencies.size == 256

@@ -115,6 +115,17 @@ def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = N
     return cal
 
 
+def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return g_a g_b* of baselines (a, b), and where it is flagged, both (Ntimes, len(pairs), Nfreqs, Npols).
+
+    `pairs` are numbers of antennas that are in `cal`, whose convention is "divide".
+    """
+    order = np.argsort(cal.ant_array)
+    first, second = (order[np.searchsorted(cal.ant_array, column, sorter=order)] for column in pairs.T)
+    products = cal.gain_array[first] * cal.gain_array[second].conj()
+    return np.moveaxis(products, 2, 0), np.moveaxis(cal.flag_array[first] | cal.flag_array[second], 2, 0)
+
+
 def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
     """Return the gains of the template's antennas, channels and polarizations.
 

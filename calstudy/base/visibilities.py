@@ -87,6 +87,12 @@ def antenna_pairs(uvd: UVData) -> np.ndarray:
     return np.column_stack([uvd.ant_1_array[: uvd.Nbls], uvd.ant_2_array[: uvd.Nbls]])
 
 
+def rows_of(uvd: UVData, pairs: np.ndarray) -> list[int]:
+    """Return the places of baselines (a, b), (n, 2), among `antenna_pairs`; raise KeyError if one is missing."""
+    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(uvd).tolist())}
+    return [places[tuple(pair)] for pair in pairs.tolist()]
+
+
 def antenna_indices(uvd: UVData) -> np.ndarray:
     """Return `antenna_pairs` as indices into `uvd.telescope.antenna_numbers`, (Nbls, 2)."""
     order = np.argsort(uvd.telescope.antenna_numbers)

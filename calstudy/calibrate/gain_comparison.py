@@ -70,6 +70,12 @@ class GainDifference:
     delay: np.ndarray
     of_delay: np.ndarray
 
+    @property
+    def together(self) -> float:
+        """Rms of the difference of all antennas over that of the second gains."""
+        squares = [np.sum(np.abs(gains) ** 2) for gains in (self.pair.first - self.pair.second, self.pair.second)]
+        return float(np.sqrt(squares[0] / squares[1]))
+
 
 def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
     """Select the gains that two files have in common.

@@ -91,7 +91,7 @@ class Solve:
         return self.status in USABLE
 
     def summary(self) -> dict[str, Any]:
-        """Return all fields but the full loss history, as plain JSON types."""
+        """Return all fields as plain JSON types."""
         losses = self.loss_history
         return {
             "integration": self.integration,
@@ -109,15 +109,12 @@ class Solve:
             "decrement_rms": _number(self.decrement_rms),
             "peak_memory": self.peak_memory,
             **({"diagnostics": dict(self.diagnostics)} if self.diagnostics else {}),
+            "loss_history": [_number(loss) for loss in losses],
         }
-
-    def detail(self) -> dict[str, Any]:
-        """Return the summary with the full loss history."""
-        return {**self.summary(), "loss_history": [_number(loss) for loss in self.loss_history]}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return the record of a summary, with the first and the last loss, or of a detail, with all losses."""
+        """Return the record of a summary; products of earlier versions have only the first and the last loss."""
         fields = dict(content)
         ends = [fields.pop("first_loss"), fields.pop("last_loss")]
         losses = np.array(fields.pop("loss_history", ends), float)

@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from calstudy.calibrate.gain_comparison import GainDifference
 
 NAME = "gain-comparison"
+MOST_NAMES = 40
+"""Largest number of antennas that are named on the axis."""
 
 First = Annotated[Path, typer.Argument(help="Gains, a CalH5 or calfits file.", show_default=False)]
 Second = Annotated[Path, typer.Argument(help="Gains that they are compared with, such as the true ones.")]
@@ -35,7 +39,7 @@ def compare_gains(
     """
     from calstudy.base.gains import at_common_channels, read_gains
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
-    from calstudy.observed.gain_comparison_figure import draw_gain_difference
+    from calstudy.plotting import style
     from calstudy.plotting.save import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
 
@@ -45,7 +49,9 @@ def compare_gains(
     numbers = _numbers(found)
     for name, value in numbers.items():
         typer.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
-    for path in save_figure(draw_gain_difference(found), figure_arrays(found), folder, NAME):
+    with style.journal_style():
+        figure = _draw(found)
+    for path in save_figure(figure, figure_arrays(found), folder, NAME):
         typer.echo(f"{path}")
     path = folder / f"{NAME}.json"
     path.write_text(json.dumps(numbers, indent=1), encoding="utf-8")
@@ -55,13 +61,11 @@ def compare_gains(
 def _numbers(found: GainDifference) -> dict[str, float | int | str]:
     import numpy as np
 
-    from calstudy.observed.gain_comparison_figure import together
-
     worst = int(np.nanargmax(found.of_antenna))
     return {
         "antennas": int(np.isfinite(found.of_antenna).sum()),
         "channels": int(np.isfinite(found.of_channel).sum()),
-        "difference": together(found),
+        "difference": found.together,
         "difference as given": found.as_given,
         "median over antennas": float(np.nanmedian(found.of_antenna)),
         "worst antenna": str(found.pair.antennas[worst]),
@@ -71,3 +75,28 @@ def _numbers(found: GainDifference) -> dict[str, float | int | str]:
         "worst delay [ns]": float(1e9 * found.delay[np.argmax(found.of_delay)]),
         "difference at the worst delay": float(found.of_delay.max()),
     }
+
+
+def _draw(found: GainDifference) -> Figure:
+    """Draw the relative difference by antenna, by channel and by delay, on logarithmic axes."""
+    import numpy as np
+
+    from calstudy.plotting import style
+
+    figure = style.new_figure(style.TWO_COLUMNS, 2.4)
+    by_antenna, by_channel, by_delay = figure.subplots(1, 3)
+    place = np.arange(found.of_antenna.size)
+    by_antenna.plot(place, found.of_antenna, "o", color=style.BLUE)
+    if place.size <= MOST_NAMES:
+        by_antenna.set_xticks(place, found.pair.antennas, rotation=90, fontsize=style.NOTE_SIZE)
+    by_antenna.set_xlabel("antenna")
+    by_antenna.set_ylabel("rms difference / rms")
+    by_channel.plot(found.pair.frequency / 1e6, found.of_channel, color=style.BLUE)
+    by_channel.set_xlabel(style.FREQUENCY)
+    by_delay.plot(1e9 * found.delay, found.of_delay, color=style.BLUE)
+    by_delay.set_xlabel(style.DELAY)
+    for axes in (by_antenna, by_channel, by_delay):
+        if np.nanmax(axes.lines[0].get_ydata()) > 0:
+            axes.set_yscale("log")
+    by_channel.set_title(f"feed {found.pair.polarization}; together {found.together:.3g}")
+    return figure

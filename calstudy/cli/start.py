@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-
-if TYPE_CHECKING:
-    from calstudy.experiment.starter import DataSet
 
 Name = Annotated[str, typer.Argument(help="Of the experiment; the file is NAME.yaml.")]
 Example = Annotated[
@@ -60,7 +57,7 @@ def init(name: Name = "my-study", example: Example = None, data: Data = None, be
     if example is not None and data is not None:
         raise InputError("--example and --data: choose one")
     if data is not None:
-        text = observed_text(name, schema_file, _described(data), beam)
+        text = observed_text(name, schema_file, beam, **_described(data))
     else:
         text = starter_text(name, schema_file) if example is None else copy_text(example, name, schema_file)
     if path.exists():
@@ -69,26 +66,28 @@ def init(name: Name = "my-study", example: Example = None, data: Data = None, be
     typer.echo(f"{path}: next, `calstudy plan {path}`")
 
 
-def _described(data: str) -> DataSet:
-    """Return the section of a file on measured data, after a look at their metadata."""
-    from calstudy.experiment.starter import DataSet
-    from calstudy.measured.halves import read_facts
-    from calstudy.measured.selection import Selection
-    from calstudy.measured.settings import find_data
+def _described(data: str) -> dict[str, Any]:
+    """Return entries of a file on measured data, after a look at their metadata."""
+    from calstudy.realdata.halves import read_facts
+    from calstudy.realdata.interference import has_surroundings
+    from calstudy.realdata.selection import Selection
+    from calstudy.realdata.settings import find_data
 
     try:
         facts = read_facts((find_data(data, Path()),), Selection(), even=False)
     except InputError as error:
         raise InputError(f"--data: {error}") from None
     first, last = math.floor(facts.frequencies[0] / 1e3), math.ceil(facts.frequencies[-1] / 1e3)
-    return DataSet(
-        path=data,
-        summary=f"{facts.antennas} antennas, {facts.frequencies.size} channels between {first / 1e3:.3f} and "
-        f"{last / 1e3:.3f} MHz, {facts.times.size} integrations, in {facts.unit!r}.",
-        first=f"{first / 1e3:.3f} MHz",
-        last=f"{last / 1e3:.3f} MHz",
-        in_jansky=facts.unit.lower() == "jy",
-    )
+    return {
+        "path": data,
+        "summary": f"{facts.antennas} antennas with baselines of up to {facts.frame.lengths.max():.0f} m, "
+        f"{facts.frequencies.size} channels between {first / 1e3:.3f} and {last / 1e3:.3f} MHz, {facts.times.size} "
+        f"integrations, in {facts.unit!r}.",
+        "first": f"{first / 1e3:.3f} MHz",
+        "last": f"{last / 1e3:.3f} MHz",
+        "in_jansky": facts.unit.lower() == "jy",
+        "searchable": has_surroundings(facts.times.size, facts.frequencies.size),
+    }
 
 
 def schema(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 from calstudy.base.errors import InputError
@@ -71,7 +70,8 @@ observed:
   select:
     frequencies: {first}..{last}                          # leave out edges and interference
     # antennas: 0,1,12                                    # lengths, times and polarizations likewise
-  # flag: [149.7 MHz..150.2 MHz]                          # channels of interference inside the band
+  # flag: [149.7 MHz..150.2 MHz]                          # channels of known interference inside the band
+  {search}flag_interference: true                               # what stands out in time and frequency
   # positions: antennas.csv                               # number, east_m, north_m, up_m, in place of the file's
   # sky_model: model.uvh5                                 # visibilities in Jy, if there are any
   beam: {beam}
@@ -95,26 +95,16 @@ outputs:
 SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: factor, unit: 1 Jy}"
 
 
-@dataclass(frozen=True)
-class DataSet:
-    """Entries of a new file on measured data: path as it is written, a sentence, and the ends of the band.
+def observed_text(name: str, schema: Path, beam: str, in_jansky: bool, searchable: bool, **entries: str) -> str:
+    """Return the text of a file about measured data; see `starter_text`.
 
-    `in_jansky` is true for data in Jy.
+    `beam` is the name of a beam, `in_jansky` is true for data in Jy, and `searchable` for those that are enough for a
+    search for interference. The entries are ``path`` as it is written, ``summary``, a sentence, and ``first`` and
+    ``last``, the ends of the band.
     """
-
-    path: str
-    summary: str
-    first: str
-    last: str
-    in_jansky: bool
-
-
-def observed_text(name: str, schema: Path, data: DataSet, beam: str) -> str:
-    """Return the text of a file about measured data, with the name of a beam; see `starter_text`."""
     _require_name(name)
-    scale = "# " + SCALE if data.in_jansky else SCALE
-    values = {"summary": data.summary, "path": data.path, "first": data.first, "last": data.last}
-    return f"{MODELINE}{schema}\n{OBSERVED.format(name=name, beam=beam, scale=scale, **values)}"
+    optional = {"scale": "# " + SCALE if in_jansky else SCALE, "search": "" if searchable else "# "}
+    return f"{MODELINE}{schema}\n{OBSERVED.format(name=name, beam=beam, **optional, **entries)}"
 
 
 def starter_text(name: str, schema: Path) -> str:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from calstudy.products.comparison import Case
     from calstudy.products.graph import Graph
-    from calstudy.products.observed import ObservedGraph
+    from calstudy.products.observed import DataGraph
 
 
 TWO_ARRAYS = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
@@ -244,7 +244,7 @@ DRAW = Stage(name="figure", version=4, make=draw, cost=lambda task: Cost(3, disk
 
 def figure_task(
     figure: StudyFigure,
-    members: Mapping[str, Graph | ObservedGraph],
+    members: Mapping[str, Graph | DataGraph],
     stand_ins: Sequence[str],
     settings: Mapping[str, Any] | None = None,
 ) -> Task:

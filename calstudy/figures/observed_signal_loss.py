@@ -14,7 +14,8 @@ from calstudy.plotting import style
 from calstudy.products.expected_loss import EXPECTED
 from calstudy.products.files import spectrum_file
 from calstudy.products.graph import required
-from calstudy.products.observed_injection import expected, transfer
+from calstudy.products.observed_injection import transfer
+from calstudy.products.observed_quality import expected
 from calstudy.products.signal_loss import TRANSFER as FILE
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half

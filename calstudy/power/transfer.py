@@ -51,7 +51,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -159,6 +159,16 @@ class Injection:
                     f"the {name} has {getattr(self, name).power.shape} units and delays, expected those of the signal, "
                     f"{self.signal.power.shape}"
                 )
+
+
+def known_within(found: TransferFunction, largest_error: float) -> TransferFunction:
+    """Return a transfer function in which bins whose T has a larger error hold NaN, but for the signal."""
+    names = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence")
+    unknown = found.transfer_error > largest_error
+    changes: dict[str, Any] = {
+        name: np.where(unknown, np.nan, getattr(found, name)) for stem in names for name in (stem, f"{stem}_error")
+    }
+    return replace(found, **changes)
 
 
 def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:

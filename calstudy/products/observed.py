@@ -1,21 +1,21 @@
-"""Measured data: two halves, their calibration and averages, and delay power spectra."""
+"""Measured data: the parts that are read, their calibration, and averages and delay power spectra of the halves."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import GainFit
-from calstudy.measured.settings import Factor, FromAutocorrelations, InjectionSettings, ObservedSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.products.calibration import calibration_of
-from calstudy.products.corruption import LEVELS, PARITIES
+from calstudy.products.corruption import LEVELS
 from calstudy.products.files import (
     AVERAGE,
     DATA,
+    GAINS,
     MODEL,
     RESIDUAL,
     VISIBILITIES,
@@ -25,13 +25,23 @@ from calstudy.products.files import (
 )
 from calstudy.products.graph import Memory, once, size_of
 from calstudy.products.spectra import NOT_OF_DELAY_SPECTRA, POWER, blocks_in, blocks_of
+from calstudy.realdata.halves import PARITIES, WHOLE, Parts
+from calstudy.realdata.settings import (
+    DataSettings,
+    Factor,
+    FromAutocorrelations,
+    InjectionSettings,
+    ObservedSettings,
+)
 from calstudy.run.task import Job, Stage, Task
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
     from pyuvdata import UVData
 
-    from calstudy.measured.halves import Halves
+    from calstudy.realdata.selection import Selection
 
 NOISE = "noise.uvh5"
 """Sigma of an average's noise from the autocorrelations."""
@@ -41,7 +51,15 @@ SOURCES = ("difference", "autos")
 """Sources of the noise level: the difference of the halves, the autocorrelations."""
 
 
-class ObservedGraph(Memory):
+class DataGraph(Memory):
+    """The tasks that read and calibrate measured data, from the sections of a file and the parts of the data."""
+
+    def __init__(self, observed: DataSettings, calibration: Calibrator, parts: Parts) -> None:
+        super().__init__()
+        self.observed, self.calibration, self.parts = observed, calibration, parts
+
+
+class ObservedGraph(DataGraph):
     """The tasks of one study of measured data, from the sections of its file and the two halves of the data.
 
     There is no injection if `injection` is None.
@@ -53,30 +71,35 @@ class ObservedGraph(Memory):
         calibration: Calibrator,
         power: PowerSettings,
         injection: InjectionSettings | None,
-        halves: Halves,
+        parts: Parts,
     ) -> None:
-        super().__init__()
-        self.observed, self.calibration, self.power = observed, calibration, power
-        self.injection, self.halves = injection, halves
+        super().__init__(observed, calibration, parts)
+        self.observed: ObservedSettings = observed
+        self.power, self.injection = power, injection
 
     @property
     def beam_settings(self) -> dict[str, Any]:
         """Beam and channels."""
-        return {"beam": self.observed.beam, "channels": self.halves.facts["even"].channels}
+        return {"beam": self.observed.beam, "channels": self.parts.facts["even"].channels}
 
 
 @once
-def observed(graph: ObservedGraph, parity: str) -> Task:
-    """Return the task of one half of the data, in Jy, and of the sky model at the same samples."""
-    section, halves = graph.observed, graph.halves
-    files = section.odd if parity == "odd" and not halves.interleaved else section.data
-    size = halves.facts[parity].size(len(halves.times(parity)))
+def observed(graph: DataGraph, part: str) -> Task:
+    """Return the task of one part of the data, and of the sky model at the same samples.
+
+    A half is in Jy, with the names of feeds that power spectra need; the whole has its own unit and names.
+    """
+    section, parts = graph.observed, graph.parts
+    odd = section.odd if isinstance(section, ObservedSettings) and part == "odd" else ()
+    size = parts.facts[part].size(len(parts.times(part)))
     settings: dict[str, Any] = {
-        "files": list(files),
+        "files": list(odd or section.data),
         "select": section.select,
         "size": {name: getattr(size, name) for name in size.__dataclass_fields__},
-        "parity": parity if halves.interleaved else None,
+        "parity": part if parts.interleaved else None,
     }
+    if part == WHOLE:
+        settings["as_given"] = True
     if section.flag:
         settings["flag"] = list(section.flag)
     if section.flag_interference is not None:
@@ -86,16 +109,16 @@ def observed(graph: ObservedGraph, parity: str) -> Task:
     if section.sky_model is not None:
         autos = isinstance(graph.calibration, GainFit) and graph.calibration.autos
         settings |= {"sky_model": section.sky_model, "autos": autos}
-    if section.flux_scale is not None:
+    if isinstance(section, ObservedSettings) and section.flux_scale is not None:
         settings["flux_scale"] = section.flux_scale
         if isinstance(section.flux_scale, FromAutocorrelations):
             settings["beam"] = section.beam
-    return Task(OBSERVE, f"data {parity}", settings)
+    return Task(OBSERVE, f"data {part}", settings)
 
 
-def calibration_inputs(graph: ObservedGraph, data: Task, parity: str) -> dict[str, Task]:
-    """Return the inputs of a calibration of data of one half."""
-    inputs, source = {"data": data}, observed(graph, parity)
+def calibration_inputs(graph: DataGraph, data: Task, part: str) -> dict[str, Task]:
+    """Return the inputs of a calibration of data of one part."""
+    inputs, source = {"data": data}, observed(graph, part)
     if graph.observed.sky_model is not None:
         inputs["sky_model"] = source
     if graph.calibration.needs_noise:
@@ -104,17 +127,17 @@ def calibration_inputs(graph: ObservedGraph, data: Task, parity: str) -> dict[st
 
 
 @once
-def calibrated(graph: ObservedGraph, parity: str) -> Task:
-    """Return the task of the calibration of one half."""
-    data = observed(graph, parity)
-    return calibration_of(graph.calibration.with_defaults("assumed"), calibration_inputs(graph, data, parity))
+def calibrated(graph: DataGraph, part: str) -> Task:
+    """Return the task of the calibration of one part."""
+    data = observed(graph, part)
+    return calibration_of(graph.calibration.with_defaults("assumed"), calibration_inputs(graph, data, part))
 
 
 @once
 def average(graph: ObservedGraph, what: str, parity: str) -> Task:
     """Return the task of the fringe-stopped average of one half; `what` is one of `WHAT`."""
     inputs = {"data": observed(graph, parity), "calibration": calibrated(graph, parity)}
-    return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, **graph.halves.averaging(graph.power)}, inputs)
+    return Task(OBSERVED_AVERAGE, f"{what} {parity}", {"what": what, **graph.parts.averaging(graph.power)}, inputs)
 
 
 def crossed(graph: ObservedGraph, label: str, even: Task, odd: Task, power: PowerSettings | None = None) -> Task:
@@ -140,45 +163,65 @@ def noise_power(graph: ObservedGraph, what: str, source: str) -> Task:
 
 
 def observe(job: Job) -> Mapping[str, Any]:
-    """Write the data of one half to data.uvh5, and the sky model to visibilities.uvh5."""
-    from calstudy.calibrate.sky_model import common_baselines
-    from calstudy.measured.halves import east_and_north, flag_channels, interleaved
-    from calstudy.measured.interference import flag_interference
-    from calstudy.measured.positions import place_antennas
-    from calstudy.measured.reading import prepare, read_visibilities
-    from calstudy.measured.selection import Selection
+    """Write the data of one part to data.uvh5, and the sky model to visibilities.uvh5."""
+    from calstudy.realdata.noise import sample_noise
 
-    settings, placed = job.settings, []
-    data = read_visibilities(settings["files"])
-    if "positions" in settings:
-        placed = [place_antennas(data, settings["positions"])]
-    try:
-        data, notes = prepare(data, settings["select"].selection)
-    except InputError as error:
-        raise InputError(str(error).replace("--select ", "observed.select.")) from None
-    notes = placed + notes + east_and_north(data)
-    for text in settings.get("flag", ()):
-        flag_channels(data, text)
+    data, sky, notes = read_part(job.settings)
+    factor, as_given = _factor(job, data), "as_given" in job.settings
+    data.data_array = data.data_array.astype(complex) * factor
+    for name, uvd in ((DATA, data), (VISIBILITIES, sky)):
+        if uvd is not None:
+            uvd.vis_units = uvd.vis_units if as_given else "Jy"
+            write_visibilities(uvd, job.output / name)
+    noise = sample_noise(data)
+    if noise is not None:
+        write_json(job.output / LEVELS, {"noise_std": noise})
+    flagged = float(data.flag_array.mean())
+    return {"integrations": int(data.Ntimes), "jansky_per_unit": factor, "flagged_fraction": flagged, "changes": notes}
+
+
+def read_part(settings: Mapping[str, Any]) -> tuple[UVData, UVData | None, list[str]]:
+    """Return one part of the data, in their own unit, the sky model or None, and sentences on the changes of both.
+
+    The settings are those of the task `observed`; raises InputError if the data or the model cannot be used.
+    """
+    from calstudy.calibrate.sky_model import common_baselines
+    from calstudy.realdata.halves import interleaved
+    from calstudy.realdata.interference import flag_interference
+    from calstudy.realdata.selection import Selection
+
+    selection = settings["select"].selection
+    data, notes = _read(settings, settings["files"], selection)
     if "interference" in settings:
         notes.append(flag_interference(data, settings["interference"]))
     sky = None
     if "sky_model" in settings:
-        sky, sky_notes = prepare(read_visibilities([settings["sky_model"]]), Selection())
-        sky_notes += east_and_north(sky)
+        alone = {name: settings[name] for name in ("as_given",) if name in settings}
+        sky, sky_notes = _read(alone, [settings["sky_model"]], Selection(polarizations=selection.polarizations))
         sky, data, left_out = common_baselines(sky, data, settings["autos"])
         notes += [f"Sky model: {note}" for note in sky_notes] + left_out
     if settings["parity"] is not None:
         data, sky = (uvd and interleaved(uvd, settings["parity"]) for uvd in (data, sky))
-    factor = _factor(job, data)
-    data.data_array = data.data_array.astype(complex) * factor
-    data.vis_units = "Jy"
-    write_visibilities(data, job.output / DATA)
-    if sky is not None:
-        sky.vis_units = "Jy"
-        write_visibilities(sky, job.output / VISIBILITIES)
-    _write_level(job, data)
-    flagged = float(data.flag_array.mean())
-    return {"integrations": int(data.Ntimes), "jansky_per_unit": factor, "flagged_fraction": flagged, "changes": notes}
+    return data, sky, notes
+
+
+def _read(settings: Mapping[str, Any], files: Sequence[Path], selection: Selection) -> tuple[UVData, list[str]]:
+    """Return files of visibilities as calibration needs them, and sentences on what was changed."""
+    from calstudy.realdata.halves import east_and_north, flag_channels
+    from calstudy.realdata.reading import place_antennas, prepare, read_visibilities
+
+    data, placed = read_visibilities(files), []
+    if "positions" in settings:
+        placed = [place_antennas(data, settings["positions"])]
+    try:
+        data, notes = prepare(data, selection)
+    except InputError as error:
+        raise InputError(str(error).replace("--select ", "observed.select.")) from None
+    if "as_given" not in settings:
+        notes += east_and_north(data)
+    for text in settings.get("flag", ()):
+        flag_channels(data, text)
+    return data, placed + notes
 
 
 def _factor(job: Job, data: UVData) -> float:
@@ -209,37 +252,28 @@ def _factor(job: Job, data: UVData) -> float:
     return float(found)
 
 
-def _write_level(job: Job, data: UVData) -> None:
-    """Write the rms of the noise for calibrators that need it, if the autocorrelations give it."""
-    from calstudy.measured.noise import sample_noise
-
-    noise = sample_noise(data)
-    if noise is not None:
-        write_json(job.output / LEVELS, {"noise_std": noise})
-
-
 def make_average(job: Job) -> Mapping[str, Any]:
     """Write the average of one half to average.uvh5, and sigma of its noise to noise.uvh5 if there are autos.
 
     All averages have the samples, flags and baselines of the residual.
     """
     import numpy as np
+    from pyuvdata import UVCal
 
-    from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, to_cube
-    from calstudy.measured.noise import noise_of_average
+    from calstudy.base.gains import gain_products
+    from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, rows_of, to_cube
     from calstudy.power.average import average_in_blocks
+    from calstudy.realdata.noise import noise_of_average
 
     what, folder = job.settings["what"], job.inputs["calibration"]
     residual, data = read_visibilities(folder / RESIDUAL), read_visibilities(job.inputs["data"] / DATA)
     pairs = antenna_pairs(residual)
     crosses = pairs[:, 0] != pairs[:, 1]
-    residual = residual.select(blt_inds=_rows(residual, crosses), inplace=False, run_check=False)
-    pairs = pairs[crosses]
-    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(data).tolist())}
+    pairs, residual = pairs[crosses], crosses_of(residual)
     if what == "residual":
         cube = to_cube(residual)
     elif what == "data":
-        cube = to_cube(data)[:, [places[tuple(pair)] for pair in pairs.tolist()]]
+        cube = to_cube(data)[:, rows_of(data, pairs)]
     else:
         cube = to_cube(residual) + to_cube(read_visibilities(folder / MODEL))[:, crosses]
     found = from_cube(residual, np.where(flag_cube(residual), 0, cube))
@@ -250,7 +284,8 @@ def make_average(job: Job) -> Mapping[str, Any]:
     if variance is None:
         return {}
     if what != "data":
-        variance = variance / _products(job, pairs)
+        products, unsolved = gain_products(UVCal.from_file(folder / GAINS), pairs)
+        variance = variance / np.where(unsolved, np.nan, np.abs(products) ** 2)
     sigma = np.concatenate([noise_of_average(variance, found, block.times) for block in blocks])
     noise = averaged.copy()
     noise.data_array = np.nan_to_num(sigma).astype(complex)
@@ -259,42 +294,30 @@ def make_average(job: Job) -> Mapping[str, Any]:
     return {}
 
 
-def _rows(data: UVData, chosen: np.ndarray) -> np.ndarray:
+def crosses_of(data: UVData) -> UVData:
+    """Return the cross-correlations of rectangular, time-major data."""
     import numpy as np
 
-    return np.flatnonzero(np.tile(chosen, data.Ntimes))
+    crosses = np.flatnonzero(data.ant_1_array != data.ant_2_array)
+    return data.select(blt_inds=crosses, inplace=False, run_check=False)
 
 
 def _variances(data: UVData, pairs: np.ndarray) -> np.ndarray | None:
     """Return sigma^2 of all samples from the autocorrelations, (Ntimes, Nbls, Nfreqs, Npols), or None without them."""
     import numpy as np
 
-    from calstudy.measured.noise import radiometer_variance
+    from calstudy.realdata.noise import radiometer_variance
 
     found = [radiometer_variance(data, pairs, polarization) for polarization in range(data.Npols)]
     known = [variance for variance in found if variance is not None]
     return np.stack(known, axis=-1) if len(known) == len(found) else None
 
 
-def _products(job: Job, pairs: np.ndarray) -> np.ndarray:
-    """Return |g_a g_b*|^2, (Ntimes, Nbls, Nfreqs, Npols), NaN where there is no solution."""
-    import numpy as np
-    from pyuvdata import UVCal
-
-    from calstudy.products.files import GAINS
-
-    gains = UVCal.from_file(job.inputs["calibration"] / GAINS)
-    order = np.argsort(gains.ant_array)
-    first, second = (order[np.searchsorted(gains.ant_array, column, sorter=order)] for column in pairs.T)
-    power = np.where(gains.flag_array, np.nan, np.abs(gains.gain_array) ** 2)
-    return np.moveaxis(power[first] * power[second], 2, 0)
-
-
 def make_noise(job: Job) -> Mapping[str, Any]:
     """Write visibilities whose power is that of the noise of even x odd to average.uvh5."""
     import numpy as np
 
-    from calstudy.measured.noise import half_difference
+    from calstudy.realdata.noise import half_difference
 
     if job.settings["source"] == "difference":
         noise = half_difference(*(read_visibilities(job.inputs[parity] / AVERAGE) for parity in PARITIES))

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.calibrate.settings import GainFit
 from calstudy.products import signal_loss
 from calstudy.products.calibration import calibration_of
-from calstudy.products.corruption import LEVELS, PARITIES
-from calstudy.products.expected_loss import EXPECTED, PROBES, binned
+from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
     AVERAGE,
     DATA,
@@ -32,9 +30,10 @@ from calstudy.products.observed import (
     calibrated,
     calibration_inputs,
     crossed,
+    crosses_of,
     observed,
 )
-from calstudy.products.observed_quality import read_result
+from calstudy.products.observed_quality import expected
 from calstudy.products.observed_spectra import observed_spectra
 from calstudy.products.signal_loss import DIFFERENCE
 from calstudy.products.spectra import EXCISION, blocks_of, read_delay_spectra
@@ -42,10 +41,11 @@ from calstudy.run.task import Job, Stage, Task
 from calstudy.simulate.interface import SimulationSize
 
 if TYPE_CHECKING:
-    import numpy as np
     from pyuvdata import UVData
 
 FACTOR = "factor.json"
+LARGEST_ERROR = 0.5
+"""Standard deviation of a T that is measured: T is a fraction, and 95 % intervals of larger ones hold all of 0 to 1."""
 
 
 @once
@@ -98,7 +98,7 @@ def response(graph: ObservedGraph, parity: str) -> Task:
 def signal(graph: ObservedGraph, parity: str) -> Task:
     """Return the task of the averaged EoR of one half, as added but without the gains."""
     inputs = {"eor": eor(graph, parity), "factor": factor(graph), "calibration": calibrated(graph, parity)}
-    return Task(AVERAGE_EOR, f"eor {parity}", graph.halves.averaging(graph.power), inputs)
+    return Task(AVERAGE_EOR, f"eor {parity}", graph.parts.averaging(graph.power), inputs)
 
 
 @once
@@ -114,21 +114,6 @@ def transfer(graph: ObservedGraph) -> Task | None:
         "spectra": observed_spectra(graph),
     }
     return Task(OBSERVED_TRANSFER, "signal loss", {"power": graph.power}, inputs)
-
-
-@once
-def expected(graph: ObservedGraph) -> Task | None:
-    """Return the task of the T that the fit itself predicts, or None if it is not a least-squares fit."""
-    if not isinstance(graph.calibration, GainFit):
-        return None
-    inputs = {"data": observed(graph, "even"), "calibration": calibrated(graph, "even")}
-    settings = {
-        "calibration": graph.calibration.with_defaults("assumed"),
-        "power": graph.power.with_defaults("pairs", "redundancy_tolerance", "coherent_time"),
-        "sky_model": graph.observed.sky_model is not None,
-        "probes": PROBES,
-    }
-    return Task(EXPECT, "expected signal loss", settings, inputs)
 
 
 def injection_tables(graph: ObservedGraph) -> list[Task]:
@@ -150,9 +135,7 @@ def simulate_eor(job: Job) -> Mapping[str, Any]:
 
     settings = job.settings
     data = read_visibilities(job.inputs["data"] / DATA)
-    pairs = antenna_pairs(data)
-    crosses = np.flatnonzero(np.tile(pairs[:, 0] != pairs[:, 1], data.Ntimes))
-    data = data.select(blt_inds=crosses, inplace=False, run_check=False)
+    data = crosses_of(data)
     template = subset_template(data, np.unique(data.time_array), np.asarray(data.freq_array, float))
     if not np.array_equal(antenna_pairs(template), antenna_pairs(data)):
         raise ValueError("the template of the simulation has other baselines than the data")
@@ -189,18 +172,13 @@ def inject(job: Job) -> Mapping[str, Any]:
     import numpy as np
     from pyuvdata import UVCal
 
-    from calstudy.base.visibilities import antenna_pairs, to_cube
+    from calstudy.base.gains import gain_products
+    from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 
     data, sky = read_visibilities(job.inputs["data"] / DATA), _signal(job)
-    gains = UVCal.from_file(job.inputs["calibration"] / GAINS)
-    order = np.argsort(gains.ant_array)
     pairs = antenna_pairs(sky)
-    first, second = (order[np.searchsorted(gains.ant_array, column, sorter=order)] for column in pairs.T)
-    solved = np.where(gains.flag_array, 0, gains.gain_array)
-    products = np.moveaxis(solved[first] * solved[second].conj(), 2, 0)
-    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(data).tolist())}
-    rows = [places[tuple(pair)] for pair in pairs.tolist()]
-    to_cube(data)[:, rows] += products * to_cube(sky)
+    products, unsolved = gain_products(UVCal.from_file(job.inputs["calibration"] / GAINS), pairs)
+    to_cube(data)[:, rows_of(data, pairs)] += np.where(unsolved, 0, products) * to_cube(sky)
     write_visibilities(data, job.output / DATA)
     return {}
 
@@ -214,17 +192,11 @@ def _signal(job: Job) -> UVData:
 
 def average_eor(job: Job) -> Mapping[str, Any]:
     """Write the average of the EoR to average.uvh5, with the baselines and flags of the residual."""
-    from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
+    from calstudy.base.visibilities import antenna_pairs, from_cube, rows_of, to_cube
     from calstudy.power.average import average_in_blocks
 
-    residual, sky = read_visibilities(job.inputs["calibration"] / RESIDUAL), _signal(job)
-    pairs = antenna_pairs(residual)
-    crosses = [row for row, (a, b) in enumerate(pairs.tolist()) if a != b]
-    rows = [time * residual.Nbls + row for time in range(residual.Ntimes) for row in crosses]
-    residual = residual.select(blt_inds=rows, inplace=False, run_check=False)
-    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(sky).tolist())}
-    cube = to_cube(sky)[:, [places[tuple(pair)] for pair in antenna_pairs(residual).tolist()]]
-    signal = from_cube(residual, cube)
+    residual, sky = crosses_of(read_visibilities(job.inputs["calibration"] / RESIDUAL)), _signal(job)
+    signal = from_cube(residual, to_cube(sky)[:, rows_of(sky, antenna_pairs(residual))])
     write_visibilities(average_in_blocks(signal, blocks_of(job, signal)), job.output / AVERAGE)
     return {}
 
@@ -240,7 +212,7 @@ def measure(job: Job) -> Mapping[str, Any]:
     settings = job.settings["power"]
     delays = {name: read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
     # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
-    summary = signal_loss.write_transfer(job.output, Injection(**delays), settings, 1.0)
+    summary = signal_loss.write_transfer(job.output, Injection(**delays), settings, 1.0, LARGEST_ERROR)
     signals = {}
     for modes, excise in EXCISION.items():
         spectrum = spherical_average(delays["signal"], settings, excise)
@@ -249,30 +221,22 @@ def measure(job: Job) -> Mapping[str, Any]:
         write_csv(job.output / f"eor.{modes}.csv", signals[modes])
     residual = load_spectrum(job.inputs["spectra"] / spectrum_file("residual", "outside-wedge"), SphericalSpectrum)
     signal_loss.write_corrected(job.output, residual, signals["outside-wedge"])
-    return {"transfer": summary}
+    return {"transfer": summary, "warnings": _not_measured(summary)}
 
 
-def expect(job: Job) -> Mapping[str, Any]:
-    """Write the expected T of the middle integration of the even half, in bins of k and of length and delay."""
-    import numpy as np
-
-    from calstudy.base.observation import Observation
-    from calstudy.base.visibilities import baseline_vectors
-    from calstudy.calibrate.interface import Assumed
-    from calstudy.measured.expectation import expect as expect_of
-    from calstudy.power.tables import save_spectrum
-
-    folder, settings, power = job.inputs["data"], job.settings["calibration"], job.settings["power"]
-    data, result = read_visibilities(folder / DATA), read_result(job.inputs["calibration"])
-    sky = Observation(read_visibilities(folder / VISIBILITIES)) if job.settings["sky_model"] else None
-    noise = read_json(folder / LEVELS)["noise_std"] if settings.needs_noise else None
-    found = expect_of(data, settings, result, Assumed(sky, noise=noise), taper=power.taper)
-    if found is None:
-        raise InputError("expected-loss: no solve of the calibration gave gains")
-    lengths: np.ndarray = np.linalg.norm(baseline_vectors(result.model), axis=1)
-    centre = float(np.mean(data.freq_array))
-    save_spectrum(job.output / EXPECTED, binned(found, np.resize(lengths, len(found.transfer)), centre, power))
-    return {"probes": job.settings["probes"]}
+def _not_measured(summary: Mapping[str, Any]) -> list[str]:
+    """Return a sentence that names the bands outside the wedge in which T is not measured; none without any."""
+    unknown = [band for band in summary["outside-wedge"] if band["transfer"] is None and band["error"] is not None]
+    if not unknown:
+        return []
+    named = ", ".join(
+        f"{low:g} to {high:g} (error {band['error']:.2g})" for band in unknown for low, high in [band["k"]]
+    )
+    return [
+        f"T is not measured at k of {named} h/Mpc: an error above {LARGEST_ERROR:g} leaves open all that T can be; "
+        "interference that is not flagged (observed.flag_interference: true), few integrations or a weak "
+        "injection.level are the usual reasons"
+    ]
 
 
 def _cost_of_eor(task: Task) -> Cost:
@@ -298,14 +262,8 @@ def _cost_of_average(task: Task) -> Cost:
     return Cost(2, LIBRARIES_MEMORY + 8 * size.samples * COMPLEX128, disk)
 
 
-def _cost_of_expectation(task: Task) -> Cost:
-    samples = size_of(task).samples
-    return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * samples * COMPLEX128, 1e6)
-
-
 SIMULATE_EOR = Stage(name="observed-eor", version=3, make=simulate_eor, cost=_cost_of_eor)
 SET_LEVEL = Stage(name="observed-level", version=1, make=set_level, cost=_cost_of_average)
 INJECT = Stage(name="inject", version=1, make=inject, cost=_cost_of_data)
 AVERAGE_EOR = Stage(name="observed-eor-average", version=1, make=average_eor, cost=_cost_of_average)
-OBSERVED_TRANSFER = Stage(name="observed-transfer", version=2, make=measure, cost=lambda task: Cost(4, disk=1e6))
-EXPECT = Stage(name="observed-expected-loss", version=2, make=expect, cost=_cost_of_expectation)
+OBSERVED_TRANSFER = Stage(name="observed-transfer", version=3, make=measure, cost=lambda task: Cost(4, disk=1e6))

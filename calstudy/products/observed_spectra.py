@@ -26,7 +26,7 @@ NOISE_SUMMARY = "noise.json"
 def observed_spectra(graph: ObservedGraph) -> Task:
     """Return the task of the averaged spectra of all data in `WHAT`, and of the noise."""
     inputs = {what: power_of(graph, what) for what in WHAT}
-    sources = SOURCES if all(facts.autos for facts in graph.halves.facts.values()) else SOURCES[:1]
+    sources = SOURCES if graph.parts.autos else SOURCES[:1]
     for what in ("data", "residual"):
         inputs |= {f"noise of {what} from {source}": noise_power(graph, what, source) for source in sources}
     return Task(OBSERVED_SPECTRA, "wedge and spherical", {"power": graph.power}, inputs)
@@ -71,7 +71,7 @@ def _levels(delays: Mapping[str, DelaySpectra], what: str, source: str, buffer: 
     """Return P_N of each baseline, or None if it is not known from this source."""
     import numpy as np
 
-    from calstudy.measured.noise import noise_of_baselines
+    from calstudy.realdata.noise import noise_of_baselines
 
     name = f"noise of {what} from {source}"
     if name not in delays:
@@ -85,10 +85,10 @@ def _write_spherical(
 ) -> None:
     from dataclasses import replace
 
-    from calstudy.measured.noise import noise_of_units
     from calstudy.power.errors import noise_error, with_errors
     from calstudy.power.spherical import modes_in_bins, spherical_average
     from calstudy.power.tables import save_spectrum, write_csv
+    from calstudy.realdata.noise import noise_of_units
 
     settings, spectra = job.settings["power"], delays[what]
     of_units = noise_of_units(spectra, delays[noise_name], level)

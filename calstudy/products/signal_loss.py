@@ -98,26 +98,31 @@ def measure(job: Job) -> Mapping[str, Any]:
     return {"transfer": summary, "flux_scale": _json(scale)}
 
 
-def write_transfer(folder: Path, injection: Injection, settings: PowerSettings, scale: float) -> dict[str, Any]:
+def write_transfer(
+    folder: Path, injection: Injection, settings: PowerSettings, scale: float, largest_error: float = math.inf
+) -> dict[str, Any]:
     """Write T per k outside and inside the wedge, in fine bins and in bands, and per (|b|, tau).
 
-    The flux scale of the calibration is NaN if it is not known. Return T in bands, as plain JSON types, by part of
-    Fourier space.
+    The flux scale of the calibration is NaN if it is not known. Per k, a T with an error above `largest_error` is NaN.
+    Return T in bands, as plain JSON types, by part of Fourier space; errors are kept.
     """
     from calstudy.power.spherical import make_bin_edges
     from calstudy.power.tables import save_spectrum, write_transfer_csv
-    from calstudy.power.transfer import BANDS, cylindrical_transfer, spherical_transfer
+    from calstudy.power.transfer import BANDS, cylindrical_transfer, known_within, spherical_transfer
 
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
         for name, edges in ((TRANSFER, fine), (BAND, BANDS)):
-            found = spherical_transfer(injection, edges, buffer, inside, scale)
+            measured = spherical_transfer(injection, edges, buffer, inside, scale)
+            found = known_within(measured, largest_error)
             save_spectrum(folder / spectrum_file(name, region), found)
             write_transfer_csv(folder / f"{name}.{region}.csv", found)
         summary[region] = [
             {"k": [low, high], "transfer": _json(value), "error": _json(error)}
-            for low, high, value, error in zip(BANDS[:-1], BANDS[1:], found.transfer, found.transfer_error, strict=True)
+            for low, high, value, error in zip(
+                BANDS[:-1], BANDS[1:], found.transfer, measured.transfer_error, strict=True
+            )
         ]
     save_spectrum(folder / spectrum_file(TRANSFER, "wedge"), cylindrical_transfer(injection, settings.length_bin))
     return summary

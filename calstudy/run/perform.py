@@ -82,6 +82,8 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
 
 def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:
     """Return the reason why a file of the store could not be written, or None for any other error."""
+    if not root.is_dir():
+        return "it was removed while it was written"
     name = getattr(error, "filename", None)
     if isinstance(name, str) and not Path(name).is_relative_to(root):
         return None

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
-from calstudy.experiment.model import Experiment
+from calstudy.calibrate.interface import Calibrator
+from calstudy.experiment.model import Experiment, Folders
 from calstudy.instrument.size import Size
 from calstudy.products.calibration import CALIBRATE_CHUNK
 from calstudy.products.simulation import SIMULATE_CHUNK
@@ -23,15 +24,31 @@ WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """Limits of the number of workers, of which more than cores wait for each other."""
 ABSURD = 10
 """Data larger than this many times the memory are refused; a finished run of smaller ones may still be drawn."""
-Targets = Callable[[Experiment], Sequence[Task]]
-"""Function that returns the wanted products of an experiment."""
 
 
-def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Experiment, int]:
+class Contents(Protocol):
+    """The content of a file: an `Experiment`, or measured data, which have no section `simulation`."""
+
+    @property
+    def calibration(self) -> Calibrator:
+        """How gains are found."""
+
+    @property
+    def outputs(self) -> Folders:
+        """Store and folder of runs."""
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None) -> Self:
+        """Return a copy with other sections."""
+
+
+File = TypeVar("File", bound=Contents)
+
+
+def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -> tuple[File, int]:
     """Choose the number of workers, and cut simulations into enough chunks for them, within the memory.
 
     The number of chunks of a simulation changes its visibilities by less than the tolerance of their interpolation,
-    and does not change their key in the store. The result is the experiment, perhaps with more `simulation.chunks`
+    and does not change their key in the store. The result is the file, perhaps with more `simulation.chunks`
     and a calibrator that needs less memory, and the number of workers that fit into the memory, or the requested
     number if no memory was given.
 
@@ -44,11 +61,11 @@ def fit(experiment: Experiment, budget: Budget, targets: Targets) -> tuple[Exper
     workers, scheduler = budget.workers, budget.scheduler
     _require_sane(budget)
     if scheduler is not None:
-        return experiment, workers or 1
+        return file, workers or 1
     memory = _memory(budget)
     hoped = workers or cores()
-    lean = _stream(_cut(_Work(experiment, targets), memory / hoped), memory / hoped)
-    return lean.experiment, _workers(lean.missing, memory, hoped, budget)
+    lean = _stream(_cut(_Work(file, targets), memory / hoped), memory / hoped)
+    return lean.file, _workers(lean.missing, memory, hoped, budget)
 
 
 def require_data_fit(experiment: Experiment, budget: Budget) -> None:
@@ -66,14 +83,6 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
             f"the data have {samples:.3g} samples, which take {need / 1e9:,.1f} GB, and there are "
             f"{memory / 1e9:.1f} GB of memory; use fewer antennas, channels or integrations"
         )
-
-
-def workers_for(targets: Sequence[Task], store: Path, budget: Budget) -> int:
-    """Return the number of workers for products that cannot be cut further; errors as for `fit`."""
-    _require_sane(budget)
-    if budget.scheduler is not None:
-        return budget.workers or 1
-    return _workers(_missing(targets, store), _memory(budget), budget.workers or cores(), budget)
 
 
 def _memory(budget: Budget) -> float:
@@ -114,28 +123,28 @@ def _require_room(largest: Task, need: float, budget: float, source: str) -> Non
 
 
 @dataclass(frozen=True)
-class _Work:
-    """An experiment, and the tasks that a run would have to make for it."""
+class _Work(Generic[File]):
+    """A file, and the tasks that a run would have to make for it."""
 
-    experiment: Experiment
-    targets: Targets
+    file: File
+    targets: Callable[[File], Sequence[Task]]
 
     @cached_property
     def missing(self) -> Sequence[Task]:
-        return _missing(self.targets(self.experiment), self.experiment.outputs.store)
+        return _missing(self.targets(self.file), self.file.outputs.store)
 
     def largest(self, stage: Stage) -> float:
         """Return the memory of the largest missing product of a stage; zero if none is missing."""
         return max((task.cost.memory for task in self.missing if task.stage is stage), default=0.0)
 
-    def changed(self, **sections: Any) -> _Work:
-        return replace(self, experiment=self.experiment.model_copy(update=sections))
+    def changed(self, **sections: Any) -> Self:
+        return replace(self, file=self.file.model_copy(update=sections))
 
 
-def _cut(work: _Work, share: float) -> _Work:
+def _cut(work: _Work[File], share: float) -> _Work[File]:
     """Double the number of simulation chunks until each needs no more than its share, or they are single channels."""
-    while (largest := work.largest(SIMULATE_CHUNK)) > share:
-        simulation, channels = work.experiment.simulation, work.experiment.instrument.channels.count
+    while isinstance(work.file, Experiment) and (largest := work.largest(SIMULATE_CHUNK)) > share:
+        simulation, channels = work.file.simulation, work.file.instrument.channels.count
         if simulation.chunks >= channels:
             break
         chunks = min(2 * simulation.chunks, channels)
@@ -146,10 +155,10 @@ def _cut(work: _Work, share: float) -> _Work:
     return work
 
 
-def _stream(work: _Work, share: float) -> _Work:
+def _stream(work: _Work[File], share: float) -> _Work[File]:
     """Let the calibrator use less memory until a solve needs no more than its share."""
     while work.largest(CALIBRATE_CHUNK) > share:
-        calibration = work.experiment.calibration
+        calibration = work.file.calibration
         with guarded(calibration):
             leaner = calibration.with_less_memory()
         if leaner is None:

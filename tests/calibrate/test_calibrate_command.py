@@ -15,10 +15,9 @@ from test_calamity import make_uvdata
 
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
-from calstudy.measured.defaults import defaults
-from calstudy.observed.options import read_calibrator
-from calstudy.observed.output import FIGURE_FILES
 from calstudy.power.tables import load_spectrum
+from calstudy.realdata.settings import defaults
+from calstudy.studies.calibration import FIGURE_FILES
 
 OPTIONS = ["--buffer", "50 ns", "--set", "basis.min_delay=50 ns"]
 
@@ -34,14 +33,15 @@ def data(toy, tmp_path):
 
 @pytest.fixture
 def command(monkeypatch, capsys, tmp_path):
-    """Run the command and return its exit code and what it wrote to standard error."""
+    """Run the command and return its exit code and what it wrote."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["calstudy", "calibrate", *map(str, arguments)])
         monkeypatch.chdir(tmp_path)
         with pytest.raises(SystemExit) as end:
             cli.main(leave=sys.exit)
-        return end.value.code, capsys.readouterr().err
+        written = capsys.readouterr()
+        return end.value.code, written.out + written.err
 
     return run
 
@@ -55,7 +55,7 @@ def test_a_dry_run_says_what_would_be_solved_and_imports_no_tensorflow(data, tmp
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
     assert result.returncode == 0, result.stderr
-    assert "2 solves" in result.stderr
+    assert "2 solves" in result.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["data.uvh5"]
 
 
@@ -140,11 +140,14 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["none.uvh5"], "none.uvh5: no such file or folder"),
+        (["none.uvh5"], "'none.uvh5': no such file or folder"),
         (["data.uvh5", "--solver", "newton"], "solver: 'newton' is not a choice"),
         (["data.uvh5", "--buffer", "50"], "basis.buffer: '50' has no unit"),
         (["data.uvh5", "--set", "bufer=3"], "bufer: unknown key"),
-        (["data.uvh5", "--set", "calibrator=delay-weighted"], "foreground_prior.noise: a finite deviation is weighed"),
+        (
+            ["data.uvh5", "--set", "calibrator=delay-weighted"],
+            "foreground_prior.noise: must be given, for the data",
+        ),
         (["data.uvh5", "--redundant", "--gains-only"], "--redundant and --gains-only: choose one"),
         (["data.uvh5", "--gains-only"], "calibration.calibrator = 'sky-based': needs a sky model"),
         (["data.uvh5", "--gains-only", *OPTIONS], "calibration.basis: unknown key"),
@@ -169,7 +172,7 @@ def test_mistakes_are_one_sentence(command, data, arguments, sentence):
 def test_what_the_memory_does_not_hold_is_refused(command, data, tmp_path):
     code, error = command(data, *OPTIONS, "--output", "out", "--max-memory", "500 MB")
     assert code == 2
-    assert "8 antennas, 28 baselines and 64 channels need about 1.2 GB, and 0.5 GB are allowed by --max-memory" in error
+    assert "calstudy: --max-memory leaves 0.0 GB of memory for work, but calibrate-chunk (data whole" in error
     assert not (tmp_path / "out").exists()
     assert "--max-memory '5': write a positive number" in command(data, "--max-memory", "5")[1]
 
@@ -194,7 +197,8 @@ def test_an_output_folder_that_vanishes_is_told_in_a_sentence(writer, command, d
     monkeypatch.setattr(container, writer, vanish)
     code, error = command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
     assert code == 2
-    assert "--output out: cannot be written (it was removed while it was written)" in error
+    assert "--output out: calibrate-chunk (data whole" in error or "--output out: observe (data whole" in error
+    assert "could not be written (it was removed while it was written)" in error
     assert "Traceback" not in error
 
 
@@ -206,15 +210,16 @@ def test_a_disk_that_is_full_is_told_in_a_sentence(command, data, monkeypatch):
     monkeypatch.setattr(UVData, "write_uvh5", fail)
     code, error = command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
     assert code == 2
-    assert "--output out: cannot be written (No space left on device); make room or choose another folder" in error
+    assert "--output out: observe (data whole) could not be written (No space left on device); make room or" in error
 
 
 @pytest.mark.parametrize("text", ["prior: none\n", "calibration: {prior: none, solver: {max_steps: 7}}\n", "{}\n"])
-def test_a_settings_file_is_stronger_than_the_defaults_for_measured_data(tmp_path, text):
-    path = tmp_path / "settings.yaml"
-    path.write_text(text)
+def test_a_settings_file_is_stronger_than_the_defaults_for_measured_data(command, data, tmp_path, text):
+    (tmp_path / "settings.yaml").write_text(text)
+    options = ["--buffer", "50 ns", "--settings", "settings.yaml", "--set", "solver.tolerance=1e-4"]
+    command(data, *options, "--select", "times=0..0", "--output", "out")
+    found = json.loads((tmp_path / "out" / "solution.json").read_text())["settings"]
     usual = defaults(has_sky_model=False)
-    found = read_calibrator(path, {"solver": None}, usual, ["solver.tolerance=1e-4"])
-    assert found.prior == ("none" if "prior" in text else "gains")
-    assert found.solver.max_steps == (7 if "solver" in text else usual["solver"]["max_steps"])
-    assert found.solver.tolerance == 1e-4
+    assert found["prior"] == ("none" if "prior" in text else "gains")
+    assert found["solver"]["max_steps"] == (7 if "solver" in text else usual["solver"]["max_steps"])
+    assert found["solver"]["tolerance"] == 1e-4

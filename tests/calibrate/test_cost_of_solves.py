@@ -16,7 +16,6 @@ from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibration, Calibrator, Solve
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
-from calstudy.observed import pieces
 from calstudy.products.comparison import score_table
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, write_json, write_visibilities
 from calstudy.products.observed_quality import read_result
@@ -101,25 +100,26 @@ def test_records_add_up_to_at_most_the_whole_and_skipped_solves_took_nothing(cal
 
 def test_records_of_earlier_versions_are_read_and_do_not_tell(toy, tmp_path):
     result = run_calibrator(SETTINGS, make_uvdata(toy, 2))
-    piece, product = tmp_path / "piece", tmp_path / "product"
-    pieces._write(result, piece)
+    product = tmp_path / "product"
     product.mkdir()
     result.gains.write_calh5(product / GAINS)
     for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
         write_visibilities(uvd, product / name)
     write_json(product / SOLUTION, {"records": result.summary()["records"]})
     known = [record.cpu_seconds for record in result.solutions]
-    assert [record.cpu_seconds for record in pieces._read(piece).solutions] == known
-    assert [record.cpu_seconds for record in read_result(product).solutions] == known
+    found = read_result(product).solutions
+    assert [record.cpu_seconds for record in found] == known
+    for record, same in zip(result.solutions, found, strict=True):
+        np.testing.assert_array_equal(same.loss_history, record.loss_history)
 
-    for path in (piece / pieces.RECORDS, product / SOLUTION):
-        content = json.loads(path.read_text())
-        for record in content if path.parent == piece else content["records"]:
-            del record["cpu_seconds"]
-        path.write_text(json.dumps(content))
-    for found in (pieces._read(piece), read_result(product)):
-        assert [record.cpu_seconds for record in found.solutions] == [None, None]
-        assert [record.seconds for record in found.solutions] == [record.seconds for record in result.solutions]
+    content = json.loads((product / SOLUTION).read_text())
+    for record in content["records"]:
+        del record["cpu_seconds"], record["loss_history"]
+    (product / SOLUTION).write_text(json.dumps(content))
+    found = read_result(product).solutions
+    assert [record.cpu_seconds for record in found] == [None, None]
+    assert [record.seconds for record in found] == [record.seconds for record in result.solutions]
+    assert [len(record.loss_history) for record in found] == [2, 2]
 
 
 def record(cpu_seconds, status="converged", polarization=-5, n_integrations=1):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calstudy.observed.diagnostics_figure import Diagnostics, draw_diagnostics
+from calstudy.figures.diagnostics import Diagnostics, draw_diagnostics
 
 DRAWN = True
 

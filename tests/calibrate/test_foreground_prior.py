@@ -26,7 +26,7 @@ from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.solvers.reduced import ReducedKernels
 from calstudy.calibrate.synthetic import Case, Simulation
-from calstudy.measured.defaults import defaults
+from calstudy.realdata.settings import defaults
 
 SIGMA = 0.05
 OWN, SHARED = 0.7, 1.9

@@ -13,7 +13,6 @@ from toy import FREQUENCIES, complex_normal, make_toy, scattered
 from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal
 from calstudy.calibrate.gain_comparison import GainPair, compare_gains, pair_gains
-from calstudy.observed.gain_comparison_figure import together
 
 DRAWN = True
 
@@ -68,7 +67,7 @@ def test_gradients_may_be_several_turns_across_a_redundant_array():
     pair = GainPair(np.arange(len(lattice)).astype(str), 14.6 * lattice, frequency, "x", first, second)
     found = compare_gains(pair, redundant=True)
     # Of 16 antennas, amplitude, phase and gradient of each channel take four of 32 real numbers.
-    assert together(found) == pytest.approx(0.01 * np.sqrt(28 / 32), rel=0.1)
+    assert found.together == pytest.approx(0.01 * np.sqrt(28 / 32), rel=0.1)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -12,10 +12,10 @@ from toy import make_toy, scattered
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
-from calstudy.measured.interference import flag_interference
-from calstudy.measured.reading import prepare, read_visibilities
-from calstudy.measured.selection import Selection
-from calstudy.measured.settings import Interference, find_data
+from calstudy.realdata.interference import flag_interference
+from calstudy.realdata.reading import prepare, read_visibilities
+from calstudy.realdata.selection import Selection
+from calstudy.realdata.settings import Interference, find_data
 
 N_TIMES, NOISE = 24, 0.05
 ALWAYS, SOMETIMES = 20, (9, 30)

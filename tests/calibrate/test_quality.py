@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from command_line import run_command
+from command_line import run_and_read, run_command
 from pyuvdata import UVCal, UVData
 from test_calamity import make_uvdata
 from toy import make_toy, scattered
@@ -15,9 +15,9 @@ from calstudy.base.errors import InputError
 from calstudy.calibrate import execution
 from calstudy.calibrate.records import CalibrationResult, make_gains, make_visibilities
 from calstudy.calibrate.sky_model import common_baselines
-from calstudy.measured.quality import assess
-from calstudy.measured.reading import prepare
-from calstudy.measured.selection import Selection, select
+from calstudy.realdata.quality import assess
+from calstudy.realdata.reading import prepare
+from calstudy.realdata.selection import Selection, select
 
 OPTIONS = ["--gains-only"]
 N_TIMES, CHANNEL, NOISE = 4, 20, 0.01
@@ -187,9 +187,9 @@ CALIBRATE = ["calibrate", "data.uvh5", "--sky-model", "sky.uvh5", *OPTIONS]
 
 
 def test_a_dry_run_says_what_would_be_done_and_writes_nothing(files, capsys):
-    status, told = run_command(capsys, *CALIBRATE, "--output", "out", "--dry-run")
+    status, told = run_and_read(capsys, *CALIBRATE, "--output", "out", "--dry-run")
     assert status == 0
-    assert f"{N_TIMES} solves" in told
+    assert f"{N_TIMES} solves" in told.out
     assert not (files / "out").exists()
 
 
@@ -199,24 +199,25 @@ def test_a_killed_calibration_is_resumed_and_gives_what_an_undisturbed_one_gives
     solves = []
     true = execution.run_calibrator
 
-    def killed(calibrator, data, *others):
+    def killed(calibrator, data, *others, **more):
         if len(solves) == 2:
-            raise KeyboardInterrupt
+            raise RuntimeError("killed")
         solves.append(data.time_array[0])
-        return true(calibrator, data, *others)
+        return true(calibrator, data, *others, **more)
 
     with monkeypatch.context() as patch:
-        patch.setattr("calstudy.observed.pieces.run_calibrator", killed)
-        assert run_command(capsys, *CALIBRATE, "--output", "cut")[0] == 130
+        patch.setattr(execution, "run_calibrator", killed)
+        with pytest.raises(RuntimeError, match="killed"):
+            run_command(capsys, *CALIBRATE, "--output", "cut")
     assert not (files / "cut" / "gains.calh5").exists()
     solves.clear()
 
-    def counted(calibrator, data, *others):
+    def counted(calibrator, data, *others, **more):
         solves.append(data.time_array[0])
-        return true(calibrator, data, *others)
+        return true(calibrator, data, *others, **more)
 
     with monkeypatch.context() as patch:
-        patch.setattr("calstudy.observed.pieces.run_calibrator", counted)
+        patch.setattr(execution, "run_calibrator", counted)
         assert run_command(capsys, *CALIBRATE, "--output", "cut")[0] == 0
     assert len(solves) == 2
     whole, cut = (UVCal.from_file(files / name / "gains.calh5") for name in ("whole", "cut"))
@@ -235,10 +236,10 @@ def test_interference_is_warned_of_and_written(files, clean, capsys):
     spoiled = clean.copy()
     spoiled.data_array[:, CHANNEL] *= 1e4
     spoiled.write_uvh5("data.uvh5", clobber=True)
-    status, told = run_command(capsys, *CALIBRATE, "--output", "out")
+    status, told = run_and_read(capsys, *CALIBRATE, "--output", "out")
     assert status == 0
     named = f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (100 x); interference?"
-    assert named in told
+    assert named in told.out
     (quality,) = json.loads((files / "out" / "solution.json").read_text())["quality"]
     assert any(named in warning for warning in quality["warnings"])
     assert quality["gain_by_channel"][CHANNEL] == pytest.approx(100, rel=1e-3)
@@ -246,9 +247,9 @@ def test_interference_is_warned_of_and_written(files, clean, capsys):
     with np.load(files / "out" / "diagnostics.npz") as arrays:
         assert arrays["chi2_by_channel"].shape == (clean.Nfreqs,)
         assert str(arrays["antennas"][0]).startswith("ant")
-    status, told = run_command(capsys, *CALIBRATE, "--output", "flagged", "--flag-interference")
+    status, told = run_and_read(capsys, *CALIBRATE, "--output", "flagged", "--flag-interference")
     assert status == 0
-    assert "interference?" not in told
+    assert "interference?" not in told.out
     gains = UVCal.from_file(files / "flagged" / "gains.calh5")
     assert gains.flag_array[:, CHANNEL].all()
     assert np.abs(gains.gain_array[~gains.flag_array]) == pytest.approx(2, rel=1e-3)
@@ -256,6 +257,6 @@ def test_interference_is_warned_of_and_written(files, clean, capsys):
 
 def test_a_field_may_be_given_as_in_an_experiment_file(files, capsys):
     options = ["--set", "calibration.integrations_per_solve=2", "--output", "out", "--dry-run"]
-    status, told = run_command(capsys, *CALIBRATE, *options)
+    status, told = run_and_read(capsys, *CALIBRATE, *options)
     assert status == 0
-    assert f"{N_TIMES // 2} solves" in told
+    assert f"{N_TIMES // 2} solves" in told.out

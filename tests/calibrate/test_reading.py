@@ -10,8 +10,8 @@ from test_calamity import make_uvdata
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
 from calstudy.calibrate.sky_model import match_sky_model
-from calstudy.measured.reading import prepare, read_visibilities
-from calstudy.measured.selection import Selection, parse_selection, select
+from calstudy.realdata.reading import prepare, read_visibilities
+from calstudy.realdata.selection import Selection, parse_values, select, split_selections
 
 
 @pytest.fixture
@@ -113,8 +113,12 @@ def test_sky_models_are_matched_and_turned(data):
         )
 
 
+def selected(texts):
+    return parse_values(split_selections(texts), "--select ")
+
+
 def test_selections_are_read_and_applied(data):
-    selection = parse_selection(
+    selection = selected(
         ["antennas=10,ant12,16", "times=1..", "frequencies=165 MHz..170 MHz", "polarizations=ee", "lengths=0 m..500 m"]
     )
     assert selection.times == (1, None)
@@ -139,7 +143,7 @@ def test_selections_are_read_and_applied(data):
 )
 def test_bad_selections_are_one_sentence(data, text, match):
     with pytest.raises(InputError, match=match):
-        select(data, parse_selection([text]))
+        select(data, selected([text]))
 
 
 def test_files_come_back_as_written(data, tmp_path):

@@ -16,7 +16,7 @@ from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import starting_gains
 from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, FlagWeights, ForegroundPrior, SampleWeights
 from calstudy.calibrate.weights import inverse_variances, make_weights
-from calstudy.measured.noise import radiometer_variance, sample_noise
+from calstudy.realdata.noise import radiometer_variance, sample_noise
 
 
 def everything(data):

@@ -22,12 +22,12 @@ from calstudy.corrupt.temperature import SystemTemperature, effective_area
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import Variant
 from calstudy.instrument.beams import make_beam
-from calstudy.measured.noise import radiometer_variance
 from calstudy.power.settings import PowerSettings
 from calstudy.products import corruption
 from calstudy.products.calibration import calibration, with_autocorrelations
 from calstudy.products.files import read_json, read_visibilities
 from calstudy.products.graph import Graph
+from calstudy.realdata.noise import radiometer_variance
 from calstudy.validation.steps.noise import noise_power
 
 

@@ -13,7 +13,6 @@ from astropy.time import Time
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.instrument.array_layouts.golomb import GolombLayout
-from calstudy.measured.halves import Halves
 from calstudy.power.average import average_in_blocks, divide, fringe_stop_and_average
 from calstudy.power.errors import independent_times, noise_level, sample_modes
 from calstudy.power.interface import estimate_spectra
@@ -21,6 +20,7 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra
 from calstudy.power.spherical import modes_in_bins, spherical_average
 from calstudy.power.tables import load_spectrum, save_spectrum
+from calstudy.realdata.halves import Parts
 
 SETTINGS = PowerSettings(pairs="same-baseline")
 DAY = 86400.0
@@ -161,7 +161,7 @@ def averaging(times, coherent_time, odd=None):
         return SimpleNamespace(times=found, integration=10.0, duration=np.ptp(found) * DAY + 10)
 
     even = facts(times)
-    halves = Halves({"even": even, "odd": even if odd is None else facts(odd)})
+    halves = Parts({"even": even, "odd": even if odd is None else facts(odd)})
     return halves.averaging(PowerSettings(coherent_time=f"{coherent_time} s"))
 
 

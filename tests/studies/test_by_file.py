@@ -405,7 +405,7 @@ def test_other_formats_hold_the_same_data(exported, home, tmp_path, file_format)
     """Both store single precision, and are phased: what comes back agrees to 1e-6 of the largest visibility."""
     if file_format == "ms":
         pytest.importorskip("casacore", reason="the extra [ms] is not installed")
-    from calstudy.measured.reading import prepare
+    from calstudy.realdata.reading import prepare
 
     folder = tmp_path / "out"
     command("export", home / "secret.yaml", "--output", folder, "--format", file_format, "--workers", 1)

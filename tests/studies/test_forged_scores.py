@@ -19,7 +19,7 @@ from calstudy.base.visibilities import from_cube
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, find_returned, read_manifest
 from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.instrument.telescope import make_template
-from calstudy.measured.reading import read_metadata, read_visibilities
+from calstudy.realdata.reading import read_metadata, read_visibilities
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import FileSources
 from calstudy.studies.scores import Scores, leaderboard

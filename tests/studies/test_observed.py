@@ -372,7 +372,7 @@ def test_antennas_get_their_positions(simulated, folder):
     found = halves(folder, "twice", observed)["odd"]
     longest = np.linalg.norm(baseline_vectors(found), axis=1).max()
     assert longest == pytest.approx(2 * np.linalg.norm(baseline_vectors(data), axis=1).max(), rel=1e-9)
-    size = load_study(observed_file(folder, "twice", observed)).graph.halves.facts["even"].size(2)
+    size = load_study(observed_file(folder, "twice", observed)).graph.parts.facts["even"].size(2)
     assert size.longest == pytest.approx(longest, rel=1e-9)
 
 

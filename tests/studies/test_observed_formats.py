@@ -13,10 +13,10 @@ from pyuvdata import UVData
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
 from calstudy.instrument.telescope import make_template
-from calstudy.measured import reading
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA
 from calstudy.products.observed import observe, observed
+from calstudy.realdata import reading
 from calstudy.run.task import Job
 from calstudy.studies.kinds.observed import ObservedStudy
 from calstudy.studies.load import load_study

@@ -14,14 +14,17 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from pyuvdata import UVData
+from astropy import units
+from pyuvdata import UVData, utils
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gains import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.calibrate.records import PARALLEL_HANDS
-from calstudy.measured.selection import Selection, select
+from calstudy.instrument.array_layouts.csv import CsvLayout
+from calstudy.instrument.layouts import make_layout
+from calstudy.realdata.selection import Selection, select
 
 logger = logging.getLogger(__name__)
 
@@ -32,8 +35,12 @@ LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e6, 1e12
 EVERYTHING = Selection()
 
 
-def read_visibilities(paths: Sequence[Path]) -> UVData:
-    """Read one data set from a file or folder, or from several that belong together.
+# Readers of eight formats raise any error of their libraries; the user must repair a file that cannot be read.
+UNREADABLE = (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError)
+
+
+def read_visibilities(paths: Sequence[Path], read_data: bool = True) -> UVData:
+    """Read one data set from a file or folder, or from several that belong together; or its metadata alone.
 
     Raises
     ------
@@ -41,39 +48,31 @@ def read_visibilities(paths: Sequence[Path]) -> UVData:
         If a path does not exist, pyuvdata cannot read it, or its antennas have no positions.
     """
     _require_readable(paths)
-    names = [str(path) for path in paths]
+    names = ", ".join(map(str, paths))
     keep_compiled_pyuvdata()
+    data = UVData()
     try:
-        data = UVData.from_file(names[0] if len(names) == 1 else names)
-    # Readers of eight formats raise any error of their libraries; the user must repair a file that cannot be read.
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError) as error:
-        raise InputError(f"{', '.join(names)}: cannot be read as visibilities ({_first_sentence(error)})") from None
-    if data.data_array is None:
-        raise InputError(f"{', '.join(names)}: holds no visibilities")
+        data.read(str(paths[0]) if len(paths) == 1 else [str(path) for path in paths], read_data=read_data)
+    except UNREADABLE as error:
+        raise InputError(f"{names}: cannot be read as visibilities ({_first_sentence(error)})") from None
+    if read_data and data.data_array is None:
+        raise InputError(f"{names}: holds no visibilities")
+    # The times of Miriad folders come with the visibilities.
+    if not read_data and data.time_array is None:
+        return read_visibilities(paths)
     if not np.isfinite(data.telescope.antenna_positions).all():
-        raise InputError(f"{', '.join(names)}: antenna positions are not finite")
-    _require_plausible(data, ", ".join(names))
+        raise InputError(f"{names}: antenna positions are not finite")
+    _require_plausible(data, names)
     return data
 
 
 def read_metadata(paths: Sequence[Path]) -> UVData:
     """Read a data set as `read_visibilities` does, but without visibilities where the format allows it."""
-    _require_readable(paths)
-    names = [str(path) for path in paths]
-    data = UVData()
-    keep_compiled_pyuvdata()
     try:
-        data.read(names[0] if len(names) == 1 else names, read_data=False)
-    # As above; a file that cannot be read in parts may be readable as a whole.
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, ImportError):
+        return read_visibilities(paths, read_data=False)
+    except InputError:
+        # A file that cannot be read in parts may be readable as a whole.
         return read_visibilities(paths)
-    # The times of Miriad folders come with the visibilities.
-    if data.time_array is None:
-        return read_visibilities(paths)
-    if not np.isfinite(data.telescope.antenna_positions).all():
-        raise InputError(f"{', '.join(names)}: antenna positions are not finite")
-    _require_plausible(data, ", ".join(names))
-    return data
 
 
 def _require_readable(paths: Sequence[Path]) -> None:
@@ -250,3 +249,37 @@ def _reindexed(data: UVData, by_time: np.ndarray, by_baseline: np.ndarray) -> UV
     result.Nbls = result.Nblts // result.Ntimes
     result.blt_order = ("time", "baseline")
     return result
+
+
+def place_antennas(data: UVData, path: Path) -> str:
+    """Give antennas their positions, and baselines the vectors between these; return a sentence on the changes.
+
+    `data` are drift-scan visibilities, perhaps only metadata, and are changed. `path` is a CSV file with columns
+    number, east_m, north_m and up_m, about the location of the telescope. Raise InputError if the file cannot be used,
+    or lacks an antenna of the data, or the data are phased to a source.
+    """
+    if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
+        raise InputError("observed.positions: the data are phased to a source, by the positions that they have")
+    try:
+        layout = make_layout(CsvLayout(kind="csv", path=path))
+    except InputError as error:
+        raise InputError(str(error).replace("instrument.layout.path", "observed.positions")) from None
+    telescope = data.telescope
+    present = np.union1d(data.ant_1_array, data.ant_2_array)
+    missing = np.setdiff1d(present, layout.numbers)
+    if missing.size:
+        raise InputError(f"observed.positions: {path} has no antenna {missing[0]}, which is in the data")
+    enu = telescope.get_enu_antpos()
+    places = {int(number): row for row, number in enumerate(layout.numbers)}
+    moved = [row for row, number in enumerate(telescope.antenna_numbers.tolist()) if number in places]
+    before = enu[moved].copy()
+    for row in moved:
+        enu[row] = layout.enu[places[int(telescope.antenna_numbers[row])]]
+    centre = np.array([axis.to_value(units.m) for axis in telescope.location.geocentric])
+    telescope.antenna_positions = utils.ECEF_from_ENU(enu, center_loc=telescope.location) - centre
+    data.set_uvws_from_antenna_positions(update_vis=False)
+    distances = [np.linalg.norm(positions[:, None] - positions, axis=-1) for positions in (before, enu[moved])]
+    return (
+        f"Antenna positions are those of {path.name}; distances between antennas change by up to "
+        f"{np.abs(distances[1] - distances[0]).max():.3g} m."
+    )

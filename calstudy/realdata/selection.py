@@ -53,23 +53,17 @@ class Selection:
     autos: bool = False
 
 
-def parse_selection(texts: Sequence[str]) -> Selection:
-    """Read the ``key=value`` texts of --select; `KEYS` has an example of each.
-
-    Raises
-    ------
-    InputError
-        If a key is unknown or given twice, or a value cannot be read.
-    """
-    found: dict[str, Any] = {}
+def split_selections(texts: Sequence[str]) -> dict[str, str]:
+    """Split the ``key=value`` texts of --select; raises InputError if a key is unknown or given twice."""
+    found: dict[str, str] = {}
     for text in texts:
         key, equals, value = (part.strip() for part in text.partition("="))
         if not equals or key not in KEYS or not value:
             raise InputError(f"--select {text}: write one of {'; '.join(KEYS.values())}")
         if key in found:
             raise InputError(f"--select {key}: given twice")
-        found[key] = _value(key, value, f"--select {text}")
-    return Selection(**found)
+        found[key] = value
+    return found
 
 
 def parse_values(values: Mapping[str, str], where: str, autos: bool = False) -> Selection:

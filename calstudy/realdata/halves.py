@@ -1,4 +1,7 @@
-"""Two halves of measured data, even and odd, that see the same sky with independent noise."""
+"""The parts of measured data that are calibrated by themselves: two halves, or all of them together.
+
+The halves, even and odd, see the same sky with independent noise.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.size import Size
-from calstudy.measured.selection import Selection, parse_values, select
+from calstudy.realdata.selection import Selection, parse_values, select
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
     from calstudy.power.settings import PowerSettings
 
 PARITIES = ("even", "odd")
+WHOLE = "whole"
+"""The part that is all of the data."""
 FEED_TOLERANCE = np.radians(1)
 LEAST_CHANNELS = 8
 SECONDS_PER_DAY = 86400.0
@@ -60,8 +65,8 @@ class Facts:
 
     @property
     def channels(self) -> Channels:
-        """The channels, which are equally spaced."""
-        width = float(np.ptp(self.frequencies)) / (self.frequencies.size - 1)
+        """The channels, as if they were equally spaced."""
+        width = float(np.ptp(self.frequencies)) / max(self.frequencies.size - 1, 1)
         first = float(self.frequencies[0])
         return Channels.model_construct(first=first, width=float(f"{width:.12g}"), count=self.frequencies.size)
 
@@ -79,20 +84,25 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Halves:
-    """Metadata of the two halves, by parity, before they are read."""
+class Parts:
+    """Metadata of the two halves, by parity, or of `WHOLE` alone, before they are read."""
 
     facts: Mapping[str, Facts]
 
     @property
     def interleaved(self) -> bool:
-        """True if both halves are in the same files."""
-        return self.facts["even"] is self.facts["odd"]
+        """True if there are two halves, in the same files."""
+        return WHOLE not in self.facts and self.facts["even"] is self.facts["odd"]
 
-    def times(self, parity: str) -> np.ndarray:
-        """Return the Julian dates of the integrations of a half."""
-        times = self.facts[parity].times
-        return times[PARITIES.index(parity) :: 2] if self.interleaved else times
+    @property
+    def autos(self) -> bool:
+        """True if there are autocorrelations of all antennas."""
+        return all(facts.autos for facts in self.facts.values())
+
+    def times(self, part: str) -> np.ndarray:
+        """Return the Julian dates of the integrations of a part."""
+        times = self.facts[part].times
+        return times[PARITIES.index(part) :: 2] if self.interleaved else times
 
     @property
     def centre(self) -> float | None:
@@ -150,8 +160,7 @@ def read_facts(
     """
     # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
     from calstudy.calibrate.records import PARALLEL_HANDS
-    from calstudy.measured.positions import place_antennas
-    from calstudy.measured.reading import read_metadata
+    from calstudy.realdata.reading import place_antennas, read_metadata
 
     data = read_metadata(paths)
     if positions is not None:
@@ -160,7 +169,7 @@ def read_facts(
     pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)
     crosses, autos = pairs[pairs[:, 0] != pairs[:, 1]], pairs[pairs[:, 0] == pairs[:, 1], 0]
     if not len(crosses):
-        raise InputError("observed.data: there are no baselines, only autocorrelations")
+        raise InputError("observed.data: there are no cross-correlations, only autocorrelations")
     frequencies = np.sort(np.ravel(data.freq_array))
     if even:
         _require_even(frequencies)
@@ -189,7 +198,7 @@ def modelled(frame: Frame, path: Path) -> Frame:
 
     Raise InputError if the file cannot be read, or has none of the cross-correlations.
     """
-    from calstudy.measured.reading import read_metadata
+    from calstudy.realdata.reading import read_metadata
 
     sky = read_metadata((path,))
     known = {frozenset(pair) for pair in zip(sky.ant_1_array.tolist(), sky.ant_2_array.tolist(), strict=True)}

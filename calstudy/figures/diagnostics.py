@@ -1,10 +1,10 @@
-"""The diagnostic figure of a calibration: data, model and residual in delay, gains, and convergence of the solves."""
+"""Diagnostics of a calibration of measured data: data, model and residual in delay, gains, convergence, and chi^2."""
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,10 +12,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from scipy.signal.windows import blackmanharris
 
+from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
+from calstudy.products.files import DATA, read_visibilities
+from calstudy.products.observed import calibrated, observed
+from calstudy.products.observed_quality import read_result
+from calstudy.run.task import Job, Task
 
-NOTE_CHARACTERS = 150
+if TYPE_CHECKING:
+    from pyuvdata import UVData
+
+    from calstudy.calibrate.records import CalibrationResult
+    from calstudy.products.observed import DataGraph
+
 MAX_NAMES = 20
 LINEAR_RANGE = 5.0
 SHORT_AXIS = 100.0
@@ -49,7 +59,7 @@ class Diagnostics:
     chi2_antennas
         Names of all calibrated antennas, (Nants,).
     chi2_by_antenna, chi2_by_channel, chi2_by_integration
-        As in `calstudy.measured.quality.Quality`.
+        As in `calstudy.realdata.quality.Quality`.
     """
 
     polarization: str
@@ -86,7 +96,7 @@ def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.nd
 
 
 @style.journal_style()
-def draw_diagnostics(found: Diagnostics, notes: Sequence[str] = ()) -> Figure:
+def draw_diagnostics(found: Diagnostics, stand_ins: Sequence[str] = ()) -> Figure:
     """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 
     The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
@@ -108,9 +118,7 @@ def draw_diagnostics(found: Diagnostics, notes: Sequence[str] = ()) -> Figure:
         _label_between_powers(axes)
     # Above the axes: gains of measured data have peaks anywhere.
     grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2)
-    if notes:
-        lines = [line for note in notes for line in textwrap.wrap(note, width=NOTE_CHARACTERS)]
-        figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=style.NOTE_SIZE, color=style.GREY)
+    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -203,3 +211,83 @@ def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
     _make_logarithmic(axes, np.concatenate(found.losses or (np.empty(0),)))
     axes.set_title(f"{good} of {count} solves converged (blue)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> Diagnostics:
+    """Collect the arrays of the diagnostic figure for one polarization, given by its index.
+
+    `data` are those of `calstudy.calibrate.execution.run_calibrator`, and `result` is its result.
+    """
+    from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, rows_of, to_cube
+    from calstudy.calibrate.basis import channel_grid
+    from calstudy.realdata.quality import assess
+
+    model = result.model
+    rows = rows_of(data, antenna_pairs(model))
+    lengths = np.linalg.norm(baseline_vectors(model), axis=1)
+    order = np.argsort(lengths, kind="stable")
+    grid = channel_grid(np.asarray(model.freq_array, float))
+    flags = flag_cube(result.residual)[..., polarization]
+    measured = np.where(flags, 0, to_cube(data)[..., polarization][:, rows])
+    spectra = [
+        delay_rms(np.where(flags, 0, cube)[:, order], grid.positions, grid.n_channels)
+        for cube in (measured, to_cube(model)[..., polarization], to_cube(result.residual)[..., polarization])
+    ]
+    antennas, gains = _shown_gains(result, polarization)
+    number = int(model.polarization_array[polarization])
+    records = [record for record in result.solutions if record.polarization == number]
+    quality = assess(data, result, polarization)
+    return Diagnostics(
+        polarization=model.get_pols()[polarization],
+        unit=model.vis_units,
+        delay=np.fft.fftshift(np.fft.fftfreq(grid.n_channels, grid.width)),
+        lengths=lengths[order],
+        data=spectra[0],
+        model=spectra[1],
+        residual=spectra[2],
+        frequency=np.asarray(model.freq_array, float),
+        antennas=antennas,
+        gains=gains,
+        losses=tuple(record.loss_history / record.loss_history[0] for record in records if record.loss_history.size),
+        chi2_antennas=quality.antennas,
+        chi2_by_antenna=quality.chi2_by_antenna,
+        chi2_by_channel=quality.chi2_by_channel,
+        chi2_by_integration=quality.chi2_by_integration,
+        converged=np.array([record.status == "converged" for record in records if record.loss_history.size]),
+    )
+
+
+def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return names of antennas with solutions, spread over the array, and their gains, NaN where flagged."""
+    gains = result.gains
+    flags = gains.flag_array[..., polarization]
+    used = np.flatnonzero(~flags.all(axis=(1, 2)))
+    used = (
+        used[np.unique(np.linspace(0, used.size - 1, min(used.size, MAX_ANTENNAS)).astype(int))] if used.size else used
+    )
+    values = np.where(flags[used], np.nan, gains.gain_array[used, :, :, polarization])
+    times = np.flatnonzero(~flags.all(axis=(0, 1)))
+    middle = times[times.size // 2] if times.size else 0
+    names = dict(zip(gains.telescope.antenna_numbers.tolist(), gains.telescope.antenna_names, strict=True))
+    return np.array([str(names[int(number)]) for number in gains.ant_array[used]]), values[:, :, middle]
+
+
+class DiagnosticsFigure(StudyFigure):
+    """Diagnostics of a calibration of measured data, of the even half or of all data."""
+
+    of = ("observed",)
+    caption = (
+        "The calibration of the measured data, of the first polarization: data, model and residual by baseline length "
+        "and delay, convergence of the solves, gains, and chi^2 of antennas, channels and integrations."
+    )
+
+    def inputs(self, graph: DataGraph) -> Mapping[str, Task]:
+        """Return the data and the calibration of the first part."""
+        part = next(iter(graph.parts.facts))
+        return {"data": observed(graph, part), "calibration": calibrated(graph, part)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the diagnostics of the first polarization."""
+        data = read_visibilities(job.inputs["data"] / DATA)
+        found = diagnose(data, read_result(job.inputs["calibration"]))
+        return Drawing(draw_diagnostics(found, job.settings["notes"]), found)

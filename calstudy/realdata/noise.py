@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
 from calstudy.power.spectra import outside_wedge
 
 if TYPE_CHECKING:
@@ -42,8 +42,7 @@ def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> n
         return None
     flags, cube = flag_cube(data)[..., polarization], to_cube(data)[..., polarization]
     power = np.where(flags, np.nan, cube.real)
-    places = {tuple(pair): row for row, pair in enumerate(all_pairs.tolist())}
-    rows = [places[tuple(pair)] for pair in pairs.tolist()]
+    rows = rows_of(data, pairs)
     first, second = ([autos[int(number)] for number in column] for column in pairs.T)
     counts = data.nsample_array[..., polarization].reshape(cube.shape)[:, rows]
     samples = np.abs(np.mean(data.channel_width)) * np.mean(data.integration_time) * counts

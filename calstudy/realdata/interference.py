@@ -9,7 +9,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
-from calstudy.measured.settings import Interference
+from calstudy.realdata.settings import Interference
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -23,9 +23,14 @@ NAMED = 8
 """Largest number of ranges of channels named in a note."""
 
 
+def has_surroundings(integrations: int, channels: int) -> bool:
+    """Return whether so many unflagged integrations and channels have surroundings."""
+    return integrations >= LEAST_INTEGRATIONS and channels >= LEAST_CHANNELS
+
+
 def require_surroundings(integrations: int, channels: int) -> None:
     """Raise InputError unless so many unflagged integrations and channels have surroundings."""
-    if integrations < LEAST_INTEGRATIONS or channels < LEAST_CHANNELS:
+    if not has_surroundings(integrations, channels):
         raise InputError(
             f"flag_interference: takes at least {LEAST_INTEGRATIONS} integrations and {LEAST_CHANNELS} channels that "
             f"are not flagged, and the data have {integrations} and {channels}"

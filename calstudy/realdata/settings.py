@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,12 +22,16 @@ from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Decibel, FluxDensity
+from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.corrupt.temperature import SystemTemperature
 from calstudy.instrument.settings import BEAMS
-from calstudy.measured.selection import Selection, parse_values
+from calstudy.realdata.selection import Selection, parse_values
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.settings import Eor
 
+DEFAULT = "calamity"
+# Real data of few baselines have directions that converge slowly, at next to no cost.
+PATIENT = {"name": "gauss-newton", "max_steps": 500}
 IN_PACKAGE = re.compile(r"(?P<package>[A-Za-z_][A-Za-z0-9_.]+):(?P<path>[^/\\].*)")
 """A file of an installed package: ``hera_qm:data/zen.uvh5``."""
 
@@ -45,7 +50,11 @@ def find_data(text: str, folder: Path) -> Path:
             path = folder / Path(text).expanduser()
         except RuntimeError:
             raise InputError(f"{text!r}: there is no such home folder") from None
-    if not path.exists():
+    try:
+        found = path.exists()
+    except OSError as error:
+        raise InputError(f"{text!r}: cannot be read ({error.strerror})") from None
+    if not found:
         raise InputError(f"{text!r}: no such file or folder (looked for {path.resolve()})")
     return path.resolve()
 
@@ -81,15 +90,15 @@ DataFiles = Annotated[
 ]
 
 
-def _can_be_a_range(value: str) -> str:
+def _require_selection(key: str, value: str) -> str:
     try:
-        parse_values({"frequencies": value}, "")
+        parse_values({key: value}, "")
     except InputError as error:
         raise fault("", f"{value!r}: {str(error).partition(': ')[2]}") from None
     return value
 
 
-FrequencyRange = Annotated[str, AfterValidator(_can_be_a_range)]
+FrequencyRange = Annotated[str, AfterValidator(lambda value: _require_selection("frequencies", value))]
 
 
 class Select(Section):
@@ -104,12 +113,7 @@ class Select(Section):
     @field_validator("*")
     @classmethod
     def _can_be_read(cls, value: str | None, info: ValidationInfo) -> str | None:
-        if value is not None:
-            try:
-                parse_values({str(info.field_name): value}, "")
-            except InputError as error:
-                raise fault("", f"{value!r}: {str(error).partition(': ')[2]}") from None
-        return value
+        return value if value is None else _require_selection(str(info.field_name), value)
 
     @property
     def selection(self) -> Selection:
@@ -151,15 +155,10 @@ def _as_block(value: Any) -> Any:
     return {True: {}, False: None}[value] if isinstance(value, bool) else value
 
 
-class ObservedSettings(Section):
-    """Measured visibilities in any format that pyuvdata reads; paths start at the file, or are ``package:path``."""
+class DataSettings(Section):
+    """Measured visibilities in any format that pyuvdata reads, and what is known of them."""
 
     data: DataFiles = Field(min_length=1, description="A file or folder, or several that belong together.")
-    odd: DataFiles = Field(
-        (),
-        description="Other data of the same sky, such as another night at the same sidereal time: spectra are data x "
-        "odd. Empty: every second integration of `data`.",
-    )
     select: Select = Select()
     flag: Annotated[tuple[FrequencyRange, ...], Field(strict=False)] = Field(
         (), description="Channels that are flagged, such as those of known interference: ['149.7 MHz..150.2 MHz']."
@@ -178,6 +177,16 @@ class ObservedSettings(Section):
     )
     sky_model: DataFile | None = Field(
         None, description="Visibilities of the sky as far as it is known, in Jy, with the times and channels of `data`."
+    )
+
+
+class ObservedSettings(DataSettings):
+    """Measured visibilities in any format that pyuvdata reads; paths start at the file, or are ``package:path``."""
+
+    odd: DataFiles = Field(
+        (),
+        description="Other data of the same sky, such as another night at the same sidereal time: spectra are data x "
+        "odd. Empty: every second integration of `data`.",
     )
     beam: Annotated[SerializeAsAny[Plugin], BEAMS.field()] = Field(
         description="The beam of the antennas; it normalizes power spectra, and the injected signal is seen through it."
@@ -205,3 +214,36 @@ class InjectionSettings(Section):
         "as `eor` says.",
     )
     simulation: SimulationSettings = SimulationSettings()
+
+
+def defaults(has_sky_model: bool) -> dict[str, Any]:
+    """Return default fields for measured data, which apply where a calibrator has them and the user does not set them.
+
+    Without a model of the sky the scale is not known; visibilities of any phase may sum to zero.
+    """
+    return {"solver": PATIENT} if has_sky_model else {"solver": PATIENT, "prior": "gains"}
+
+
+def with_defaults(content: Mapping[str, Any], chosen: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the content of a file about measured data with the defaults in its section `calibration`.
+
+    `chosen` is the content with the overrides, which tell the calibrator; relative paths start at `folder`. Invalid
+    content is returned unchanged, because validation reports the error.
+    """
+    own, block = (_calibration(found) for found in (content, chosen))
+    observed = chosen.get("observed")
+    if own is None or block is None or not isinstance(observed, Mapping):
+        return dict(content)
+    try:
+        found, _ = CALIBRATORS.class_of(block, DEFAULT, folder)
+    except InputError:
+        return dict(content)
+    usual = defaults(observed.get("sky_model") is not None)
+    return {**content, "calibration": {**{k: v for k, v in usual.items() if k in found.model_fields}, **own}}
+
+
+def _calibration(content: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the section `calibration` as a block, or None if it is invalid."""
+    section = content.get("calibration") or {}
+    block = {CALIBRATORS.tag: section} if isinstance(section, str) else section
+    return block if isinstance(block, Mapping) else None

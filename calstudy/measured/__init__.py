@@ -1,1 +1,0 @@
-"""Measured data: reading, selecting, halves that share the sky, their noise, and how well a calibration fits them."""

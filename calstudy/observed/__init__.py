@@ -1,1 +1,0 @@
-"""Calibration of measured data: reading, selection, output."""

@@ -1,0 +1,287 @@
+"""Calibration of measured data: what all studies of such data have, and the study that calibrates and no more."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Self, TypeVar
+
+from pydantic import Field, SerializeAsAny, model_validator
+from rich.console import Console
+
+from calstudy import __version__
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.observation import Frame
+from calstudy.base.plugins import guarded
+from calstudy.base.schema import Section, fault
+from calstudy.calibrate.calibrators.given_gains import ByFile
+from calstudy.calibrate.calibrators.least_squares import Calamity
+from calstudy.calibrate.execution import require_calibratable
+from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
+from calstudy.calibrate.settings import GainFit
+from calstudy.experiment.files import StudyFile, apply_scale, checked, input_files, override
+from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
+from calstudy.figures import figure_task
+from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, read_json
+from calstudy.products.observed import DataGraph, calibrated, observed, read_part
+from calstudy.products.observed_quality import QUALITY, TRANSFER, expected_transfer, quality
+from calstudy.realdata.halves import WHOLE, Facts, Parts, modelled, read_facts
+from calstudy.realdata.interference import require_surroundings
+from calstudy.realdata.settings import DataSettings, with_defaults
+from calstudy.run.execution import Workers
+from calstudy.run.store import Store, require_writable
+from calstudy.run.task import Task
+from calstudy.studies.capacity import fit
+from calstudy.studies.folder import LOG, log_to, publish
+from calstudy.studies.study import Budget, RunProducts, Study, make
+
+CALFITS, FIGURE, UNFINISHED = "gains.calfits", "diagnostics", ".unfinished"
+FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
+
+
+class ObservedOutputs(Folders):
+    """Figures, and the folders of products and runs."""
+
+    figures: Figures | None = Field(None, description="Figures of measured data; null: all.")
+
+
+class DataFile(Section):
+    """Measured data and their calibration."""
+
+    name: StudyName
+    description: str = ""
+    observed: DataSettings
+    calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Field(
+        default_factory=Calamity,
+        description="As in an experiment. Without `solver`, Gauss-Newton steps go on longer, for data of few baselines "
+        "converge slowly; without `prior` and sky model, the size of the gains fixes the scale.",
+    )
+    outputs: ObservedOutputs = Field(default_factory=ObservedOutputs)
+
+    @model_validator(mode="after")
+    def _calibration_is_of_measured_data(self) -> Self:
+        if self.calibration.assumed:
+            raise fault("calibration.assumed", "is for simulated data; give the sky model as observed.sky_model")
+        if isinstance(self.calibration, ByFile) and self.calibration.folder is not None:
+            raise fault("calibration.folder", "is for simulated data; give gains of measured data as calibration.gains")
+        return self
+
+
+File = TypeVar("File", bound=DataFile)
+
+
+def read_file(model: type[File], file: StudyFile) -> File:
+    """Return the content of a file of measured data, with the defaults for such data and absolute paths.
+
+    Raises ExperimentError if fields are unknown, missing or have values that are not allowed, or an input file does not
+    exist.
+    """
+    content = with_defaults(apply_scale(file.content, file.scale), file.changed(), file.folder)
+    changed = replace(file, content=content, scale=None).changed()
+    found = checked(model, changed, file.folder)
+    for field, block, name in input_files(found.calibration):
+        path = getattr(block, name)
+        if not (file.folder / path).exists():
+            raise ExperimentError([f"calibration.{field} = {str(path)!r}: no such file"])
+        changed = override(changed, f"calibration.{field}", str((file.folder / path).resolve()))
+    return checked(model, changed, file.folder)
+
+
+def read_selected(file: DataFile, files: tuple[Path, ...], even: bool = True) -> Facts:
+    """Read the metadata of the selected data; raises InputError as `read_facts`, or if the noise is not known.
+
+    `even` requires equally spaced channels.
+    """
+    section = file.observed
+    try:
+        facts = read_facts(files, section.select.selection, section.positions, even)
+    except InputError as error:
+        raise InputError(str(error).replace("--select ", "observed.select.")) from None
+    if file.calibration.needs_noise and not facts.autos:
+        raise InputError(
+            "calibration.foreground_prior.noise: must be given, for the data have no autocorrelations that tell it"
+        )
+    return facts
+
+
+class DataStudy(Study):
+    """A study of measured data, from its file and the metadata of their parts."""
+
+    def __init__(self, file: Any, data: Parts) -> None:
+        self.file, self.data = file, data
+
+    @cached_property
+    def frames(self) -> list[Frame]:
+        """Antennas, baselines and channels of the data that are calibrated, of each data set."""
+        path = self.file.observed.sky_model
+        frames = list({id(facts): facts.frame for facts in self.data.facts.values()}.values())
+        return frames if path is None else [modelled(frame, path) for frame in frames]
+
+    @cached_property
+    def solve_plan(self) -> SolvePlan:
+        """Properties of the calibration that are known before it starts."""
+        with guarded(self.file.calibration):
+            return self.file.calibration.plan(self.frames[0])
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the calibrator on settings that will not work well."""
+        return self.solve_plan.notes
+
+    def sized_to(self, budget: Budget) -> tuple[Self, int]:
+        """Return the study fitted to a budget, and the number of workers.
+
+        Raises InputError if the memory is too small, the calibrator refuses the data, or they are too few for a search
+        for interference.
+        """
+        if self.file.observed.flag_interference is not None:
+            for facts in self.data.facts.values():
+                require_surroundings(facts.times.size, facts.frequencies.size)
+        for frame in self.frames:
+            require_calibratable(self.file.calibration, frame, self.file.observed.sky_model is not None)
+        file, workers = fit(self.file, budget, lambda file: type(self)(file, self.data).targets)
+        return type(self)(file, self.data), workers
+
+
+class CalibrationFile(DataFile):
+    """Measured data that are calibrated as a whole, and the results that are wanted; they go to `outputs.runs`."""
+
+    calfits: bool = Field(False, description="Also write the gains as calfits.")
+    expected_loss: bool = Field(False, description="Also write the signal loss that the fit is expected to cause.")
+
+
+class DataCalibration(DataStudy):
+    """The calibration of all data of a file together, in their own unit."""
+
+    def __init__(self, file: CalibrationFile, data: Parts) -> None:
+        super().__init__(file, data)
+        self.graph = DataGraph(file.observed, file.calibration, data)
+
+    @classmethod
+    def load(cls, file: StudyFile) -> DataCalibration:
+        """Return the calibration of a file, with the metadata of its data."""
+        content = read_file(CalibrationFile, file)
+        if content.expected_loss and not isinstance(content.calibration, GainFit):
+            label = content.calibration.label
+            raise InputError(f"--expected-loss: is known for fits by least squares, and {label} is none")
+        return cls(content, Parts({WHOLE: read_selected(content, content.observed.data, even=False)}))
+
+    @property
+    def content(self) -> Any:
+        """Nothing: results go to the folder of the user's choice."""
+        return None
+
+    @cached_property
+    def figures(self) -> list[Task]:
+        """The diagnostics."""
+        return [figure_task(FIGURES.make(FIGURE), {"": self.graph}, (), {})]
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The calibration, its quality, and the signal loss if it is wanted."""
+        expected = [expected_transfer(self.graph, WHOLE)] if self.file.expected_loss else []
+        return [calibrated(self.graph, WHOLE), quality(self.graph), *expected]
+
+    def described(self) -> str:
+        """Return a sentence on the data and the solves."""
+        frame, details = self.frames[0], self.solve_plan.details
+        cross = frame.n_baselines - int(frame.autos.sum())
+        solves = len(self.file.calibration.solves(frame.n_times)) * frame.n_polarizations
+        memory = max(task.cost.memory for task in self.tables[0].needs.values())
+        return (
+            f"{frame.n_antennas} antennas, {cross} baselines, {frame.n_channels} channels, {frame.n_times} "
+            f"integrations, {frame.n_polarizations} polarizations: {solves} solves{f', {details}' if details else ''}, "
+            f"about {memory / 1e9:.1f} GB"
+        )
+
+    def read(self) -> list[str]:
+        """Read all input files without calibrating; return sentences on what is done to the data, and on doubts.
+
+        Raises InputError if a file cannot be used.
+        """
+        from calstudy.base.gains import read_gains
+        from calstudy.base.observation import Observation
+        from calstudy.calibrate.weights import conspicuous
+
+        data, _, notes = read_part(observed(self.graph, WHOLE).settings)
+        if self.start is not None:
+            read_gains(self.start, "calibration.initial_gains.path")
+        return [*notes, *conspicuous(Observation(data))]
+
+    @property
+    def start(self) -> Path | None:
+        """The file of gains from which the calibration starts; None for another start."""
+        gains = getattr(self.file.calibration, "initial_gains", None)
+        return gains.path if gains is not None and gains.kind == "file" else None
+
+    def run(self, console: Console) -> dict[str, Any]:
+        """Calibrate, write the results to the folder, and return the content of solution.json.
+
+        The products are kept in a hidden folder until the results are written, so that another run resumes. Raises
+        InputError if a stage refuses its input, or the folder cannot be written.
+        """
+        store = Store(self.outputs.store)
+        store.prepare()
+        with log_to(store.root / LOG):
+            made = make(self.targets, store, Workers(1, store.root / LOG), console)
+            solution = self._write(made)
+        shutil.rmtree(store.root, ignore_errors=True)
+        return solution
+
+    def _write(self, made: RunProducts) -> dict[str, Any]:
+        """Write all results or none."""
+        folder = self.outputs.runs
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as temporary:
+            work = Path(temporary)
+            publish([made.products[task.key] for task in self.targets], work)
+            solution = self._solution(made, read_json(work / SOLUTION), read_json(work / QUALITY)[WHOLE])
+            (work / QUALITY).unlink()
+            (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
+            if self.file.calfits:
+                from pyuvdata import UVCal
+
+                UVCal.from_file(work / GAINS).write_calfits(str(work / CALFITS))
+            for path in work.iterdir():
+                path.replace(folder / path.name)
+        return solution
+
+    def _solution(self, made: RunProducts, solved: Mapping[str, Any], found: dict[str, Any]) -> dict[str, Any]:
+        """Return the request, the changes of the data, what stands out, and every solve, as plain JSON types."""
+        section = self.file.observed
+        tasks = (observed(self.graph, WHOLE), *self.tables)
+        notes = [made.products[task.key].record["notes"] for task in tasks]
+        return {
+            "calstudy": __version__,
+            "data": [str(path) for path in section.data],
+            "sky_model": None if section.sky_model is None else str(section.sky_model),
+            "gains": None if self.start is None else str(self.start),
+            "selection": asdict(section.select.selection),
+            "flag_interference": section.flag_interference is not None,
+            "settings": self.file.calibration.model_dump(mode="json"),
+            "notes": notes[0]["changes"],
+            "warnings": [text for note in notes for text in note.get("warnings", ())],
+            "plan": self.described(),
+            "quality": found.pop("quality"),
+            "chi_squared": found or None,
+            "solves": len(solved["records"]),
+            "by_status": solved["by_status"],
+            "seconds": sum(record["seconds"] for record in solved["records"]),
+            "records": solved["records"],
+        }
+
+
+def require_free(output: Path, overwrite: bool) -> None:
+    """Raise InputError if a folder cannot be written, or has results of a calibration that may not be replaced."""
+    if output.exists() and not output.is_dir():
+        raise InputError(f"--output {output}: is a file, not a folder")
+    names = (GAINS, CALFITS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
+    present = [name for name in names if (output / name).exists()]
+    present += [path.name for path in sorted(output.glob(f"{TRANSFER}.*.h5"))]
+    if present and not overwrite:
+        raise InputError(f"--output {output}: holds {', '.join(present)} already; use --overwrite or another folder")
+    require_writable(output.absolute(), f"--output {output}")
