@@ -197,13 +197,13 @@ def _absolute(
     """
     faults, resolved = [], data
     if sky.foregrounds.kind == "gleam" and sky.foregrounds.path is None:
-        from calstudy.sky.gleam import default_path
+        from calstudy.sky.catalogue import gleam_path
 
-        resolved = override(resolved, "sky.foregrounds.path", str(default_path()))
-        if not default_path().is_file():
+        resolved = override(resolved, "sky.foregrounds.path", str(gleam_path()))
+        if not gleam_path().is_file():
             raise ExperimentError(
                 [
-                    f"{prefix}sky.foregrounds: GLEAM is not on this machine (looked for {default_path()}); get it with "
+                    f"{prefix}sky.foregrounds: GLEAM is not on this machine (looked for {gleam_path()}); get it with "
                     "'calstudy data fetch gleam', give a file under sky.foregrounds.path, or use 'g4jy-and-counts'"
                 ]
             )

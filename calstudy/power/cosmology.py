@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from astropy.cosmology import FLRW
     from hera_pspec.conversions import Cosmo_Conversions
 
+    from calstudy.sky.settings import Eor
+
+
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 
@@ -92,3 +95,16 @@ def _effective_densities(cosmology: FLRW, z: float) -> tuple[float, float]:
 
     dark_energy = brentq(excess, 0.3, 1.2, xtol=1e-13)
     return dark_energy, matter(dark_energy)
+
+
+MILLIKELVIN2 = 1e6
+
+
+def input_power(settings: Eor, k: np.ndarray, cosmology: str) -> np.ndarray:
+    """Return the input P(k), mK^2 h^-3 Mpc^3, at wavenumbers `k` (h/Mpc, any shape).
+
+    Amplitude and shape in the settings of the EoR sky are in units without h.
+    """
+    h = float(make_cosmology(cosmology).h)
+    index = settings.index if settings.spectrum == "power-law" else 0.0
+    return MILLIKELVIN2 * h**3 * settings.amplitude * (np.asarray(k) * h / settings.pivot_k) ** index

@@ -39,7 +39,7 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
     """
     import numpy as np
 
-    from calstudy.power.cylindrical import cylindrical_average
+    from calstudy.power.binned import cylindrical_average
     from calstudy.power.tables import save_spectrum
 
     settings = job.settings["power"]
@@ -85,8 +85,8 @@ def _write_spherical(
 ) -> None:
     from dataclasses import replace
 
+    from calstudy.power.binned import modes_in_bins, spherical_average
     from calstudy.power.errors import noise_error, with_errors
-    from calstudy.power.spherical import modes_in_bins, spherical_average
     from calstudy.power.tables import save_spectrum, write_csv
     from calstudy.realdata.noise import noise_of_units
 

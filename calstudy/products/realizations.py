@@ -78,9 +78,9 @@ def reduce(job: Job) -> Mapping[str, Any]:
 
     Errors are as in `calstudy.products.spectra`.
     """
-    from calstudy.power.drawn import input_power
+    from calstudy.power.binned import make_bin_edges, spherical_average
+    from calstudy.power.cosmology import input_power
     from calstudy.power.errors import noise_level, with_errors
-    from calstudy.power.spherical import make_bin_edges, spherical_average
     from calstudy.power.tables import save_spectrum
 
     power = job.settings["power"]

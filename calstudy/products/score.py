@@ -57,11 +57,11 @@ def score(graph: Graph) -> Task | None:
 
 def make_score(job: Job) -> Mapping[str, Any]:
     """Write the scores in bins and in bands of k, and all numbers to score.json."""
+    from calstudy.power.binned import make_bin_edges
     from calstudy.power.score import BANDS as EDGES
     from calstudy.power.score import CalibratedSpectra
     from calstudy.power.score import score as measure
     from calstudy.power.spectra import of_common_units
-    from calstudy.power.spherical import make_bin_edges
     from calstudy.power.tables import save_spectrum
 
     names = ("signal", "response", "cross", "residual", "residual_without_eor")

@@ -148,9 +148,8 @@ def average_spectra(job: Job) -> Mapping[str, Any]:
     """
     import numpy as np
 
-    from calstudy.power.cylindrical import cylindrical_average
+    from calstudy.power.binned import cylindrical_average, spherical_average
     from calstudy.power.errors import noise_level, with_errors
-    from calstudy.power.spherical import spherical_average
     from calstudy.power.tables import save_spectrum, write_csv
 
     settings = job.settings["power"]

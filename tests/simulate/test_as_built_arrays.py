@@ -24,7 +24,7 @@ from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.other_packages import PyuvsimEngine
 
 SMALL = {
     "name": "built",
