@@ -46,6 +46,7 @@ from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study, study_of
 from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Budget, Study, run_study
+from calstudy.verdicts.standing import LIMIT
 
 if TYPE_CHECKING:
     import pandas
@@ -344,6 +345,29 @@ class OpenRun:
 
         rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._tables.summary["bands"]]
         return pandas.DataFrame(rows).drop(columns="k").set_index(["k_from", "k_to"])
+
+    def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> pandas.DataFrame:
+        """Return which calibrators of a comparison have a bias below a limit in all, or some, worlds, by band of k.
+
+        Columns are `standing` ("passes", "open" or "fails"), `worlds`, those that decide, `bias_below`, the 95 % upper
+        limit in these worlds in units of the EoR, and `transfer`, the smallest T. A table without rows for other runs.
+        """
+        import pandas
+
+        found = self._folder.standings(limit, worlds)
+        rows = [
+            (
+                *entry.band,
+                entry.calibrator,
+                entry.standing,
+                [world.world for world in entry.decisive],
+                entry.upper_limit,
+                entry.transfer,
+            )
+            for entry in found
+        ]
+        columns = ["k_from", "k_to", "calibrator", "standing", "worlds", "bias_below", "transfer"]
+        return pandas.DataFrame(rows, columns=columns).set_index(columns[:3])
 
     @property
     def claims(self) -> pandas.DataFrame:

@@ -18,6 +18,7 @@ from calstudy.report.charts import Chart, read_charts
 from calstudy.report.headline import Number, read_headline, read_signal
 from calstudy.results.folder import EXPERIMENT, MANIFEST, RunFolder
 from calstudy.run.progress import duration
+from calstudy.verdicts.standing import answers, standing_table
 from calstudy.verdicts.tables import CLAIMS_JSON, marked, tally
 from calstudy.verdicts.tables import measured as number_measured
 
@@ -40,10 +41,10 @@ class Picture:
 class Contents:
     """All contents of a report.
 
-    Facts are short statements by name, such as the time, the machine and versions. Pictures and tables are in the
-    order of the page, below the headline. Files, tables and records, are relative to the run folder. Parts are the
-    run folders of which this one consists: name and relative path of their reports. The experiment is the resolved
-    file, or empty.
+    Facts are short statements by name, such as the time, the machine and versions. Answers say which calibrators of a
+    comparison pass. Pictures and tables are in the order of the page, below the headline. Files, tables and records,
+    are relative to the run folder. Parts are the run folders of which this one consists: name and relative path of
+    their reports. The experiment is the resolved file, or empty.
     """
 
     title: str
@@ -54,6 +55,7 @@ class Contents:
     pictures: Sequence[Picture]
     tables: Sequence[Table]
     headline: Sequence[Number] = ()
+    answers: Sequence[str] = ()
     files: Sequence[str] = ()
     parts: Sequence[tuple[str, str]] = field(default=())
     experiment: str = ""
@@ -65,7 +67,9 @@ def read_contents(run: RunFolder) -> Contents:
     experiment = run.path / EXPERIMENT
     text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
     sky_model = f" Sky model: {manifest['sky_model']}." if "sky_model" in manifest else ""
+    found = run.standings()
     tables = [
+        standing_table(found) if found else None,
         _claims(run),
         _summary(run.path),
         _comparison(run.path),
@@ -87,6 +91,7 @@ def read_contents(run: RunFolder) -> Contents:
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),
+        answers=answers(found),
         files=_files(run.path),
         parts=_parts(run),
         experiment=text,

@@ -20,6 +20,7 @@ from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.study import Budget, Run, Study, said_of_other_code
+from calstudy.verdicts.standing import answers, standing_table
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_MARKDOWN, measured, tally
 
 NAMED = 8
@@ -175,6 +176,7 @@ def _show_products(run: Run, console: Console) -> None:
     for warning in run.warnings:
         console.print(f"warning: {warning}", markup=False)
     _show_signal(run.folder, console)
+    _show_answer(run.folder, console)
     for figure in sorted((run.folder / "figures").glob("*.png")):
         console.print(f"figure: {figure}", markup=False)
     if (run.folder / "tables").is_dir():
@@ -193,6 +195,18 @@ def _show_signal(folder: Path, console: Console) -> None:
     console.print(f"{PLACE}: {numbers}", markup=False)
     if signal.excess is not None:
         console.print(f"warning: {signal.excess}", markup=False)
+
+
+def _show_answer(folder: Path, console: Console) -> None:
+    """Print which calibrators of a comparison pass; nothing for other runs."""
+    found = RunFolder(folder).standings()
+    if not found:
+        return
+    table = standing_table(found)
+    table.show(console, numbers=False)
+    console.print(table.note, markup=False)
+    for sentence in answers(found):
+        console.print(sentence, markup=False)
 
 
 def _show_criteria(folder: Path, console: Console) -> None:
