@@ -259,6 +259,7 @@ class LoadedStudy:
         return "\n".join(
             (
                 f"study {self.name!r}: {self._study.description}",
+                *([self._study.setup] if self._study.setup else []),
                 f"figures: {', '.join(figures) or 'none'}",
                 f"run folder: {self.folder}",
             )
@@ -457,7 +458,8 @@ class OpenRun:
         numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))
         finished = self._manifest.get("finished", "at an unknown time")
         lines = [f"run {self.name!r}, finished {finished}, in {self.folder}", f"figures: {', '.join(self.figures)}"]
-        return "\n".join([*lines, numbers] if numbers else lines)
+        setup = [self._manifest["setup"]] if "setup" in self._manifest else []
+        return "\n".join([*lines, *setup, *([numbers] if numbers else [])])
 
     def _repr_html_(self) -> str:
         from html import escape

@@ -49,6 +49,7 @@ class Contents:
 
     title: str
     description: str
+    setup: str
     facts: Mapping[str, str]
     stand_ins: Sequence[str]
     warnings: Sequence[str]
@@ -85,6 +86,7 @@ def read_contents(run: RunFolder) -> Contents:
     return Contents(
         title=run.name,
         description=manifest.get("description") or (run.content.get("description", "") if text else ""),
+        setup=manifest.get("setup", ""),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
         warnings=[*excess, *(f"{label}: {text}" for label, text in _warnings(run.products))],

@@ -72,6 +72,7 @@ def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[st
         notes.insert(0, f"--max-memory {budget.max_memory} is more than this machine has")
     return {
         "name": study.name,
+        "setup": study.setup,
         "workers": workers,
         "stages": stages,
         "seconds": sum(task.cost.seconds for task in plan.todo),
@@ -106,6 +107,8 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
             _gigabytes(row["disk"]) if made else "-",
         )
     console.print(table)
+    if plan["setup"]:
+        console.print(plan["setup"], markup=False)
     for product in plan["damaged"]:
         console.print(f"damaged, will be made again: {product}", markup=False)
     for sentence in plan["other_code"]:
@@ -187,8 +190,11 @@ def _show_products(run: Run, console: Console) -> None:
 
 
 def _show_signal(folder: Path, console: Console) -> None:
-    """Print T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
-    signal = read_signal(RunFolder(folder))
+    """Print what was calibrated, T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
+    run = RunFolder(folder)
+    if "setup" in run.manifest:
+        console.print(run.manifest["setup"], markup=False)
+    signal = read_signal(run)
     if signal is None:
         return
     numbers = ", ".join(f"{number.name} {number.text}" for number in signal.numbers)

@@ -210,6 +210,11 @@ class Study(ABC):
         return {}
 
     @property
+    def setup(self) -> str:
+        """What is calibrated, and how, in one line; empty if it is not the same for all parts."""
+        return ""
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes of a plan on settings that are probably a mistake, of the study and its parts, once each."""
         return tuple(dict.fromkeys(note for part in self.parts.values() for note in part.notes))
@@ -268,6 +273,7 @@ class Study(ABC):
         places = {name: os.path.relpath(part.folder, self.folder) for name, part in self.parts.items()}
         entries = {
             "description": self.description,
+            **({"setup": self.setup} if self.setup else {}),
             "stand_ins": list(self.stand_ins),
             "captions": {task.label: task.settings["figure"].caption for task in self.figures},
             **({"parts": places} if places else {}),
