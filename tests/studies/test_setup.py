@@ -18,7 +18,7 @@ def test_the_line_of_the_paper_is_that_of_the_paper():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("corruption.noise={kind: none}", "no noise"),
+        ("corruption.noise={kind: radiometer, nights: 3}", "thermal noise of 3 nights"),
         ("corruption.effects=[]", "no gains"),
         ("instrument.layout={kind: hex, side: 3, spacing: 10 m}", "19 antennas (hex), baselines to 40 m"),
         ("calibration.calibrator=redcal", "redcal"),
