@@ -27,7 +27,11 @@ MaxMemory = Annotated[
     typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster in place of own workers.")
+    str | None,
+    typer.Option(
+        metavar="TCP://HOST:PORT",
+        help="Use a running dask cluster in place of own workers: its address, or the scheduler file that it wrote.",
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
 

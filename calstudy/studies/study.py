@@ -6,7 +6,7 @@ import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,8 @@ from calstudy.base.schema import Section
 from calstudy.experiment.files import StudyFile, dump
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
-from calstudy.run.execution import Lifetimes, Schedule, Workers, drop, execute, found_of, schedule
+from calstudy.run.execution import Lifetimes, Schedule, Workers, execute, found_of, schedule
+from calstudy.run.leases import Lease
 from calstudy.run.progress import report
 from calstudy.run.provenance import of_other_code, other_code
 from calstudy.run.store import Product, Store
@@ -312,7 +313,18 @@ def make(
     InputError
         If the store must be written and cannot be, or a stage refuses its input.
     """
-    plan = schedule(targets, store, strict=strict)
+    lease = Lease(store)
+    if targets and not store.root.exists():
+        store.prepare()
+    # A store that cannot be written is not changed.
+    is_shared = os.access(store.root, os.W_OK)
+    with lease.holding(task.key for task in unique(targets)) if is_shared else nullcontext():
+        return _make_missing(schedule(targets, store, strict=strict), targets, lease, store, workers, console)
+
+
+def _make_missing(
+    plan: Schedule, targets: Sequence[Task], lease: Lease, store: Store, workers: Workers, console: Console
+) -> RunProducts:
     if plan.todo:
         store.prepare()
     messages = [
@@ -323,14 +335,14 @@ def make(
         logger.warning(message)
         console.print(message, markup=False)
     lifetimes = Lifetimes(targets, plan.todo)
-    drop(lifetimes.unused(), store)
+    lease.drop(lifetimes.unused())
     costs = {task.key: task.cost.seconds for task in plan.todo}
     with report(plan.todo, costs, workers.count, console) as show:
 
         def done(task: Task, product: Product) -> None:
             logger.info("%s (%s): %.1f s", task.stage.name, task.label, product.record["seconds"])
             show(task, product)
-            drop(lifetimes.after(task), store)
+            lease.drop(lifetimes.after(task))
 
         def told(text: str) -> None:
             logger.warning(text)
