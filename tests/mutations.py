@@ -3,8 +3,8 @@
     python tests/mutations.py                 makes all of them, each in a copy of the repository
     python tests/mutations.py sign            those whose names contain "sign"
 
-A mutation replaces a text, which the package has once, and runs some of the tests. It *survives* if they pass; then a
-test is missing. The exit status is the number of survivors. `test_mutations.py` holds that every text is still there.
+A mutation replaces a text, which the package has once, and runs some of the tests, which pass without it. It *survives*
+if they pass with it, too; then a test is missing. The exit status is the number of survivors. `test_mutations.py` holds that every text is still there.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -217,14 +218,25 @@ def copied(folder: Path) -> None:
             shutil.copy2(ROOT / name, folder / name, follow_symlinks=False)
 
 
+@cache
+def pass_without(tests: tuple[str, ...]) -> bool:
+    """Return whether tests pass in a copy of the repository without any mutation."""
+    return _pass(tests, None)
+
+
 def survives(mutation: Mutation) -> bool:
     """Return whether the tests pass in a copy of the repository with the mutation."""
+    return _pass(mutation.tests, mutation)
+
+
+def _pass(tests: tuple[str, ...], mutation: Mutation | None) -> bool:
     with tempfile.TemporaryDirectory(prefix="mutation-") as name:
         folder = Path(name)
         copied(folder)
-        path = mutation.place(folder)
-        path.write_text(path.read_text("utf-8").replace(mutation.old, mutation.new), encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *mutation.tests]
+        if mutation is not None:
+            path = mutation.place(folder)
+            path.write_text(path.read_text("utf-8").replace(mutation.old, mutation.new), encoding="utf-8")
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
         environment = {**os.environ, "PYTHONPATH": str(folder)}
         return subprocess.run(command, cwd=folder, env=environment, capture_output=True, check=False).returncode == 0
 
@@ -234,6 +246,8 @@ def main(*words: str) -> int:
     chosen = [one for one in MUTATIONS if not words or any(word in one.name for word in words)]
     survivors = 0
     for mutation in chosen:
+        if not pass_without(mutation.tests):
+            raise SystemExit(f"{', '.join(mutation.tests)}: fail without any mutation; mend them first")
         alive = survives(mutation)
         survivors += alive
         print(f"{'SURVIVES' if alive else 'noticed '}  {mutation.name}", flush=True)
