@@ -4,7 +4,8 @@
     python tests/mutations.py sign            those whose names contain "sign"
 
 A mutation replaces a text, which the package has once, and runs some of the tests, which pass without it. It *survives*
-if they pass with it, too; then a test is missing. The exit status is the number of survivors. `test_mutations.py` holds that every text is still there.
+if they pass with it, too; then a test is missing. The exit status is the number of survivors. `test_mutations.py` holds
+that every text is still there.
 """
 
 from __future__ import annotations
