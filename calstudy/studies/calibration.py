@@ -84,11 +84,13 @@ def read_file(model: type[File], file: StudyFile) -> File:
     content = with_defaults(apply_scale(file.content, file.scale), file.changed(), file.folder)
     changed = replace(file, content=content, scale=None).changed()
     found = checked(model, changed, file.folder)
-    for field, block, name in input_files(found.calibration):
-        path = getattr(block, name)
-        if not (file.folder / path).exists():
-            raise ExperimentError([f"calibration.{field} = {str(path)!r}: no such file"])
-        changed = override(changed, f"calibration.{field}", str((file.folder / path).resolve()))
+    sections = {name: getattr(found, name, None) for name in ("calibration", "injection")}
+    for place, section in sections.items():
+        for field, block, name in input_files(section, f"{place}.") if section is not None else ():
+            path = getattr(block, name)
+            if not (file.folder / path).exists():
+                raise ExperimentError([f"{field} = {str(path)!r}: no such file"])
+            changed = override(changed, field, str((file.folder / path).resolve()))
     return checked(model, changed, file.folder)
 
 
