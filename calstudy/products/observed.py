@@ -229,7 +229,7 @@ def _factor(job: Job, data: UVData) -> float:
     import numpy as np
 
     from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
-    from calstudy.corrupt.temperature import effective_area
+    from calstudy.corrupt.noise import effective_area
     from calstudy.instrument.beams import make_beam
 
     scale = job.settings.get("flux_scale")
