@@ -179,6 +179,12 @@ class DataSettings(Section):
         None, description="Visibilities of the sky as far as it is known, in Jy, with the times and channels of `data`."
     )
 
+    @field_validator("*")
+    @classmethod
+    def _input_files_exist(cls, value: Any, info: ValidationInfo) -> Any:
+        """Accept folders as well, which `find_data` found."""
+        return value
+
 
 class ObservedSettings(DataSettings):
     """Measured visibilities in any format that pyuvdata reads; paths start at the file, or are ``package:path``."""

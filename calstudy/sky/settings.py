@@ -5,11 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
-from calstudy.base.schema import Section, choice, fault
+from calstudy.base.downloads import default_directory
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import load_function
+from calstudy.base.schema import Section, choice, fault, folder_of_files
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
 
+GLEAM_FILE = "gleam_egc.vot"
+"""Name of the catalogue in the folder of downloads."""
 VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
 BRIGHTEST_SOURCE = 197.0
 """Flux density of the brightest G4Jy component, Jy at 200 MHz, rounded down; a higher flux limit keeps no sources."""
@@ -55,6 +60,19 @@ class GleamSources(PointSources):
     path: Path | None = Field(
         None, strict=False, description="Catalogue file; default: the file stored by `calstudy data fetch gleam`."
     )
+
+    @model_validator(mode="after")
+    def _catalogue_is_there(self, info: ValidationInfo) -> GleamSources:
+        if self.path is not None or folder_of_files(info) is None:
+            return self
+        path = default_directory() / GLEAM_FILE
+        if not path.is_file():
+            raise fault(
+                "",
+                f"GLEAM is not on this machine (looked for {path}); get it with 'calstudy data fetch gleam', give a "
+                "file under sky.foregrounds.path, or use 'g4jy-and-counts'",
+            )
+        return self.model_copy(update={"path": path.resolve()})
 
 
 class SyntheticSources(PointSources):
@@ -139,6 +157,15 @@ class CodeSources(Section):
     path: Path = Field(strict=False, description="Python file; a relative path starts at the experiment file.")
     function: str = Field(description="Name of the function in it.")
     options: dict[str, Any] = Field(default_factory=dict, description="Given to the function as keyword arguments.")
+
+    @model_validator(mode="after")
+    def _function_is_there(self, info: ValidationInfo) -> CodeSources:
+        if folder_of_files(info) is not None:
+            try:
+                load_function(self.path, self.function)
+            except InputError as error:
+                raise fault("", str(error)) from None
+        return self
 
 
 class NoSources(Section):
