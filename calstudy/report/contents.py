@@ -13,6 +13,7 @@ from calstudy.report.charts import Chart, read_charts
 from calstudy.report.headline import Number, read_headline, read_signal
 from calstudy.results.folder import EXPERIMENT, MANIFEST, RunFolder
 from calstudy.run.progress import duration
+from calstudy.verdicts.standing import answers, standing_table
 from calstudy.verdicts.tables import CLAIMS_JSON, tally, verdict_table
 
 CLAIMS_TITLE = "Claims of the paper"
@@ -33,20 +34,22 @@ class Picture:
 class Contents:
     """All contents of a report.
 
-    Facts are short statements by name, such as the time, the machine and versions. Pictures and tables are in the
-    order of the page, below the headline. Files, tables and records, are relative to the run folder. Parts are the
-    run folders of which this one consists: name and relative path of their reports. The experiment is the resolved
-    file, or empty.
+    Facts are short statements by name, such as the time, the machine and versions. Answers say which calibrators of a
+    comparison pass. Pictures and tables are in the order of the page, below the headline. Files, tables and records,
+    are relative to the run folder. Parts are the run folders of which this one consists: name and relative path of
+    their reports. The experiment is the resolved file, or empty.
     """
 
     title: str
     description: str
+    setup: str
     facts: Mapping[str, str]
     stand_ins: Sequence[str]
     warnings: Sequence[str]
     pictures: Sequence[Picture]
     tables: Sequence[Table]
     headline: Sequence[Number] = ()
+    answers: Sequence[str] = ()
     files: Sequence[str] = ()
     parts: Sequence[tuple[str, str]] = field(default=())
     experiment: str = ""
@@ -58,7 +61,9 @@ def read_contents(run: RunFolder) -> Contents:
     experiment = run.path / EXPERIMENT
     text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
     sky_model = f" Sky model: {manifest['sky_model']}." if "sky_model" in manifest else ""
+    found = run.standings()
     tables = [
+        standing_table(found) if found else None,
         _claims(run),
         *run.shown,
         _convergence(run.products, sky_model),
@@ -70,12 +75,14 @@ def read_contents(run: RunFolder) -> Contents:
     return Contents(
         title=run.name,
         description=manifest.get("description") or (run.content.get("description", "") if text else ""),
+        setup=manifest.get("setup", ""),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
         warnings=[*excess, *(f"{label}: {text}" for label, text in _warnings(run.products))],
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),
+        answers=answers(found),
         files=_files(run.path),
         parts=_parts(run),
         experiment=text,

@@ -17,8 +17,10 @@ from calstudy.base.table import Table, from_json
 from calstudy.experiment.files import validate
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import read_mapping
+from calstudy.products import comparison
 from calstudy.results.reader import Tables
 from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.standing import LIMIT, InBand, standings
 from calstudy.verdicts.tables import CLAIMS_JSON
 from calstudy.verdicts.tables import from_json as verdicts_from_json
 
@@ -122,6 +124,29 @@ class RunFolder:
             return {path.stem: _arrays(path) for path in sorted(self.figures.glob("*.npz"))}
         except (OSError, ValueError, KeyError) as error:
             raise InputError(f"{self.path}: its figures cannot be read ({error})") from None
+
+    def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> list[InBand]:
+        """Return how calibrators stand against a limit of the bias, in all or some worlds; empty without comparison."""
+        scores = self._scores
+        for world in worlds or ():
+            if world not in scores:
+                raise InputError(f"{world!r}: no world of the comparison (there are: {', '.join(scores)})")
+        chosen = {world: scores[world] for world in worlds or scores}
+        return standings(chosen, self.manifest.get("refusals", ()), limit)
+
+    @property
+    def _scores(self) -> Mapping[str, Mapping[str, Any]]:
+        """The scores of a comparison by world and calibrator; empty for other runs."""
+        path = self.path / "tables" / comparison.JSON
+        if not path.is_file():
+            return {}
+        try:
+            scores = json.loads(path.read_text(encoding="utf-8"))
+            # Reads all that is needed.
+            standings(scores)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError):
+            raise InputError(f"{path}: is damaged; run the comparison again") from None
+        return scores
 
     @property
     def has_claims(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -158,7 +158,7 @@ class CalibrationFile(DataFile):
 
 
 class DataCalibration(DataStudy):
-    """The calibration of all data of a file together, in their own unit."""
+    """The calibration of all data together, in their own unit."""
 
     def __init__(self, file: CalibrationFile, data: Parts) -> None:
         super().__init__(file, data)
@@ -170,7 +170,7 @@ class DataCalibration(DataStudy):
         content = read_file(CalibrationFile, file)
         if content.expected_loss and not isinstance(content.calibration, GainFit):
             label = content.calibration.label
-            raise InputError(f"--expected-loss: is known for fits by least squares, and {label} is none")
+            raise InputError(f"expected_loss: is known for fits by least squares, and {label} is none")
         return cls(content, Parts({WHOLE: read_selected(content, content.observed.data, even=False)}))
 
     @property
@@ -277,13 +277,20 @@ class DataCalibration(DataStudy):
         }
 
 
+def calibration_file(sections: Mapping[str, Any], output: Path, overrides: Sequence[str] = ()) -> StudyFile:
+    """Return the content of a `CalibrationFile` for a folder of results; paths start at the working directory."""
+    outputs = {"store": str(output / UNFINISHED), "runs": str(output)}
+    content = {"name": "calibration", **sections, "outputs": outputs}
+    return StudyFile(Path("calibration.yaml"), content, overrides=list(overrides))
+
+
 def require_free(output: Path, overwrite: bool) -> None:
     """Raise InputError if a folder cannot be written, or has results of a calibration that may not be replaced."""
     if output.exists() and not output.is_dir():
-        raise InputError(f"--output {output}: is a file, not a folder")
+        raise InputError(f"output = {output}: is a file, not a folder")
     names = (GAINS, CALFITS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
     present = [name for name in names if (output / name).exists()]
     present += [path.name for path in sorted(output.glob(f"{TRANSFER}.*.h5"))]
     if present and not overwrite:
-        raise InputError(f"--output {output}: holds {', '.join(present)} already; use --overwrite or another folder")
-    require_writable(output.absolute(), f"--output {output}")
+        raise InputError(f"output = {output}: holds {', '.join(present)} already; use `overwrite` or another folder")
+    require_writable(output.absolute(), f"output = {output}")

@@ -13,7 +13,8 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import UserCodeError
 from calstudy.base.resources import Cost
 from calstudy.run import execution
-from calstudy.run.execution import Lifetimes, Workers, drop, execute, largest_disk, schedule
+from calstudy.run.execution import Lifetimes, Workers, execute, largest_disk, schedule
+from calstudy.run.leases import Lease
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Store
 from calstudy.run.task import Inputs, Piece, Task
@@ -101,9 +102,9 @@ def test_a_store_that_can_only_be_read_keeps_its_temporary_products(store, monke
 
     with monkeypatch.context() as patched:
         patched.setattr(Store, "discard", refuse)
-        drop(Lifetimes([total], ()).unused(), store)
+        Lease(store).drop(Lifetimes([total], ()).unused())
     assert store.find("number", piece.key) is not None
-    drop(Lifetimes([total], ()).unused(), store)
+    Lease(store).drop(Lifetimes([total], ()).unused())
     assert store.find("number", piece.key) is None
     assert store.find("number", total.key) is not None
 
@@ -132,7 +133,7 @@ def test_a_run_that_was_interrupted_drops_nothing_that_it_still_needs(store):
     assert todo == (second, total)
     assert Lifetimes([total], todo).unused() == []
     run(total, store)
-    drop(Lifetimes([total], schedule([total], store).todo).unused(), store)
+    Lease(store).drop(Lifetimes([total], schedule([total], store).todo).unused())
     assert all(store.find("number", task.key) is None for task in (data, first, second))
     assert schedule([total], store).todo == ()
 
@@ -148,7 +149,7 @@ def test_a_product_that_another_run_made_to_be_kept_is_not_dropped(store):
     kept, fleeting = chain(temporary=False), chain(temporary=True)
     run(kept[1], store)
     run(fleeting[-1], store)
-    drop(Lifetimes([fleeting[-1]], ()).unused(), store)
+    Lease(store).drop(Lifetimes([fleeting[-1]], ()).unused())
     found = [store.find("number", task.key) is not None for task in fleeting]
     # Data and first half were made to be kept, the second half was not; the total is not temporary.
     assert found == [True, True, False, True]
@@ -278,7 +279,8 @@ DYING = """
 import os, signal, time
 from pathlib import Path
 from calstudy.run import execution
-from calstudy.run.execution import Lifetimes, Workers, drop, execute, schedule
+from calstudy.run.execution import Lifetimes, Workers, execute, schedule
+from calstudy.run.leases import Lease
 from calstudy.run.store import Store
 from calstudy.run.task import Input, Task
 
@@ -303,7 +305,7 @@ if __name__ == "__main__":
     last = Made("last", name="last", data=result)
     todo = schedule([last], store).todo
     lifetimes = Lifetimes([last], todo)
-    execute(todo, store, Workers(2, Path("run.log")), lambda task, product: drop(lifetimes.after(task), store))
+    execute(todo, store, Workers(2, Path("run.log")), lambda task, product: Lease(store).drop(lifetimes.after(task)))
     print(store.find("stage", last.key) is not None, store.find("stage", data.key) is None)
 """
 

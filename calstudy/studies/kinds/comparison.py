@@ -14,7 +14,7 @@ import yaml
 from pydantic import Field, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.identity import identity
+from calstudy.base.identity import digest_json, identity
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, choice, fault
 from calstudy.calibrate.interface import CALIBRATORS
@@ -412,7 +412,17 @@ def _make_cases(
                 refusals[label] = refusal
     if faults:
         raise ExperimentError([f"{sentence} (in {_listed(found)})" for sentence, found in faults.items()])
+    _require_different_worlds(members, list(worlds))
     return members, refusals
+
+
+def _require_different_worlds(members: Mapping[str, Experiment], worlds: Sequence[str]) -> None:
+    """Raise ExperimentError if two worlds are the same experiment, whose cases would be the same twice."""
+    seen: dict[str, str] = {}
+    for row, world in enumerate(worlds):
+        same = seen.setdefault(digest_json(identity(_what_is_made(members[case_name(row, 0)]))), world)
+        if same != world:
+            raise ExperimentError([f"worlds: {world!r} is the same as {same!r}; change a field in it, or remove it"])
 
 
 def _listed(cases: Sequence[str]) -> str:

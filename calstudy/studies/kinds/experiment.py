@@ -28,6 +28,7 @@ from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit, require_data_fit
 from calstudy.studies.preflight import notes_of, require_possible
+from calstudy.studies.setup import describe_data, describe_setup
 from calstudy.studies.study import Budget, Study, built_in_kinds
 
 SKY_MODEL_TABLE = "sky-model.csv"
@@ -79,6 +80,11 @@ class ExperimentStudy(Study):
     def notes(self) -> tuple[str, ...]:
         """Notes of a plan on settings that are allowed, but probably a mistake."""
         return notes_of(self.experiment)
+
+    @property
+    def setup(self) -> str:
+        """The array, band, times, gains, noise and calibrator."""
+        return describe_setup(self.experiment)
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
@@ -193,6 +199,12 @@ class Family(Study):
             "file": {name: identity(getattr(self.file, name)) for name in names},
             "members": {name: study.folder.name for name, study in self.studies.items()},
         }
+
+    @property
+    def setup(self) -> str:
+        """The data of all members, if they are the same."""
+        found = {describe_data(experiment) for experiment in self.members.values()}
+        return found.pop() if len(found) == 1 else ""
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
