@@ -243,7 +243,7 @@ class Registry(Generic[P]):
             raise InputError(f"{reference!r} is not a subclass of {self.base.__module__}.{self.base.__name__}")
         return found
 
-    def make(self, block: Any, default: str | None = None, folder: Path | None = None) -> P:
+    def make(self, block: Any, default: str | None = None, **context: Any) -> P:
         """Return the plug-in that a block of settings describes.
 
         Parameters
@@ -252,8 +252,8 @@ class Registry(Generic[P]):
             A name or path, a block of settings with the tag, or a plug-in, which is returned unchanged.
         default
             Name for a block without the tag.
-        folder
-            Folder to which paths of files are relative; the working directory if None.
+        context
+            Of the validation: `folder` is where relative paths of files start; the working directory without it.
 
         Raises
         ------
@@ -265,8 +265,8 @@ class Registry(Generic[P]):
         if isinstance(block, self.base):
             return block
         block = {self.tag: block} if isinstance(block, str) else dict(block)
-        found, reference = self.class_of(block, default, folder)
-        return found.model_validate({**block, self.tag: reference}, context={"folder": folder})
+        found, reference = self.class_of(block, default, context.get("folder"))
+        return found.model_validate({**block, self.tag: reference}, context=context)
 
     def class_of(self, block: Mapping[str, Any], default: str | None, folder: Path | None) -> tuple[type[P], str]:
         """Return the class for a block of settings, and its name or absolute path; raises as `make`."""
@@ -289,14 +289,14 @@ class Registry(Generic[P]):
             del handler
             if not isinstance(value, str | Mapping | self.base):
                 raise fault("", f"must be the name of {self.a_noun}, a file.py, or a block with {self.tag!r}")
-            folder = (info.context or {}).get("folder")
+            context = info.context or {}
             try:
-                return self.make(value, default, folder)
+                return self.make(value, default, **context)
             except ValidationError as error:
                 content = dict(value) if isinstance(value, Mapping) else {self.tag: value}
-                model = self.class_of(content, default, folder)[0]
-                context = {"error": error, "content": content, "model": model}
-                raise PydanticCustomError(NESTED, "nested", context) from None
+                model = self.class_of(content, default, context.get("folder"))[0]
+                nested = {"error": error, "content": content, "model": model}
+                raise PydanticCustomError(NESTED, "nested", nested) from None
             except InputError as error:
                 path = self.tag if isinstance(value, Mapping) else ""
                 raise fault(path, str(error)) from None

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler
+from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler, ValidationInfo, field_validator
 from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
@@ -27,6 +27,23 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _input_files_exist(cls, value: Any, info: ValidationInfo) -> Any:
+        """Make the path of an input file absolute, which starts at the folder of the experiment file."""
+        folder = folder_of_files(info)
+        if folder is None or not isinstance(value, Path):
+            return value
+        wanted = "folder" if cls.model_fields[str(info.field_name)].json_schema_extra == FOLDER else "file"
+        path = folder / expand_user(value)
+        try:
+            found = path.is_dir() if wanted == "folder" else path.is_file()
+        except OSError as error:
+            raise unusable(f"cannot be read ({error.strerror}; looked for {path})") from None
+        if not found:
+            raise unusable(f"no such {wanted} (looked for {path})")
+        return path.resolve()
 
     def with_defaults(self, *names: str) -> Self:
         """Return a copy in which the named fields have their defaults, for code that does not read them."""
@@ -89,6 +106,27 @@ def choice(key: str, default: str | None = None) -> BeforeValidator:
         return value
 
     return ChoiceValidator(expand, key=key, default=default)
+
+
+def folder_of_files(info: ValidationInfo) -> Path | None:
+    """Return the folder at which paths of input files start, which must exist; None if they are not looked for."""
+    context = info.context or {}
+    return context.get("folder") if context.get("files", True) else None
+
+
+def expand_user(path: Path) -> Path:
+    """Replace a leading ~ by the home folder; for validators of paths."""
+    if "\0" in str(path):
+        raise unusable("no file can have this name")
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        raise unusable("there is no such home folder") from None
+
+
+def unusable(sentence: str) -> PydanticCustomError:
+    """Return the error for the value of a field, which the message has before the sentence."""
+    return PydanticCustomError("unusable", "{sentence}", {"sentence": sentence})
 
 
 def fault(path: str, sentence: str) -> PydanticCustomError:

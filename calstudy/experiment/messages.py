@@ -10,6 +10,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import nearest
+from calstudy.base.paths import value_at
 from calstudy.base.plugins import NESTED
 
 KINDS = {
@@ -86,16 +87,10 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
 
 def _written(data: Any, path: str) -> str:
     """Return the value at the dotted path as the file has it."""
-    for step in path.split("."):
-        if isinstance(data, dict) and step in data:
-            data = data[step]
-        elif isinstance(data, list | tuple) and step.isdigit() and int(step) < len(data):
-            data = data[int(step)]
-        else:
-            return ""
-    if data is None:
+    value = value_at(data, path, {})
+    if value is None:
         return " (empty)"
-    return f" = {data!r}" if not isinstance(data, dict | list) else ""
+    return f" = {value!r}" if not isinstance(value, dict | list) else ""
 
 
 def _unit(holder: type[BaseModel] | None, field: int | str) -> str:

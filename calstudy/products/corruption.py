@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.corrupt.interface import Effect, GainEffect
-from calstudy.corrupt.settings import NoNoise, RadiometerNoise
+from calstudy.corrupt.noise import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Variant
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.settings import InstrumentSettings

@@ -203,7 +203,7 @@ class Observe(Task, stage="observe", version=2):
         import numpy as np
 
         from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
-        from calstudy.corrupt.temperature import effective_area
+        from calstudy.corrupt.noise import effective_area
         from calstudy.instrument.beams import make_beam
 
         scale = self.flux_scale

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from calstudy.base import paths
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.assumed import SKY_MODEL, AssumedWorld, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
@@ -58,21 +59,13 @@ def differences(graph: Graph) -> list[tuple[str, str, str]]:
     world = assumed_world(experiment)
     true = AssumedWorld(sky=experiment.sky, instrument=experiment.instrument)
     before, after = (_without_errors(found.model_dump(mode="json")) for found in (true, world))
-    return [*_differences(before, after), *_differences_as_built(experiment)]
+    rows = [(path, _text(value), _text(other)) for path, value, other in paths.differences(before, after)]
+    return [*rows, *_differences_as_built(experiment)]
 
 
 def _without_errors(world: dict[str, Any]) -> dict[str, Any]:
     """Return a world without the deviations of its antennas from the nominal ones, which have a row of their own."""
     return {**world, "instrument": {key: value for key, value in world["instrument"].items() if key != "as_built"}}
-
-
-def _differences(true: Any, assumed: Any, path: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield the fields in which two nested plain values differ; blocks of different kinds are yielded as a whole."""
-    if isinstance(true, Mapping) and isinstance(assumed, Mapping) and true.get("kind") == assumed.get("kind"):
-        for key in {**true, **assumed}:
-            yield from _differences(true.get(key), assumed.get(key), f"{path}.{key}" if path else key)
-    elif true != assumed:
-        yield path, _text(true), _text(assumed)
 
 
 def _differences_as_built(experiment: Experiment) -> list[tuple[str, str, str]]:

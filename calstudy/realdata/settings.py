@@ -23,7 +23,7 @@ from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Decibel, FluxDensity
 from calstudy.calibrate.interface import CALIBRATORS
-from calstudy.corrupt.temperature import SystemTemperature
+from calstudy.corrupt.noise import SystemTemperature
 from calstudy.instrument.settings import BEAMS
 from calstudy.realdata.selection import Selection, parse_values
 from calstudy.simulate.settings import SimulationSettings
@@ -178,6 +178,12 @@ class DataSettings(Section):
     sky_model: DataFile | None = Field(
         None, description="Visibilities of the sky as far as it is known, in Jy, with the times and channels of `data`."
     )
+
+    @field_validator("*")
+    @classmethod
+    def _input_files_exist(cls, value: Any, info: ValidationInfo) -> Any:
+        """Accept folders as well, which `find_data` found."""
+        return value
 
 
 class ObservedSettings(DataSettings):

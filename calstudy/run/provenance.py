@@ -20,6 +20,7 @@ from calstudy.base.files import sha256
 from calstudy.base.identity import digest_json
 from calstudy.base.kept_arrays import kept_arrays
 from calstudy.base.package_files import PackageFile
+from calstudy.base.paths import leaves
 from calstudy.base.resources import cores
 from calstudy.run.source import source_of
 from calstudy.run.store import Product
@@ -170,15 +171,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def seeds(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return every seed in nested settings, by its dotted path."""
-    found: dict[str, Any] = {}
-    for key, value in settings.items():
-        if key in ("seed", "seeds"):
-            found[f"{prefix}{key}"] = value
-        elif isinstance(value, Mapping) and key != "scales":
-            found |= seeds(value, f"{prefix}{key}.")
-        elif isinstance(value, list):
-            blocks = {str(place): item for place, item in enumerate(value) if isinstance(item, Mapping)}
-            found |= seeds(blocks, f"{prefix}{key}.")
-    return found
+def seeds(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return every seed in nested settings but those of scales, by its dotted path."""
+    found = {path: value for path, value in leaves(settings) if path.rpartition(".")[2] in ("seed", "seeds")}
+    return {path: value for path, value in found.items() if not path.startswith("scales.")}

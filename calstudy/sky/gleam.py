@@ -9,6 +9,7 @@ from calstudy.base.downloads import default_directory, download
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.sky.catalogue import read_gleam_table
+from calstudy.sky.settings import GLEAM_FILE
 
 LOG = logging.getLogger(__name__)
 
@@ -17,13 +18,12 @@ URL = (
     "https://vizier.cds.unistra.fr/viz-bin/votable?-source=VIII/100/gleamegc&-out.max=unlimited"
     "&-out=GLEAM&-out=RAJ2000&-out=DEJ2000&-out=Fintwide&-out=alpha"
 )
-FILE = "gleam_egc.vot"
 SOURCES = 307_455
 
 
 def default_path() -> Path:
     """Return the default path of the catalogue that `fetch_gleam` downloads."""
-    return default_directory() / FILE
+    return default_directory() / GLEAM_FILE
 
 
 def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
@@ -35,7 +35,7 @@ def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
     InputError if the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
     """
     directory = default_directory() if directory is None else directory
-    path = directory / FILE
+    path = directory / GLEAM_FILE
     if path.is_file() and hash_file(path).is_file():
         verify(path)
         return path
@@ -49,7 +49,7 @@ def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
     if found != SOURCES:
         path.unlink()
         raise InputError(f"the download from VizieR holds {found} sources, GLEAM has {SOURCES}: try again")
-    hash_file(path).write_text(f"{sha256(path)}  {FILE}\n")
+    hash_file(path).write_text(f"{sha256(path)}  {GLEAM_FILE}\n")
     return path
 
 

@@ -15,7 +15,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 from rich.console import Console
 
 from calstudy import __version__
-from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
@@ -24,7 +24,7 @@ from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
 from calstudy.calibrate.settings import GainFit
-from calstudy.experiment.files import StudyFile, apply_scale, checked, input_files, override
+from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
 from calstudy.products.expected_loss import TRANSFER, expected_transfer
@@ -85,12 +85,6 @@ def read_file(model: type[File], file: StudyFile) -> File:
     """
     content = with_defaults(apply_scale(file.content, file.scale), file.changed(), file.folder)
     changed = replace(file, content=content, scale=None).changed()
-    found = checked(model, changed, file.folder)
-    for field, block, name in input_files(found.calibration):
-        path = getattr(block, name)
-        if not (file.folder / path).exists():
-            raise ExperimentError([f"calibration.{field} = {str(path)!r}: no such file"])
-        changed = override(changed, f"calibration.{field}", str((file.folder / path).resolve()))
     return checked(model, changed, file.folder)
 
 

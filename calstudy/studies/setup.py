@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calstudy.corrupt.settings import NoiseRelativeToEor, NoiseRelativeToForegrounds, NoNoise, RadiometerNoise
+from calstudy.corrupt.noise import NoiseRelativeToEor, NoiseRelativeToForegrounds, NoNoise, RadiometerNoise
 from calstudy.experiment.model import Experiment
 from calstudy.studies.preflight import frame_of
 

@@ -127,7 +127,7 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
 
 def sites(tasks: Sequence[Task]) -> list[str]:
     """Name the sites of the arrays of simulations, once each."""
-    from calstudy.instrument.sites import describe
+    from calstudy.instrument.layouts import describe
 
     instruments = [task.settings["instrument"] for task in tasks if "instrument" in task.settings]
     return list(dict.fromkeys(describe(found.site) for found in instruments))

@@ -12,8 +12,7 @@ from tiny import tiny
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
 from calstudy.base.observation import Observation
-from calstudy.corrupt.effects.crosstalk import Crosstalk
-from calstudy.corrupt.effects.mutual_coupling import MutualCoupling
+from calstudy.corrupt.effects.additive import Crosstalk, MutualCoupling
 from calstudy.corrupt.interface import apply_effect, draw_truth
 from calstudy.experiment.files import dump, override, validate
 from calstudy.instrument.as_built import position_offsets

@@ -244,7 +244,7 @@ def test_fetched_gleam_is_proved_and_then_held_to_its_hash(tmp_path, monkeypatch
     monkeypatch.setattr("pooch.retrieve", download)
     with pytest.raises(InputError, match="6 sources, GLEAM has 307455"):
         gleam.fetch_gleam(tmp_path, progress=False)
-    assert not (tmp_path / gleam.FILE).exists()
+    assert not (tmp_path / gleam.GLEAM_FILE).exists()
     monkeypatch.setattr(gleam, "SOURCES", 6)
     path = gleam.fetch_gleam(tmp_path, progress=False)
     assert gleam.fetch_gleam(tmp_path, progress=False) == path

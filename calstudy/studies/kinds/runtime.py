@@ -20,8 +20,7 @@ from calstudy.claims.product import run_time_claims
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Folders, Papers, StudyName
 from calstudy.figures import draw_task
-from calstudy.instrument.array_layouts.linear import LinearLayout
-from calstudy.instrument.array_layouts.rectangular import RectangularLayout
+from calstudy.instrument.array_layouts.geometric import LinearLayout, RectangularLayout
 from calstudy.instrument.settings import Channels
 from calstudy.products.run_times import CountSteps, RunTimes, TimedArray, TimeSteps
 from calstudy.run.provenance import machine, package_versions
