@@ -19,12 +19,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import yaml
 
 from calstudy.base.errors import InputError, nearest
 from calstudy.experiment.files import StudyFile
+from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
 from calstudy.products.files import (
     DATA,
@@ -40,7 +41,7 @@ from calstudy.report.headline import read_headline
 from calstudy.results.folder import EXPERIMENT, RunFolder
 from calstudy.results.reader import Tables
 from calstudy.run.store import Store
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Task
 from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study, study_of
@@ -450,9 +451,9 @@ class OpenRun:
             raise InputError(
                 f"{name!r}: no figure of this study{nearest(name, list(tasks))}; it has {', '.join(tasks)}"
             )
-        task = tasks[name]
+        task = cast(Draw, tasks[name])
         inputs = {needed: self._product(other, study) for needed, other in task.needs.items()}
-        return task.settings["figure"].draw(Job(settings=task.settings, inputs=inputs, output=self.folder)).figure
+        return task.given(inputs).drawing(self.folder).figure
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))

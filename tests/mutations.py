@@ -169,7 +169,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a key without the version",
-        "own = [self.stage.name, self.stage.version, identity(self.settings), inputs]",
+        "own = [*self.stage, identity(self.settings), inputs]",
         "own = [self.stage.name, identity(self.settings), inputs]",
         KEYS,
     ),
@@ -181,8 +181,8 @@ MUTATIONS = (
     ),
     Mutation(
         "a version raised alone",
-        'Stage(name="simulate-chunk", version=',
-        'Stage(name="simulate-chunk", version=1',
+        'stage="simulate-chunk", version=',
+        'stage="simulate-chunk", version=1',
         KEYS,
     ),
     Mutation(
@@ -191,7 +191,7 @@ MUTATIONS = (
         'elif value != default and name != "tolerance":\n            content',
         KEYS,
     ),
-    Mutation("a lock that is not taken", "with store.lock(order.stage.name, order.key, told):", "if True:", STORE),
+    Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, told):", "if True:", STORE),
     Mutation("verify reads no file", 'sha256(product.path / name) == entry["sha256"]', "True", STORE),
     Mutation("a kept product is dropped", 'product.record.get("temporary") and ', "", STORE),
     Mutation("what other runs need is dropped", " and task.key not in needed", "", STORE),

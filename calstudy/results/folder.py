@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.table import Table, from_json
 from calstudy.experiment.files import validate
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import read_mapping
@@ -20,9 +21,10 @@ from calstudy.products import comparison
 from calstudy.results.reader import Tables
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.standing import LIMIT, InBand, standings
-from calstudy.verdicts.tables import CLAIMS_JSON, from_json
+from calstudy.verdicts.tables import CLAIMS_JSON
+from calstudy.verdicts.tables import from_json as verdicts_from_json
 
-MANIFEST, EXPERIMENT = "manifest.json", "experiment.yaml"
+MANIFEST, EXPERIMENT, SHOWN = "manifest.json", "experiment.yaml", "tables.json"
 NO_RUN = "is not the folder of a finished run; give one that 'calstudy run' printed"
 
 
@@ -105,6 +107,12 @@ class RunFolder:
         return Tables((self.path / "tables",))
 
     @property
+    def shown(self) -> list[Table]:
+        """The tables of a report that were made with the products; none in runs of earlier versions."""
+        path = self.path / "tables" / SHOWN
+        return from_json(path.read_text(encoding="utf-8")) if path.is_file() else []
+
+    @property
     def figures(self) -> Path:
         """The folder of the figures; that of a reference is the folder itself."""
         inside = self.path / "figures"
@@ -155,7 +163,7 @@ class RunFolder:
         if not path.is_file():
             return []
         try:
-            return from_json(path.read_text(encoding="utf-8"))
+            return verdicts_from_json(path.read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError, KeyError):
             raise InputError(f"{path}: is damaged; {remedy}") from None
 

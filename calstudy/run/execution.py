@@ -194,7 +194,7 @@ def _announce_and_perform(order: WorkOrder) -> Product:
     from distributed import get_worker
 
     worker = get_worker()
-    worker.log_event(BEGUN, {"worker": worker.address, "product": f"{order.stage.name} ({order.label})"})
+    worker.log_event(BEGUN, {"worker": worker.address, "product": order.name})
     return perform(order, lambda text: worker.log_event(WAITS, text))
 
 

@@ -27,9 +27,11 @@ from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
+from calstudy.products.expected_loss import TRANSFER, expected_transfer
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, read_json
-from calstudy.products.observed import DataGraph, calibrated, observed, read_part
-from calstudy.products.observed_quality import QUALITY, TRANSFER, expected_transfer, quality
+from calstudy.products.graph import MeasuredGraph
+from calstudy.products.observed import calibrated, observed
+from calstudy.products.observed_results import QUALITY, quality
 from calstudy.realdata.halves import WHOLE, Facts, Parts, modelled, read_facts
 from calstudy.realdata.interference import require_surroundings
 from calstudy.realdata.settings import DataSettings, with_defaults
@@ -154,7 +156,7 @@ class DataCalibration(DataStudy):
 
     def __init__(self, file: CalibrationFile, data: Parts) -> None:
         super().__init__(file, data)
-        self.graph = DataGraph(file.observed, file.calibration, data)
+        self.graph = MeasuredGraph(file, data)
 
     @classmethod
     def load(cls, file: StudyFile) -> DataCalibration:
@@ -202,7 +204,7 @@ class DataCalibration(DataStudy):
         from calstudy.base.observation import Observation
         from calstudy.calibrate.weights import conspicuous
 
-        data, _, notes = read_part(observed(self.graph, WHOLE).settings)
+        data, _, notes = observed(self.graph, WHOLE).read()
         if self.start is not None:
             read_gains(self.start, "calibration.initial_gains.path")
         return [*notes, *conspicuous(Observation(data))]

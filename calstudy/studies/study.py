@@ -17,9 +17,11 @@ from rich.console import Console
 from calstudy.base.identity import digest_json
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
+from calstudy.base.table import to_json
 from calstudy.experiment.files import StudyFile, dump
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
+from calstudy.results.folder import SHOWN
 from calstudy.run.execution import Lifetimes, Schedule, Workers, execute, found_of, schedule
 from calstudy.run.leases import Lease
 from calstudy.run.progress import report
@@ -266,6 +268,8 @@ class Study(ABC):
         publish([made.products[task.key] for task in self.figures], self.folder / "figures")
         if self.tables:
             publish([made.products[task.key] for task in self.tables], self.folder / "tables")
+            shown = [table for task in self.tables for table in task.shown(made.products[task.key].path)]
+            write(self.folder / "tables" / SHOWN, to_json(shown))
         if self.claims is not None:
             publish([made.products[self.claims.key]], self.folder)
         for name, text in self.texts.items():

@@ -14,16 +14,22 @@ from calstudy.base.resources import Cost
 from calstudy.run.execution import Lifetimes, Workers, execute, schedule
 from calstudy.run.leases import LOCK, Lease, needed_by_runs
 from calstudy.run.store import Store
-from calstudy.run.task import Job, Stage, Task, unique
+from calstudy.run.task import Piece, Task, unique
 
 
-def write_number(job: Job) -> Mapping[str, Any]:
-    (job.output / "number.txt").write_text(str(job.settings["number"]))
-    return {}
+class Number(Task, stage="number"):
+    number: int
+    data: Piece = None
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        (output / "number.txt").write_text(str(self.number))
+        return {}
+
+    def _cost(self) -> Cost:
+        return Cost(1)
 
 
-NUMBER = Stage(name="number", version=1, make=write_number, cost=lambda task: Cost(1))
-DATA = Task(NUMBER, "data", {"number": 1}, temporary=True)
+DATA = Number("data", number=1, temporary=True)
 
 HOLD = """
 import sys, time
@@ -39,7 +45,7 @@ with Lease(Store(Path(sys.argv[1]))).holding([sys.argv[2]]):
 
 def total(number: int) -> Task:
     """Return what one member of an array makes from the data that all have in common."""
-    return Task(NUMBER, f"total {number}", {"number": number}, {}, {"data": DATA})
+    return Number(f"total {number}", number=number, data=DATA)
 
 
 @pytest.fixture

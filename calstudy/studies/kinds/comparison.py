@@ -26,7 +26,7 @@ from calstudy.figures import StudyFigure, figures_for
 from calstudy.products import tolerances
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import score
+from calstudy.products.score import MeasureScore, score
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
 from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
@@ -254,9 +254,9 @@ class Comparison(Family):
         }
 
     @cached_property
-    def scores(self) -> dict[str, Task]:
+    def scores(self) -> dict[str, MeasureScore]:
         """The scores of every case that is not refused."""
-        return {label: study.targets[0] for label, study in self.studies.items()}
+        return {label: required(score(study.graph)) for label, study in self.studies.items()}
 
     @cached_property
     def tables(self) -> list[Task]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,6 +10,7 @@ from typing import Any, Self
 
 from calstudy.base.errors import InputError
 from calstudy.base.identity import identity
+from calstudy.base.table import Table
 from calstudy.claims.paper import stand_ins, unique_notes
 from calstudy.claims.product import claims
 from calstudy.experiment.files import StudyFile
@@ -141,20 +140,14 @@ class ExperimentStudy(Study):
         """Return as CSV the deviations of each antenna from the nominal instrument."""
         instrument = self.experiment.instrument
         numbers = make_layout(instrument.layout).numbers
-        table = io.StringIO()
-        rows = csv.writer(table, lineterminator="\n")
-        rows.writerow(("number", *COLUMNS))
         found = as_built_rows(instrument.as_built, len(numbers))
-        rows.writerows((number, *row) for number, row in zip(numbers, found, strict=True))
-        return table.getvalue()
+        rows = [(number, *row) for number, row in zip(numbers, found, strict=True)]
+        return Table(("number", *COLUMNS), rows).csv()
 
     def _sky_model_table(self) -> str:
         """Return as CSV the false assumptions of the calibrator, after a line that describes its sky model."""
-        table = io.StringIO()
-        table.write(f"# sky model: {sky_model.described(self.graph)}\n")
-        rows = csv.writer(table, lineterminator="\n")
-        rows.writerows([("field", "true", "assumed"), *sky_model.differences(self.graph)])
-        return table.getvalue()
+        table = Table(("field", "true", "assumed"), sky_model.differences(self.graph))
+        return f"# sky model: {sky_model.described(self.graph)}\n{table.csv()}"
 
 
 @dataclass(frozen=True, eq=False)
