@@ -6,15 +6,14 @@ u is the change of ln|g|, that is, the relative change of the amplitude while it
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field
 
 from calstudy.base.schema import Section, choice
 from calstudy.base.units import Phase, Time
-from calstudy.corrupt.shapes import KINDS, Shape
+from calstudy.corrupt.shapes import Delays, Polynomial
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
@@ -22,24 +21,7 @@ if TYPE_CHECKING:
 SECONDS_PER_DAY = 86400
 
 
-def _word_or_shape(value: Any) -> str | None:
-    if value in ("common", "independent"):
-        return "word"
-    return "shape" if isinstance(value, Mapping | Section) or value in KINDS else None
-
-
-Channels = Annotated[
-    Annotated[Literal["common", "independent"], Tag("word")] | Annotated[Shape, Tag("shape")],
-    Discriminator(
-        _word_or_shape,
-        custom_error_type="fault",
-        custom_error_message="{sentence}",
-        custom_error_context={
-            "path": "",
-            "sentence": f"must be common, independent, or a shape ({', '.join(KINDS)})",
-        },
-    ),
-]
+Channels = Annotated[Literal["common", "independent"] | Polynomial | Delays, choice("kind", "polynomial")]
 
 
 class _Drift(Section, ABC):
@@ -144,4 +126,4 @@ class Jumps(_Drift):
         return np.cumsum(np.sqrt(counts) * random.standard_normal((*shape, len(seconds))), axis=-1)
 
 
-Drift = Annotated[RandomWalk | Sinusoid | Jumps, Field(discriminator="kind"), choice("kind")]
+Drift = Annotated[RandomWalk | Sinusoid | Jumps, choice("kind")]

@@ -46,5 +46,4 @@ class Delays(_Shape):
         return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
 
 
-Shape = Annotated[Polynomial | Delays, Field(discriminator="kind"), choice("kind", "polynomial")]
-KINDS = ("polynomial", "delays")
+Shape = Annotated[Polynomial | Delays, choice("kind", "polynomial")]
