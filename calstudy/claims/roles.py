@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.distance import pdist
 
 from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.paths import differences
 from calstudy.calibrate.settings import WeightedFit
 from calstudy.corrupt.drift import Delays
 from calstudy.corrupt.effects.gains import Bandpass
@@ -78,20 +79,11 @@ def other_faults(experiment: Experiment, allowed: str | None = None) -> str | No
 
     A role may require a fault in the field `allowed` of `instrument.as_built`, such as "dipoles.dead_tiles".
     """
-    nominal = dict(_fields(AsBuilt().model_dump()))
-    for path, value in _fields(experiment.instrument.as_built.model_dump()):
-        if path != allowed and not path.endswith("seed") and value != nominal.get(path):
+    for path, _, value in differences(AsBuilt().model_dump(), experiment.instrument.as_built.model_dump()):
+        if path != allowed and not path.endswith("seed"):
             return f"instrument.as_built.{path} is {value}"
     others = [effect.label for effect in experiment.corruption.effects if not isinstance(effect, GainEffect)]
     return f"corruption.effects has {others[0]}" if others else None
-
-
-def _fields(block: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in block.items():
-        if isinstance(value, Mapping):
-            yield from _fields(value, f"{above}{key}.")
-        else:
-            yield f"{above}{key}", value
 
 
 def k_of_delay(experiment: Experiment, delay: float) -> float:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import Field, ValidationError
 
 from calstudy.base.errors import ExperimentError
-from calstudy.base.schema import Section
+from calstudy.base.paths import leaves, with_value
+from calstudy.base.schema import Section, plain
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.settings import InstrumentSettings
@@ -29,6 +30,12 @@ class AssumedWorld(Section):
     instrument: InstrumentSettings
 
 
+class AssumedFile(Section):
+    """The file of visibilities that the calibrator assumes."""
+
+    sky_model: Path = Field(strict=False)
+
+
 def assumed_changes(assumed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the changes of `calibration.assumed` as one dotted path for each value.
 
@@ -40,7 +47,7 @@ def assumed_changes(assumed: Mapping[str, Any]) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     faults = []
-    for path, value in _flat(assumed):
+    for path, value in leaves(assumed, whole=lambda block: "kind" in block):
         if path in found:
             faults.append(f"{FIELD}.{path}: is given twice")
         elif path != SKY_MODEL and not (path.startswith(("sky.", "instrument.")) and all(path.split("."))):
@@ -61,14 +68,6 @@ def assumed_changes(assumed: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _flat(block: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in block.items():
-        if isinstance(value, Mapping) and value and "kind" not in value:
-            yield from _flat(value, f"{above}{key}.")
-        else:
-            yield f"{above}{key}", value
-
-
 def assumed_world(experiment: Experiment, folder: Path | None = None) -> AssumedWorld:
     """Return the sky and the instrument from which the sky model of the calibrator is simulated.
 
@@ -79,9 +78,12 @@ def assumed_world(experiment: Experiment, folder: Path | None = None) -> Assumed
     values; and channels, times or polarizations that are not those of the data.
     """
     changes = {path: value for path, value in assumed_changes(experiment.calibration.assumed).items() if "." in path}
+    nominal = AssumedWorld(sky=experiment.sky, instrument=experiment.instrument.nominal())
     if not changes:
-        return AssumedWorld(sky=experiment.sky, instrument=experiment.instrument.nominal())
-    content = assumed_content(experiment, changes)
+        return nominal
+    content = nominal.model_dump(mode="json")
+    for path, value in changes.items():
+        content = with_value(content, path, plain(value), lambda above, given: {})
     try:
         world = AssumedWorld.model_validate(content, context={"folder": folder})
     except ValidationError as error:
@@ -95,28 +97,3 @@ def assumed_world(experiment: Experiment, folder: Path | None = None) -> Assumed
             ]
         )
     return world
-
-
-def assumed_content(experiment: Experiment, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sky and the nominal instrument of an experiment as plain values, with changes (dotted path: value)."""
-    content: dict[str, Any] = {
-        "sky": experiment.sky.model_dump(mode="json"),
-        "instrument": experiment.instrument.nominal().model_dump(mode="json"),
-    }
-    for path, value in changes.items():
-        block = content
-        *parents, last = path.split(".")
-        for step in parents:
-            inner = block.get(step)
-            block[step] = inner if isinstance(inner, dict) else {}
-            block = block[step]
-        block[last] = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
-    return content
-
-
-def value_at(content: Mapping[str, Any], path: str) -> Any:
-    """Return the value at a dotted path of nested plain values; None if there is none."""
-    value: Any = content
-    for step in path.split("."):
-        value = value.get(step) if isinstance(value, Mapping) else None
-    return value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, cast
+from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
@@ -126,6 +126,8 @@ class Convergence(Section):
 
 class Folders(Section):
     """Folders of products and runs."""
+
+    holds_input_files: ClassVar[bool] = False
 
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")

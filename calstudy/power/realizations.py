@@ -1,4 +1,4 @@
-r"""Pooling of realizations: quantities, their means and scatter (`calstudy.power.blocks`), and coverage.
+r"""Pooling of realizations: quantities, their means and scatter (`calstudy.power.realizations`), and coverage.
 
 A study draws its parts (EoR, gains, noise) again in blocks. Each of B blocks draws its own parts K_b times and leaves
 the others as they are in the first realization, x_0, which is in every block. A measured quantity is

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from calstudy.base.paths import leaves
 from calstudy.base.table import Table
 from calstudy.report.contents import CLAIMS_TITLE, Contents, Picture, read_contents
 from calstudy.results.folder import RunFolder
@@ -61,7 +62,7 @@ def _matched(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, t
 
 
 def _differences(first: str, second: str, names: tuple[str, str]) -> Table:
-    fields = [dict(_leaves(yaml.safe_load(text) or {})) if text else {} for text in (first, second)]
+    fields = [dict(leaves(yaml.safe_load(text) or {})) if text else {} for text in (first, second)]
     rows = [
         (name, *(str(found.get(name, "-")) for found in fields))
         for name in dict.fromkeys([*fields[0], *fields[1]])
@@ -69,15 +70,6 @@ def _differences(first: str, second: str, names: tuple[str, str]) -> Table:
     ]
     note = "" if rows else "The experiments do not differ."
     return Table(("field", *names), rows, "Fields that differ", note)
-
-
-def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted path and the value of every field that is not a block."""
-    if isinstance(value, dict):
-        for name, item in value.items():
-            yield from _leaves(item, f"{path}.{name}" if path else str(name))
-    else:
-        yield path, value
 
 
 def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -> Table | None:
@@ -91,5 +83,5 @@ def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -
         (*statement, *(text for pair in zip_longest(*(side or ("", "") for side in sides)) for text in pair))
         for statement, sides in rows.items()
     ]
-    columns = ("section", "the paper says", "measured is", "must be", *names, *(f"verdict, {name}" for name in names))
+    columns = ("section", "sentence", "measured is", "must be", *names, *(f"verdict, {name}" for name in names))
     return Table(columns, cells, CLAIMS_TITLE) if cells else None

@@ -18,7 +18,7 @@ from calstudy.base.downloads import default_directory, download
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.sky.counts import FREQUENCY, SPECTRAL_INDEX
-from calstudy.sky.settings import CatalogueErrors, CsvColumns, PointSources
+from calstudy.sky.settings import GLEAM_FILE, CatalogueErrors, CsvColumns, PointSources
 
 LOG = logging.getLogger(__name__)
 
@@ -207,7 +207,6 @@ GLEAM_URL = (
     "https://vizier.cds.unistra.fr/viz-bin/votable?-source=VIII/100/gleamegc&-out.max=unlimited"
     "&-out=GLEAM&-out=RAJ2000&-out=DEJ2000&-out=Fintwide&-out=alpha"
 )
-GLEAM_FILE = "gleam_egc.vot"
 GLEAM_SOURCES = 307_455
 
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
-from calstudy.base.schema import Section, choice, fault
+from calstudy.base.downloads import default_directory
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import load_function
+from calstudy.base.schema import Section, choice, fault, folder_of_files
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
 
+GLEAM_FILE = "gleam_egc.vot"
+"""Name of the catalogue in the folder of downloads."""
 VOTABLE_SUFFIXES = (".vot", ".votable", ".xml")
 BRIGHTEST_SOURCE = 197.0
 """Flux density of the brightest G4Jy component, Jy at 200 MHz, rounded down; a higher flux limit keeps no sources."""
@@ -55,6 +60,19 @@ class GleamSources(PointSources):
     path: Path | None = Field(
         None, strict=False, description="Catalogue file; default: the file stored by `calstudy data fetch gleam`."
     )
+
+    @model_validator(mode="after")
+    def _catalogue_is_there(self, info: ValidationInfo) -> GleamSources:
+        if self.path is not None or folder_of_files(info) is None:
+            return self
+        path = default_directory() / GLEAM_FILE
+        if not path.is_file():
+            raise fault(
+                "",
+                f"GLEAM is not on this machine (looked for {path}); get it with 'calstudy data fetch gleam', give a "
+                "file under sky.foregrounds.path, or use 'g4jy-and-counts'",
+            )
+        return self.model_copy(update={"path": path.resolve()})
 
 
 class SyntheticSources(PointSources):
@@ -140,6 +158,15 @@ class CodeSources(Section):
     function: str = Field(description="Name of the function in it.")
     options: dict[str, Any] = Field(default_factory=dict, description="Given to the function as keyword arguments.")
 
+    @model_validator(mode="after")
+    def _function_is_there(self, info: ValidationInfo) -> CodeSources:
+        if folder_of_files(info) is not None:
+            try:
+                load_function(self.path, self.function)
+            except InputError as error:
+                raise fault("", str(error)) from None
+        return self
+
 
 class NoSources(Section):
     """No foregrounds."""
@@ -149,7 +176,6 @@ class NoSources(Section):
 
 Foregrounds = Annotated[
     GleamSources | SyntheticSources | FileSources | CodeSources | NoSources,
-    Field(discriminator="kind"),
     choice("kind", "g4jy-and-counts"),
 ]
 
@@ -194,25 +220,33 @@ class NoDiffuse(Section):
     kind: Literal["none"] = "none"
 
 
-Diffuse = Annotated[HaslamMap | SyntheticDiffuse | NoDiffuse, Field(discriminator="kind"), choice("kind")]
+Diffuse = Annotated[HaslamMap | SyntheticDiffuse | NoDiffuse, choice("kind")]
 
 
 class Eor(Section):
     """Gaussian random 21 cm brightness with a known power spectrum, as one HEALPix map per channel."""
 
-    spectrum: Literal["flat", "power-law"] = "flat"
+    spectrum: Literal["flat", "power-law", "table"] = "flat"
     amplitude: PowerDensity = Field(
         12482.356, gt=0, description="P(k), or P at `pivot_k` for a power law (paper §Simulations)."
     )
     index: float = Field(0.0, ge=-3.5, le=1.0, description="P(k) = amplitude (k / pivot)^index; only for a power law.")
     pivot_k: float = Field(0.1, gt=0, description="Pivot of the power law, in 1/Mpc (no h).")
+    path: Path | None = Field(
+        None,
+        strict=False,
+        description="For spectrum: table, a text file with k in h/Mpc and P(k) in mK^2 h^-3 Mpc^3 in two columns, for "
+        "the redshift of the data. P is a power law between two k, and constant beyond the first and the last.",
+    )
     nside: Literal[16, 32, 64, 128, 256] = Field(256, description="HEALPix resolution.")
     seed: int = Field(2, ge=0, description="Seed of the maps.")
 
     @model_validator(mode="after")
-    def _index_is_used(self) -> Eor:
-        if self.index and self.spectrum == "flat":
-            raise fault("index", f"{self.index:g} has no effect with spectrum: flat; use spectrum: power-law")
+    def _fields_are_used(self) -> Eor:
+        if self.index and self.spectrum != "power-law":
+            raise fault("index", f"{self.index:g} has no effect with spectrum: {self.spectrum}; use power-law")
+        if (self.path is None) == (self.spectrum == "table"):
+            raise fault("path", "is needed with spectrum: table, and has no effect with others")
         return self
 
 

@@ -22,7 +22,6 @@ from calstudy.papers.calamity2022 import Calamity2022
 from calstudy.products import corruption, simulation, sky_model
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.other_packages import PyuvsimEngine
 
@@ -51,8 +50,8 @@ def simulated(experiment, folder: Path):
     chunk, whole = folder / "chunk", folder / "whole"
     chunk.mkdir(parents=True)
     whole.mkdir()
-    simulation.simulate_chunk(Job(settings=piece.settings, inputs={}, output=chunk))
-    notes = simulation.assemble(Job(settings=task.settings, inputs={"chunk000": chunk}, output=whole))
+    piece.make(chunk)
+    notes = task.given({"chunk000": chunk}).make(whole)
     return read_visibilities(whole / "visibilities.uvh5"), notes
 
 

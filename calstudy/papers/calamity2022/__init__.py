@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
-from pydantic import BaseModel
-
+from calstudy.base.paths import differences
+from calstudy.base.schema import Section
 from calstudy.calibrate.settings import AdamaxSettings, FlagWeights, GainFit, Solver
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.noise import NoNoise, RadiometerNoise
@@ -130,17 +130,11 @@ def _study(role: str) -> str:
     return {own: of_any for of_any, own in Calamity2022.own_solver_roles.items()}.get(role, role)
 
 
-def _changed(section: BaseModel, path: str, free: tuple[str, ...] = ()) -> str | None:
+def _changed(section: Section, path: str, free: tuple[str, ...] = ()) -> str | None:
     """Return in words a field of a section that is not the paper's, which is its default; None if all others are."""
-    written = section.model_dump(mode="json")
-    for name, field in type(section).model_fields.items():
-        value, papers = getattr(section, name), field.get_default(call_default_factory=True)
-        if name in free or value == papers:
-            continue
-        if isinstance(value, BaseModel) and type(value) is type(papers) and name in written:
-            return _changed(value, f"{path}.{name}")
-        return f"{path}.{name} is {written[name]}, not the paper's"
-    return None
+    papers = section.with_defaults(*(name for name in type(section).model_fields if name not in free))
+    changes = differences(papers.model_dump(mode="json"), section.model_dump(mode="json"))
+    return next((f"{path}.{field} is {value}, not the paper's" for field, _, value in changes), None)
 
 
 def _other_calibrator(role: str, experiment: Experiment) -> str | None:

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.identity import identity
+from calstudy.base.identity import digest_json, identity
 from calstudy.base.plugins import guarded
-from calstudy.base.schema import Section, choice, fault
+from calstudy.base.schema import Section, fault
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import StudyFile, apply_scale, checked, dump, override, parse_override, validate
@@ -26,7 +26,7 @@ from calstudy.figures import StudyFigure, figures_for
 from calstudy.products import tolerances
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import score
+from calstudy.products.score import MeasureScore, score
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
 from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
@@ -42,7 +42,12 @@ VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
 )
 
-Block = Annotated[dict[str, Any], choice("calibrator")]
+
+def _block(block: Any) -> Any:
+    return {CALIBRATORS.tag: block} if isinstance(block, str) else block
+
+
+Block = Annotated[dict[str, Any], BeforeValidator(_block, json_schema_input_type=str | dict[str, Any])]
 
 
 class ComparisonFile(Section):
@@ -254,9 +259,9 @@ class Comparison(Family):
         }
 
     @cached_property
-    def scores(self) -> dict[str, Task]:
+    def scores(self) -> dict[str, MeasureScore]:
         """The scores of every case that is not refused."""
-        return {label: study.targets[0] for label, study in self.studies.items()}
+        return {label: required(score(study.graph)) for label, study in self.studies.items()}
 
     @cached_property
     def tables(self) -> list[Task]:
@@ -337,10 +342,6 @@ def load_worlds(
     return Comparison.load(StudyFile(file.path, content))
 
 
-def _block(block: Any) -> dict[str, Any]:
-    return {"calibrator": block} if isinstance(block, str) else dict(block)
-
-
 def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     """Return a comparison's content with one of its own keys, an entry by its label, or a field of it changed.
 
@@ -412,7 +413,17 @@ def _make_cases(
                 refusals[label] = refusal
     if faults:
         raise ExperimentError([f"{sentence} (in {_listed(found)})" for sentence, found in faults.items()])
+    _require_different_worlds(members, list(worlds))
     return members, refusals
+
+
+def _require_different_worlds(members: Mapping[str, Experiment], worlds: Sequence[str]) -> None:
+    """Raise ExperimentError if two worlds are the same experiment, whose cases would be the same twice."""
+    seen: dict[str, str] = {}
+    for row, world in enumerate(worlds):
+        same = seen.setdefault(digest_json(identity(_what_is_made(members[case_name(row, 0)]))), world)
+        if same != world:
+            raise ExperimentError([f"worlds: {world!r} is the same as {same!r}; change a field in it, or remove it"])
 
 
 def _listed(cases: Sequence[str]) -> str:
