@@ -24,7 +24,7 @@ from calstudy.sky.settings import SkySettings
 
 Component = Literal["foregrounds", "eor", "noise"]
 SIGNAL_LOSS_VARIANTS = ("residual", "residual_without_eor", "eor")
-FIGURES: Registry[Any] = Registry("figure", "calstudy.figures", "calstudy.figures:StudyFigure")
+FIGURES: Registry[Any] = Registry("figure", "calstudy.figures", "calstudy.figures:StudyFigure", families=True)
 PAPERS: Registry[Any] = Registry("paper", "calstudy.papers", "calstudy.claims.paper:Paper")
 DEFAULT_FIGURES = ("layout", "gains", "model", "data", "baselines", "wedge", "spherical", "signal-loss")
 

@@ -7,10 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
-from scipy.signal.windows import blackmanharris
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -21,6 +17,8 @@ from calstudy.products.observed import calibrated, observed
 from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from pyuvdata import UVData
 
     from calstudy.calibrate.records import CalibrationResult
@@ -86,6 +84,8 @@ def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.nd
     `cube` holds visibilities, zero where flagged, (Ntimes, Nbls, Nfreqs); `positions` are channel numbers on an even
     grid of `n_channels`, (Nfreqs,). A tone at a delay of the transform keeps its amplitude.
     """
+    from scipy.signal.windows import blackmanharris
+
     taper = blackmanharris(n_channels)
     power = np.zeros((cube.shape[1], n_channels))
     for integration in cube:
@@ -123,6 +123,8 @@ def draw_diagnostics(found: Diagnostics, stand_ins: Sequence[str] = ()) -> Figur
 
 
 def _draw_images(figure: Figure, panels: list[Axes], found: Diagnostics) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     peak = max(found.data.max(), np.finfo(float).tiny)
     edges = np.linspace(found.delay[0], found.delay[-1], found.delay.size) * 1e9
     rows = np.arange(found.lengths.size)
@@ -172,6 +174,8 @@ def _label_between_powers(axes: Axes) -> None:
 
     The default labels, such as 6 × 10⁻¹, are so wide that a constrained layout finds no room for the axes.
     """
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
     if axes.get_yscale() != "log":
         return
     low, high = axes.get_ylim()
@@ -185,6 +189,8 @@ def _label_one_digit(value: float, _: float) -> str:
 
 
 def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     antennas = np.arange(found.chi2_antennas.size)
     integrations = np.arange(found.chi2_by_integration.size)
     for axes, places, values, label in (
@@ -203,6 +209,8 @@ def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
 
 
 def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     for losses, converged in zip(found.losses, found.converged, strict=True):
         positive = np.where(losses > 0, losses, np.nan)
         axes.plot(positive, color=style.BLUE if converged else style.RED, linewidth=0.7, marker=".", markersize=2)
@@ -274,6 +282,8 @@ def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarr
 
 class DiagnosticsFigure(StudyFigure):
     """Diagnostics of a calibration of measured data, of the even half or of all data."""
+
+    kind: str = "diagnostics"
 
     of = ("observed",)
     caption = (
