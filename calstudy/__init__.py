@@ -13,7 +13,8 @@ try:
 except PackageNotFoundError:
     __version__ = "0+unknown"
 
-INTERFACE = ("load", "open_run")
+# `calibrate` is the package of that name.
+INTERFACE = ("load", "open_run", "calibrate_data")
 __all__ = ["__version__", *INTERFACE]
 
 

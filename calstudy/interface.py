@@ -1,4 +1,4 @@
-"""The Python interface: load, plan and run a study, and read its results.
+"""The Python interface: load, plan and run a study, read its results, and calibrate measured data.
 
 The command line calls the same functions. Results are labelled arrays of xarray with units in their attributes, tables
 of pandas, and the objects of pyuvdata::
@@ -9,31 +9,45 @@ of pandas, and the objects of pyuvdata::
     study.plan()
     run = study.run(workers=2)
     run.spectra["residual"]
+
+    calstudy.calibrate_data("data.uvh5", calibrator="calamity").gains
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import yaml
 
 from calstudy.base.errors import InputError, nearest
 from calstudy.experiment.files import StudyFile
+from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
-from calstudy.products.files import DATA, GAINS, RESIDUAL
+from calstudy.products.files import (
+    DATA,
+    GAINS,
+    MODEL,
+    RESIDUAL,
+    SOLUTION,
+    quiet_libraries,
+    read_json,
+    read_visibilities,
+)
 from calstudy.report.headline import read_headline
 from calstudy.results.folder import EXPERIMENT, RunFolder
 from calstudy.results.reader import Tables
 from calstudy.run.store import Store
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Task
+from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study, study_of
 from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Budget, Study, run_study
+from calstudy.verdicts.standing import LIMIT
 
 if TYPE_CHECKING:
     import pandas
@@ -68,7 +82,7 @@ def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **
     InputError
         If the file cannot be read, or a field is unknown or has a value that is not allowed.
     """
-    texts = [f"{path}={yaml.safe_dump(value, default_flow_style=True)}" for path, value in changes.items()]
+    texts = _overrides(changes)
     if isinstance(source, Mapping):
         return LoadedStudy(study_of(StudyFile(Path("study.yaml"), source, scale, texts)))
     return LoadedStudy(load_study(Path(source), scale, texts))
@@ -77,6 +91,86 @@ def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **
 def open_run(folder: str | Path) -> OpenRun:
     """Open the folder of a finished run; raises InputError for another folder."""
     return OpenRun(RunFolder(Path(folder)))
+
+
+def calibrate_data(
+    data: str | Path | Sequence[str | Path],
+    output: str | Path = "calibrated",
+    observed: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+    quiet: bool = False,
+    **changes: Any,
+) -> CalibratedData:
+    """Calibrate measured data, as the command ``calstudy calibrate`` does; an interrupted calibration is resumed.
+
+    Parameters
+    ----------
+    data
+        Files in any format that pyuvdata reads.
+    output
+        Folder for the results.
+    observed
+        Fields of the section `observed` of a study of measured data: `select`, `sky_model`, `flag_interference`.
+    overwrite
+        Whether results of an earlier calibration may be replaced.
+    quiet
+        If true, no progress is printed.
+    **changes
+        Fields of the section `calibration` by dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``.
+
+    Raises
+    ------
+    InputError
+        If the data cannot be used, a field is unknown or has a value that is not allowed, or the folder has results.
+    """
+    from rich.console import Console
+
+    paths = [data] if isinstance(data, str | Path) else data
+    sections = {"observed": {"data": [str(path) for path in paths], **(observed or {})}}
+    folder = Path(output)
+    require_free(folder, overwrite)
+    with quiet_libraries():
+        file = calibration_file(sections, folder, _overrides(changes, "calibration."))
+        DataCalibration.load(file).sized_to(Budget(workers=1))[0].run(Console(quiet=quiet))
+    return CalibratedData(folder)
+
+
+class CalibratedData:
+    """The results of `calibrate_data`, which are read from their folder when they are asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.solution: Mapping[str, Any] = read_json(folder / SOLUTION)
+        """Content of solution.json: settings, changes of the data, what stands out, and every solve."""
+
+    @property
+    def gains(self) -> UVCal:
+        """Fitted gains g, with V = g_a g_b* F."""
+        from pyuvdata import UVCal
+
+        return UVCal.from_file(self.folder / GAINS)
+
+    @property
+    def model(self) -> UVData:
+        """Fitted foregrounds F."""
+        return read_visibilities(self.folder / MODEL)
+
+    @property
+    def residual(self) -> UVData:
+        """V / (g_a g_b*) - F."""
+        return read_visibilities(self.folder / RESIDUAL)
+
+    @property
+    def solves(self) -> pandas.DataFrame:
+        """Status, steps, loss and time of every solve."""
+        import pandas
+
+        return pandas.DataFrame(self.solution["records"])
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{count} {status}" for status, count in self.solution["by_status"].items())
+        warned = [f"warning: {text}" for text in self.solution["warnings"]]
+        return "\n".join([f"calibrated data in {self.folder}", f"solves: {counts}", *warned])
 
 
 class StudyPlan(Mapping[str, Any]):
@@ -166,6 +260,7 @@ class LoadedStudy:
         return "\n".join(
             (
                 f"study {self.name!r}: {self._study.description}",
+                *([self._study.setup] if self._study.setup else []),
                 f"figures: {', '.join(figures) or 'none'}",
                 f"run folder: {self.folder}",
             )
@@ -253,6 +348,29 @@ class OpenRun:
         rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._tables.summary["bands"]]
         return pandas.DataFrame(rows).drop(columns="k").set_index(["k_from", "k_to"])
 
+    def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> pandas.DataFrame:
+        """Return which calibrators of a comparison have a bias below a limit in all, or some, worlds, by band of k.
+
+        Columns are `standing` ("passes", "open" or "fails"), `worlds`, those that decide, `bias_below`, the 95 % upper
+        limit in these worlds in units of the EoR, and `transfer`, the smallest T. A table without rows for other runs.
+        """
+        import pandas
+
+        found = self._folder.standings(limit, worlds)
+        rows = [
+            (
+                *entry.band,
+                entry.calibrator,
+                entry.standing,
+                [world.world for world in entry.decisive],
+                entry.upper_limit,
+                entry.transfer,
+            )
+            for entry in found
+        ]
+        columns = ["k_from", "k_to", "calibrator", "standing", "worlds", "bias_below", "transfer"]
+        return pandas.DataFrame(rows, columns=columns).set_index(columns[:3])
+
     @property
     def claims(self) -> pandas.DataFrame:
         """Statements of papers with the measured number and the verdict, by name; empty without papers."""
@@ -314,8 +432,6 @@ class OpenRun:
         half
             Which of the two noise realizations.
         """
-        from calstudy.products.files import read_visibilities
-
         study = self._experiment
         if self._variant(variant).calibrate:
             return read_visibilities(self._product(self._calibration(variant, half), study) / RESIDUAL)
@@ -335,15 +451,16 @@ class OpenRun:
             raise InputError(
                 f"{name!r}: no figure of this study{nearest(name, list(tasks))}; it has {', '.join(tasks)}"
             )
-        task = tasks[name]
+        task = cast(Draw, tasks[name])
         inputs = {needed: self._product(other, study) for needed, other in task.needs.items()}
-        return task.settings["figure"].draw(Job(settings=task.settings, inputs=inputs, output=self.folder)).figure
+        return task.given(inputs).drawing(self.folder).figure
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))
         finished = self._manifest.get("finished", "at an unknown time")
         lines = [f"run {self.name!r}, finished {finished}, in {self.folder}", f"figures: {', '.join(self.figures)}"]
-        return "\n".join([*lines, numbers] if numbers else lines)
+        setup = [self._manifest["setup"]] if "setup" in self._manifest else []
+        return "\n".join([*lines, *setup, *([numbers] if numbers else [])])
 
     def _repr_html_(self) -> str:
         from html import escape
@@ -402,6 +519,10 @@ class OpenRun:
                 "run the study again"
             )
         return product.path
+
+
+def _overrides(changes: Mapping[str, Any], section: str = "") -> list[str]:
+    return [f"{section}{path}={yaml.safe_dump(value, default_flow_style=True)}" for path, value in changes.items()]
 
 
 def _single(study: Study) -> ExperimentStudy:

@@ -27,7 +27,7 @@ from calstudy.base.schema import Section
 from calstudy.experiment.model import Experiment
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.source import reached
-from calstudy.run.task import Stage
+from calstudy.run.task import Task
 
 TABLE = Path(__file__).with_suffix(".txt")
 SETTINGS = "settings"
@@ -42,17 +42,17 @@ def makers() -> dict[str, tuple[int, dict[tuple[str, str], str]]]:
     """Return version and definitions of every stage and plug-in, by what it is called."""
     root = Path(calstudy.__file__).parent
     defining = [
-        path for path in sorted(root.rglob("*.py")) if "Stage(" in (text := path.read_text()) or "Registry" in text
+        path for path in sorted(root.rglob("*.py")) if "stage=" in (text := path.read_text()) or "Registry" in text
     ]
     names = [
         ".".join(path.relative_to(root.parent).with_suffix("").parts).removesuffix(".__init__") for path in defining
     ]
     defined = [item for name in names for item in vars(import_module(name)).values()]
-    stages = {item.name: item for item in defined if isinstance(item, Stage)}
+    kinds = [item for item in defined if isinstance(item, type) and issubclass(item, Task) and "stage" in vars(item)]
     offered = [getattr(item, "registry", item) for item in defined]
     # Kinds of study have no version: they ask for products, and make none.
     registries = {item.noun: item for item in offered if isinstance(item, Registry) and hasattr(item.base, "version")}
-    found = {f"stage {name}": (stage.version, reached(stage.make, {})) for name, stage in stages.items()}
+    found = {f"stage {kind.stage.name}": (kind.stage.version, reached(kind, {})) for kind in kinds}
     for noun, registry in registries.items():
         for thing in map(registry.find, registry.built_in()):
             found[f"{noun} {registry.reference_of(thing)}"] = (thing.version, reached(thing, {}))

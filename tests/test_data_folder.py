@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calstudy.base.mwa_files import G4JY, MWA_FILES
-from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.layouts import make_layout
 from calstudy.sky import counts
 from calstudy.sky.catalogue import read_gleam_table

@@ -12,7 +12,7 @@ from calstudy.base.gains import make_uvcal
 from calstudy.base.visibilities import antenna_indices, antenna_pairs, baseline_vectors, from_cube
 from calstudy.experiment.model import FIGURES
 from calstudy.figures import draw
-from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
 from calstudy.products.files import write_visibilities

@@ -75,7 +75,9 @@ def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
         (["init", "../mine"], "cannot name an experiment"),
         (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
         (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
-        (["schema", "--output", "nowhere/schema.json"], "--output nowhere/schema.json: cannot be written"),
+        (["fields", "--schema", "nowhere/schema.json"], "--schema nowhere/schema.json: cannot be written"),
+        (["examples"], "examples: is calstudy init --list"),
+        (["schema", "--output", "schema.json"], "schema: is calstudy fields --schema FILE"),
         (["runs", "nowhere"], "nowhere: no such folder of runs"),
         (["store", "nowhere"], "nowhere: no such store"),
         (["store", "store", "--delete"], "--delete: say which products"),
@@ -96,13 +98,13 @@ def test_mistakes_are_one_sentence_and_change_nothing(arguments, told, here, cap
 
 
 def test_all_published_experiments_are_listed(here, capsys):
-    listed = output_of(capsys, "examples")
+    listed = output_of(capsys, "init", "--list")
     assert all(name in listed for name in experiment_names())
 
 
 def test_the_published_schema_is_current_and_every_experiment_names_it():
     folder = published("experiments")
-    assert (folder / SCHEMA_FILE).read_text() == experiment_schema(), "run: python -m calstudy schema"
+    assert (folder / SCHEMA_FILE).read_text() == experiment_schema(), "run: python -m calstudy fields --schema"
     for name in experiment_names():
         first = (folder / f"{name}.yaml").read_text().splitlines()[0]
         assert first == f"# yaml-language-server: $schema={SCHEMA_FILE}"

@@ -1,11 +1,15 @@
-"""Tables of texts, for the terminal, as Markdown for documents, and in reports; numbers with their uncertainty."""
+"""Tables: for the terminal, as Markdown, CSV and JSON, and in reports; numbers with their uncertainty."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -29,14 +33,14 @@ LARGE = 1e5
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts; each row has as many cells as there are columns.
+    """A table of texts, or of numbers for CSV; each row has as many cells as there are columns.
 
     Cells with the name of an outcome are coloured. The note, which may be empty, is a sentence below the title.
-    Markdown has neither title nor note.
+    Markdown and CSV have neither title nor note.
     """
 
     columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[Any]]
     title: str = ""
     note: str = ""
 
@@ -59,6 +63,28 @@ class Table:
         marks = ["---", *["--:" if numbers else "---"] * (len(self.columns) - 1)]
         rows = ([plain_text(cell).replace("|", "\\|") for cell in row] for row in (self.columns, marks, *self.rows))
         return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+    @classmethod
+    def of_records(cls, records: Sequence[Mapping[str, Any]]) -> Table:
+        """Return the table of records, whose cells are empty where a record lacks a column."""
+        columns = list(dict.fromkeys(column for record in records for column in record))
+        return cls(columns, [[record.get(column, "") for column in columns] for record in records])
+
+    def csv(self) -> str:
+        """Return it as CSV."""
+        text = io.StringIO()
+        csv.writer(text).writerows([self.columns, *self.rows])
+        return text.getvalue()
+
+
+def to_json(tables: Sequence[Table]) -> str:
+    """Return tables as JSON."""
+    return json.dumps([asdict(table) for table in tables], indent=1, ensure_ascii=False)
+
+
+def from_json(text: str) -> list[Table]:
+    """Return the tables that `to_json` wrote."""
+    return [Table(**{**table, "rows": [tuple(row) for row in table["rows"]]}) for table in json.loads(text)]
 
 
 def plain_text(text: str) -> str:

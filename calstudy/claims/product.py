@@ -11,9 +11,11 @@ from calstudy.experiment.model import FIGURES, Experiment
 from calstudy.figures import figure_task
 from calstudy.products import agreement, score, signal_loss, sky_model, spectra
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from calstudy.claims.evaluation import Evaluation
     from calstudy.claims.realizations import PooledResults
     from calstudy.results.reader import Results
@@ -49,8 +51,14 @@ def claims(graph: Graph, notes: Sequence[str]) -> Task | None:
     experiment = graph.experiment
     if not experiment.papers:
         return None
-    settings = {"papers": list(experiment.papers), "title": experiment.name, "notes": list(notes)}
-    return Task(EVALUATE, "claims", {**settings, "experiments": {"": _facts(experiment)}}, _inputs_of({"": graph}))
+    return Claims(
+        "claims",
+        papers=list(experiment.papers),
+        title=experiment.name,
+        notes=list(notes),
+        experiments={"": _facts(experiment)},
+        tables=_inputs_of({"": graph}),
+    )
 
 
 def combined_claims(
@@ -63,14 +71,15 @@ def combined_claims(
     playing = {name: graphs[name] for name in roles.values()}
     if not papers:
         return None
-    settings = {
-        "papers": list(papers),
-        "title": title,
-        "notes": list(notes),
-        "roles": dict(roles),
-        "experiments": {name: _facts(graph.experiment) for name, graph in playing.items()},
-    }
-    return Task(EVALUATE, "claims of all", settings, _inputs_of(playing))
+    return Claims(
+        "claims of all",
+        papers=list(papers),
+        title=title,
+        notes=list(notes),
+        roles=dict(roles),
+        experiments={name: _facts(graph.experiment) for name, graph in playing.items()},
+        tables=_inputs_of(playing),
+    )
 
 
 def _inputs_of(graphs: Mapping[str, Graph]) -> dict[str, Task]:
@@ -79,55 +88,68 @@ def _inputs_of(graphs: Mapping[str, Graph]) -> dict[str, Task]:
 
 def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Task | None:
     """Return the task that evaluates the statements of papers on a table of run times; None without papers."""
-    if not papers:
-        return None
-    return Task(EVALUATE_RUN_TIMES, "claims", {"papers": list(papers), "title": title}, {"runtime": run_times})
+    return RunTimeClaims("claims", papers=list(papers), title=title, runtime=run_times) if papers else None
 
 
-def evaluate(job: Job) -> Mapping[str, Any]:
-    """Write the claims of one run, or of the members of a collection in the roles that they play."""
-    from calstudy.claims.evaluation import evaluate_by_solver, evaluate_members, evaluate_run
-    from calstudy.verdicts.tables import write_claims_by_solver
+class Claims(Task, stage="claims", version=12):
+    """The statements of papers, evaluated on one run, or on the members of a collection in the roles that they play."""
 
-    results = {name: _results(job, name, experiment) for name, experiment in job.settings["experiments"].items()}
-    papers = job.settings["papers"]
-    if "roles" not in job.settings:
-        return _write(job, evaluate_run(papers, results[""]))
-    runs = {role: results[name] for role, name in job.settings["roles"].items()}
-    if by_solver := evaluate_by_solver(papers, runs):
-        write_claims_by_solver(by_solver, job.output, job.settings["title"], job.settings["notes"])
-    return _write(job, evaluate_members(papers, runs))
+    papers: Sequence[Any]
+    title: str
+    notes: Sequence[str]
+    roles: Mapping[str, str] | None = None
+    experiments: Mapping[str, Experiment]
+    tables: Inputs
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the claims, and those by solver."""
+        from calstudy.claims.evaluation import evaluate_by_solver, evaluate_members, evaluate_run
+        from calstudy.verdicts.tables import write_claims_by_solver
+
+        results = {name: self._results(name, experiment) for name, experiment in self.experiments.items()}
+        if self.roles is None:
+            return _write(output, evaluate_run(self.papers, results[""]), self.title, self.notes)
+        runs = {role: results[name] for role, name in self.roles.items()}
+        if by_solver := evaluate_by_solver(self.papers, runs):
+            write_claims_by_solver(by_solver, output, self.title, self.notes)
+        return _write(output, evaluate_members(self.papers, runs), self.title, self.notes)
+
+    def _results(self, name: str, experiment: Experiment) -> Results | PooledResults:
+        from calstudy.claims.realizations import PooledResults
+        from calstudy.results.reader import Results
+
+        if experiment.realizations:
+            return PooledResults.of(experiment, self.tables[f"{REALIZATIONS}:{name}"])
+        tables = (self.tables.get(f"{table}:{name}") for table in TABLES)
+        return Results(tuple(folder for folder in tables if folder is not None), experiment)
+
+    def _cost(self) -> Cost:
+        return Cost(1, disk=1e5)
 
 
-def _results(job: Job, name: str, experiment: Experiment) -> Results | PooledResults:
-    from calstudy.claims.realizations import PooledResults
-    from calstudy.results.reader import Results
+class RunTimeClaims(Task, stage="runtime-claims", version=4):
+    """The statements of papers, evaluated on a run-time study."""
 
-    if experiment.realizations:
-        return PooledResults.of(experiment, job.inputs[f"{REALIZATIONS}:{name}"])
-    tables = (job.inputs.get(f"{table}:{name}") for table in TABLES)
-    return Results(tuple(folder for folder in tables if folder is not None), experiment)
+    papers: Sequence[Paper]
+    title: str
+    runtime: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write claims.json and claims.md."""
+        from calstudy.claims import evaluation
+        from calstudy.claims.run_times import RunTimes
+        from calstudy.results.reader import Tables
+
+        times = RunTimes.of(self.title, Tables((self.runtime,)))
+        return _write(output, evaluation.evaluate_run_times(self.papers, times), self.title)
+
+    def _cost(self) -> Cost:
+        return Cost(1, disk=1e5)
 
 
-def evaluate_run_times(job: Job) -> Mapping[str, Any]:
-    """Write claims.json and claims.md of a run-time study."""
-    from calstudy.claims import evaluation
-    from calstudy.claims.run_times import RunTimes
-    from calstudy.results.reader import Tables
-
-    times = RunTimes.of(job.settings["title"], Tables((job.inputs["runtime"],)))
-    return _write(job, evaluation.evaluate_run_times(job.settings["papers"], times))
-
-
-def _write(job: Job, found: Evaluation) -> dict[str, Any]:
+def _write(output: Path, found: Evaluation, title: str, notes: Sequence[str] = ()) -> dict[str, Any]:
     from calstudy.verdicts.tables import tally, write_claims
 
-    write_claims(found.verdicts, job.output, job.settings["title"], job.settings.get("notes", ()), found.without_role)
+    write_claims(found.verdicts, output, title, notes, found.without_role)
     contradicted = [claim.name for claim in found.verdicts if claim.verdict == "contradicted"]
     return {"verdicts": tally(found.verdicts), "contradicted": contradicted, "without_role": list(found.without_role)}
-
-
-EVALUATE = Stage(name="claims", version=12, make=evaluate, cost=lambda task: Cost(1, disk=1e5))
-EVALUATE_RUN_TIMES = Stage(
-    name="runtime-claims", version=4, make=evaluate_run_times, cost=lambda task: Cost(1, disk=1e5)
-)

@@ -11,9 +11,9 @@ from scipy.spatial.distance import pdist
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.paths import differences
 from calstudy.calibrate.settings import WeightedFit
-from calstudy.corrupt.effects.bandpass import Bandpass
+from calstudy.corrupt.drift import Delays
+from calstudy.corrupt.effects.gains import Bandpass
 from calstudy.corrupt.interface import GainEffect
-from calstudy.corrupt.shapes import Delays
 from calstudy.experiment.assumed import assumed_changes
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.as_built import AsBuilt

@@ -24,6 +24,9 @@ OPTIONS = (
     (r"observed\.select\.", "--select "),
     (r"observed\.sky_model", "--sky-model"),
     (r"--set outputs\.store=DIR", "--output"),
+    (r"^output = ", "--output "),
+    (r"^expected_loss: ", "--expected-loss: "),
+    (r"`overwrite`", "--overwrite"),
 )
 """Fields of files in messages, and the options of the command that set them."""
 
@@ -86,10 +89,9 @@ def calibrate(
     solve converged, 3 if some did not, 2 if an input cannot be used.
     """
     from calstudy.base.resources import parse_memory
-    from calstudy.experiment.files import StudyFile
     from calstudy.products.files import quiet_libraries
     from calstudy.realdata.selection import split_selections
-    from calstudy.studies.calibration import UNFINISHED, DataCalibration, require_free
+    from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
     from calstudy.studies.study import Budget
 
     changes = {
@@ -101,8 +103,7 @@ def calibrate(
     }
     if max_memory is not None:
         parse_memory(max_memory)
-    content = {
-        "name": "calibration",
+    sections = {
         "observed": {
             "data": [str(path) for path in data],
             "select": split_selections(select or []),
@@ -110,16 +111,15 @@ def calibrate(
             "sky_model": None if sky_model is None else str(sky_model),
         },
         "calibration": _calibration(settings_file, changes),
-        "outputs": {"store": str(output / UNFINISHED), "runs": str(output)},
         "calfits": calfits,
         "expected_loss": expected_loss,
     }
     # They may use the path of the field in an experiment file.
     texts = [f"calibration.{text.strip().removeprefix('calibration.')}" for text in overrides or []]
     console = Console(soft_wrap=True, highlight=False)
-    require_free(output, overwrite)
     with _named_as_options(output), quiet_libraries():
-        study = DataCalibration.load(StudyFile(Path("calibration.yaml"), content, overrides=texts))
+        require_free(output, overwrite)
+        study = DataCalibration.load(calibration_file(sections, output, texts))
         study, _ = study.sized_to(Budget(workers=1, max_memory=max_memory))
         for line in (*study.notes, *(study.read() if dry_run else ()), study.described()):
             console.print(line, markup=False)

@@ -27,7 +27,7 @@ from calstudy.cli.compare_gains import compare_gains
 from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
 from calstudy.cli.regress import regress
-from calstudy.cli.start import examples, init, schema
+from calstudy.cli.start import init, write_schema
 from calstudy.cli.storage import runs, store
 from calstudy.cli.validate import validate
 
@@ -48,9 +48,7 @@ app.command()(score)
 app.command()(leaderboard)
 # Step -1 is an argument, not an option.
 app.command(context_settings={"ignore_unknown_options": True})(validate)
-app.command()(examples)
 app.command()(init)
-app.command()(schema)
 app.command()(runs)
 app.command()(store)
 
@@ -206,21 +204,21 @@ def fields(
         str | None,
         typer.Argument(help="A section, such as calibration.basis, or a Python file: the settings of what it defines."),
     ] = None,
+    schema: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the JSON schema, with which editors complete and check a file."),
+    ] = None,
 ) -> None:
     """Print the reference of all fields of an experiment file, or of one section (Markdown)."""
     from calstudy.studies.reference import field_reference, plugin_reference, section_reference
 
-    if section is None:
+    if schema is not None:
+        write_schema(schema)
+    elif section is None:
         typer.echo(field_reference(), nl=False)
     else:
         is_file = section.endswith(".py")
         typer.echo(plugin_reference(Path(section)) if is_file else section_reference(section), nl=False)
-
-
-@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-def check() -> None:
-    """Name what took the place of this command."""
-    raise InputError("check: its checks are figures: calstudy run checks, or --set outputs.figures='[delay-floor]'")
 
 
 @data_app.command()

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from calstudy.base.errors import InputError
+
 StudyFile = Annotated[
     Path,
     typer.Argument(
@@ -25,7 +27,11 @@ MaxMemory = Annotated[
     typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(metavar="TCP://HOST:PORT", help="Use a running dask cluster in place of own workers.")
+    str | None,
+    typer.Option(
+        metavar="TCP://HOST:PORT",
+        help="Use a running dask cluster in place of own workers: its address, or the scheduler file that it wrote.",
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
 
@@ -33,14 +39,26 @@ SECTIONS = {
     "Every day": ("init", "plan", "run", "calibrate", "report"),
     "Results": ("claims", "compare-gains", "runs", "store"),
     "Other programs": ("export", "score", "leaderboard"),
-    "Reference": ("examples", "fields", "schema", "data"),
+    "Reference": ("fields", "data"),
     "Checks": ("validate", "regress"),
 }
 """Commands by section of the help."""
+MOVED = {
+    "check": "its checks are figures: calstudy run checks, or --set outputs.figures='[delay-floor]'",
+    "examples": "is calstudy init --list",
+    "schema": "is calstudy fields --schema FILE",
+}
+"""What took the place of commands of earlier versions."""
 
 
 class Sections(TyperGroup):
     """A group of commands whose help lists them by section."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find a command; raises InputError with its new name if it has moved."""
+        if args and args[0] in MOVED:
+            raise InputError(f"{args[0]}: {MOVED[args[0]]}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands by section, and those of no section last."""

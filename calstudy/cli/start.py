@@ -1,4 +1,4 @@
-"""``calstudy examples``, ``init`` and ``schema``: the first steps of an experiment file."""
+"""``calstudy init``, and the JSON schema: the first steps of an experiment file."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from rich.console import Console
 from calstudy.base.errors import InputError
 
 Name = Annotated[str, typer.Argument(help="Of the experiment; the file is NAME.yaml.")]
-Example = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Copy a published experiment instead; see `calstudy examples`.")
-]
+Example = Annotated[str | None, typer.Option(metavar="NAME", help="Copy a published experiment instead; see --list.")]
 Data = Annotated[
     str | None,
     typer.Option(metavar="FILE", help="Measured visibilities, or PACKAGE:PATH: write a file about these instead."),
+]
+List = Annotated[
+    bool, typer.Option("--list", help="List the published experiments, which other commands take by name.")
 ]
 Beam = Annotated[str, typer.Option(help="The beam of measured data: hera, airy, gaussian, ..., or a file.py.")]
 KINDS = {
@@ -29,21 +30,9 @@ KINDS = {
 """Kinds of files that are not one experiment, by their key."""
 
 
-def examples() -> None:
-    """List the published experiments, which `run`, `plan` and `init --example` take by name."""
-    from calstudy.base.package_files import experiment_names, published
-    from calstudy.base.table import Table
-    from calstudy.experiment.yaml_files import read_mapping
-
-    rows = []
-    for name in experiment_names():
-        content = read_mapping(published("experiments") / f"{name}.yaml")
-        kind = next((kind for key, kind in KINDS.items() if key in content), "experiment")
-        rows.append((name, kind, " ".join(str(content.get("description", "")).split())))
-    Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False), numbers=False)
-
-
-def init(name: Name = "my-study", example: Example = None, data: Data = None, beam: Beam = "hera") -> None:
+def init(
+    name: Name = "my-study", example: Example = None, data: Data = None, beam: Beam = "hera", listed: List = False
+) -> None:
     """Write a commented experiment file, NAME.yaml, into this folder; nothing is overwritten.
 
     With --data it is one of measured data: calibration, power spectra, and signal loss by injection.
@@ -52,6 +41,9 @@ def init(name: Name = "my-study", example: Example = None, data: Data = None, be
     from calstudy.experiment.starter import copy_text, observed_text, starter_text
     from calstudy.studies.json_schema import SCHEMA_FILE
 
+    if listed:
+        _list_examples()
+        return
     path = Path(f"{name}.yaml")
     schema_file = published("experiments") / SCHEMA_FILE
     if example is not None and data is not None:
@@ -64,6 +56,19 @@ def init(name: Name = "my-study", example: Example = None, data: Data = None, be
         raise InputError(f"{path}: exists already, and is not overwritten; choose another name or remove it")
     path.write_text(text, encoding="utf-8")
     typer.echo(f"{path}: next, `calstudy plan {path}`")
+
+
+def _list_examples() -> None:
+    from calstudy.base.package_files import experiment_names, published
+    from calstudy.base.table import Table
+    from calstudy.experiment.yaml_files import read_mapping
+
+    rows = []
+    for name in experiment_names():
+        content = read_mapping(published("experiments") / f"{name}.yaml")
+        kind = next((kind for key, kind in KINDS.items() if key in content), "experiment")
+        rows.append((name, kind, " ".join(str(content.get("description", "")).split())))
+    Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False), numbers=False)
 
 
 def _described(data: str) -> dict[str, Any]:
@@ -90,22 +95,16 @@ def _described(data: str) -> dict[str, Any]:
     }
 
 
-def schema(
-    output: Annotated[Path | None, typer.Option(help="File to write it to; by default it is printed.")] = None,
-) -> None:
-    """Print the JSON schema of experiment files, with which editors complete and check them.
+def write_schema(path: Path) -> None:
+    """Write the JSON schema of experiment files; raises InputError if the file cannot be written.
 
     An editor with the YAML language server reads it if the first line of a file is
     `# yaml-language-server: $schema=FILE`; files of `calstudy init` have this line.
     """
     from calstudy.studies.json_schema import experiment_schema
 
-    text = experiment_schema()
-    if output is None:
-        typer.echo(text, nl=False)
-        return
     try:
-        output.write_text(text, encoding="utf-8")
+        path.write_text(experiment_schema(), encoding="utf-8")
     except OSError as error:
-        raise InputError(f"--output {output}: cannot be written ({error.strerror})") from None
-    typer.echo(f"{output}")
+        raise InputError(f"--schema {path}: cannot be written ({error.strerror})") from None
+    typer.echo(f"{path}")

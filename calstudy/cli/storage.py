@@ -57,11 +57,11 @@ def store(
     verify: Verify = False,
     delete: Delete = False,
 ) -> None:
-    """Show what is in a store by stage, or delete chosen products.
+    """Show what is in a store by stage, or delete chosen products, but those that a run needs at this time.
 
     A deleted product is made again by the next run that needs it. Folders left by killed runs are listed too, and
     deleted with --older-than. Without --delete nothing is changed; with it, at least one of --older-than,
-    --larger-than, --unreferenced and --verify must choose the products. Do not delete during a run.
+    --larger-than, --unreferenced and --verify must choose the products.
     """
     from calstudy.results.folder import find_runs
     from calstudy.run.inventory import age_of, leftovers, products
@@ -97,11 +97,17 @@ def store(
 
 
 def _delete(chosen: list[Product], store: Store, console: Console) -> None:
-    for product in chosen:
-        stage, key = str(product.record["stage"]), str(product.record["key"])
-        with store.lock(stage, key):
-            store.discard(stage, key)
-        console.print(f"deleted: {stage} ({product.record['label']}), {_size(product.size)}, {key}", markup=False)
+    from calstudy.run.leases import LOCK, needed_by_runs
+
+    with store.lock(*LOCK):
+        needed = needed_by_runs(store)
+        for product in chosen:
+            stage, key = str(product.record["stage"]), str(product.record["key"])
+            if key not in needed:
+                with store.lock(stage, key):
+                    store.discard(stage, key)
+            done = "kept, for a run needs it" if key in needed else "deleted"
+            console.print(f"{done}: {stage} ({product.record['label']}), {_size(product.size)}, {key}", markup=False)
 
 
 def _verify(store: Store, delete: bool) -> None:

@@ -39,12 +39,17 @@ class Effect(Plugin, ABC):
     """
 
     registry: ClassVar[Registry[Effect]] = Registry(
-        "effect", "calstudy.corrupt.effects", "calstudy.corrupt.interface:Effect"
+        "effect", "calstudy.corrupt.effects", "calstudy.corrupt.interface:Effect", families=True
     )
 
     uses_positions: ClassVar[bool] = True
 
     kind: str = Field("", description="Name of an effect, or a file.py.")
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the name of a built-in effect."""
+        return (cls.model_fields["kind"].default,)
 
     def refusal(self, size: Size) -> str | None:
         """Return in one sentence why the effect cannot be applied to data of this size, or None if it can.

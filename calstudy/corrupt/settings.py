@@ -3,84 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 
-from calstudy.base.schema import Section, choice, fault
-from calstudy.base.units import Area, Decibel
-from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
+from calstudy.base.schema import Section, fault
+from calstudy.base.units import Decibel
+from calstudy.corrupt.effects.gains import PerChannelGains
 from calstudy.corrupt.interface import Effect, GainEffect
-from calstudy.corrupt.temperature import SystemTemperature
-
-
-def _different(seeds: tuple[int, int]) -> tuple[int, int]:
-    if seeds[0] == seeds[1]:
-        raise fault("", f"of even and odd are both {seeds[0]}: their noise would be the same")
-    return seeds
-
-
-Seed = Annotated[int, Field(ge=0)]
-Seeds = Annotated[
-    tuple[Seed, Seed],
-    Field(strict=False, description="Seeds of the even and odd realization."),
-    AfterValidator(_different),
-]
-
-
-OF_TWINS = Field(
-    None,
-    description="Seeds of data without the EoR; null: the noise of the data with it, so that their difference is the "
-    "EoR alone. Blind challenges need noise of its own.",
-)
-
-
-class NoiseRelativeToEor(Section):
-    """Thermal noise with a standard deviation of `factor` times the rms of the EoR visibilities (paper: 10)."""
-
-    kind: Literal["times-eor"] = "times-eor"
-    factor: float = Field(10.0, gt=0)
-    seeds: Seeds = (3, 4)
-    seeds_without_eor: Seeds | None = OF_TWINS
-
-
-class NoiseRelativeToForegrounds(Section):
-    """Thermal noise of `factor` times the rms of the foreground visibilities (paper §Low SNR: 0.1)."""
-
-    kind: Literal["times-foregrounds"]
-    factor: float = Field(0.1, gt=0)
-    seeds: Seeds = (3, 4)
-    seeds_without_eor: Seeds | None = OF_TWINS
-
-
-class RadiometerNoise(SystemTemperature):
-    """Thermal noise in absolute units, by the radiometer equation: k_B T / (A_e sqrt(width x integration x nights)).
-
-    T is receiver + sky (nu / sky_frequency)^sky_index. This is the standard deviation of the complex noise in xx or yy,
-    per baseline, channel, integration and realization; width and integration are those of the instrument. Foregrounds
-    are in absolute units; for the EoR to be so too, set `corruption.eor_level` to null.
-    """
-
-    kind: Literal["radiometer"]
-    effective_area: Area | None = Field(
-        None, gt=0, description="Of an antenna; null: wavelength^2 over the solid angle of `instrument.beam`."
-    )
-    nights: int = Field(1, ge=1, description="Nights at the same sidereal time that are averaged coherently.")
-    seeds: Seeds = (3, 4)
-    seeds_without_eor: Seeds | None = OF_TWINS
-
-
-class NoNoise(Section):
-    """No thermal noise: the even and odd data are the same."""
-
-    kind: Literal["none"]
-
-
-Noise = Annotated[
-    NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise,
-    choice("kind", "times-eor"),
-]
-
+from calstudy.corrupt.noise import Noise, NoiseRelativeToEor
 
 EFFECTS = Effect.registry
 

@@ -15,8 +15,8 @@ from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import AdamaxSettings, GaussNewtonSettings, Solver
+from calstudy.corrupt.noise import Autocorrelations
 from calstudy.corrupt.settings import CorruptionSettings
-from calstudy.corrupt.temperature import Autocorrelations
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.simulate.settings import SimulationSettings

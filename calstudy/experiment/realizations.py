@@ -8,7 +8,7 @@ from typing import Any
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.corrupt.interface import GainEffect
-from calstudy.corrupt.settings import NoNoise
+from calstudy.corrupt.noise import NoNoise
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
 
 PARTS = ("eor", "gains", "noise")

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.plugins import Plugin, guarded
-from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import FIGURES, Experiment
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Inputs, Job, Task
 from calstudy.verdicts.tolerances import Drawn, Rules, spread_of_scale
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from calstudy.products.comparison import Case
     from calstudy.products.graph import Graph
-    from calstudy.products.observed import DataGraph
 
 
 TWO_ARRAYS = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
@@ -131,7 +130,7 @@ class StudyFigure(Plugin):
         Parameters
         ----------
         graph
-            Products of the experiment, a `calstudy.products.graph.Graph`; of measured data an `ObservedGraph`.
+            Products of the experiment, a `calstudy.products.graph.Graph`; of measured data a `MeasuredGraph`.
 
         Returns
         -------
@@ -195,7 +194,7 @@ class CasesFigure(StudyFigure):
         """Read the scores, and draw them."""
         from calstudy.products.comparison import read_cases
 
-        cases = read_cases(job)
+        cases = read_cases(job.settings["calibrators"], job.settings["worlds"], job.inputs)
         shown = {
             world: {name: getattr(case, self.scores) for name, case in found.items()} for world, found in cases.items()
         }
@@ -217,34 +216,46 @@ def _listed(kinds: Sequence[str]) -> str:
     return f"for {' or '.join(kinds)} files"
 
 
-def draw(job: Job) -> Mapping[str, Any]:
-    """Write one figure as png and pdf, and its arrays as npz.
+class Draw(Task, stage="figure", version=4):
+    """One figure; `own` are the settings of its own, which are keyed beside the others."""
 
-    Raise InputError if a user's figure fails, or returns anything but a drawing with plain arrays.
-    """
-    from matplotlib.figure import Figure
+    figure: StudyFigure
+    notes: Sequence[str]
+    own: Mapping[str, Any]
+    products: Inputs
 
-    from calstudy.plotting.save import figure_arrays, save_figure
+    @cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """The settings that the figure is given."""
+        return {"figure": self.figure, "notes": self.notes, **self.own}
 
-    shown: StudyFigure = job.settings["figure"]
-    with guarded(shown):
-        drawing = shown.draw(job)
-    if not isinstance(drawing, Drawing) or not isinstance(drawing.figure, Figure):
-        raise InputError(f"figure {shown.label!r}: draw returned a {type(drawing).__name__}, expected a Drawing")
-    try:
-        arrays = figure_arrays(drawing.shown)
-    except ValueError as error:
-        raise InputError(f"figure {shown.label!r}: {error}") from None
-    save_figure(drawing.figure, arrays, job.output, shown.label)
-    return {"caption": shown.caption, **drawing.notes}
+    def drawing(self, output: Path) -> Drawing:
+        """Draw the figure; raises InputError if a user's figure fails, or returns anything but a drawing."""
+        from matplotlib.figure import Figure
 
+        with guarded(self.figure):
+            found = self.figure.draw(Job(settings=self.settings, inputs=self.products, output=output))
+        if not isinstance(found, Drawing) or not isinstance(found.figure, Figure):
+            name = type(found).__name__
+            raise InputError(f"figure {self.figure.label!r}: draw returned a {name}, expected a Drawing")
+        return found
 
-DRAW = Stage(name="figure", version=4, make=draw, cost=lambda task: Cost(3, disk=1e6))
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the figure as png and pdf, and its arrays as npz."""
+        from calstudy.plotting.save import figure_arrays, save_figure
+
+        drawing = self.drawing(output)
+        try:
+            arrays = figure_arrays(drawing.shown)
+        except ValueError as error:
+            raise InputError(f"figure {self.figure.label!r}: {error}") from None
+        save_figure(drawing.figure, arrays, output, self.figure.label)
+        return {"caption": self.figure.caption, **drawing.notes}
 
 
 def figure_task(
     figure: StudyFigure,
-    members: Mapping[str, Graph | DataGraph],
+    members: Mapping[str, Graph],
     stand_ins: Sequence[str],
     settings: Mapping[str, Any] | None = None,
 ) -> Task:
@@ -281,7 +292,7 @@ def draw_task(
 ) -> Task:
     """Return the task that draws a figure of given products."""
     notes = list(stand_ins) if figure.shows_sky else []
-    return Task(DRAW, figure.label, {"figure": figure, "notes": notes, **settings}, inputs)
+    return Draw(figure.label, figure=figure, notes=notes, own=settings, products=inputs)
 
 
 def members_of(job: Job) -> dict[str, dict[str, Path]]:

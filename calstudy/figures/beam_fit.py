@@ -11,7 +11,7 @@ import numpy as np
 from calstudy.base.plugins import Plugin
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
+from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
 from calstudy.instrument.settings import Channels, InstrumentSettings
 from calstudy.plotting import style
 from calstudy.products.graph import Graph

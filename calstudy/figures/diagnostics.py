@@ -15,16 +15,16 @@ from scipy.signal.windows import blackmanharris
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
+from calstudy.products.calibration import read_result
 from calstudy.products.files import DATA, read_visibilities
 from calstudy.products.observed import calibrated, observed
-from calstudy.products.observed_quality import read_result
 from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
     from calstudy.calibrate.records import CalibrationResult
-    from calstudy.products.observed import DataGraph
+    from calstudy.products.graph import MeasuredGraph
 
 MAX_NAMES = 20
 LINEAR_RANGE = 5.0
@@ -281,7 +281,7 @@ class DiagnosticsFigure(StudyFigure):
         "and delay, convergence of the solves, gains, and chi^2 of antennas, channels and integrations."
     )
 
-    def inputs(self, graph: DataGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
         """Return the data and the calibration of the first part."""
         part = next(iter(graph.parts.facts))
         return {"data": observed(graph, part), "calibration": calibrated(graph, part)}

@@ -113,7 +113,10 @@ class ExpectedLossFigure(StudyFigure):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return expectation and measurement."""
-        return {"expected": expected_loss.expected_loss(graph), "transfer": required(signal_loss.transfer(graph))}
+        return {
+            "expected": required(expected_loss.expected_loss(graph)),
+            "transfer": required(signal_loss.transfer(graph)),
+        }
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
         """Return the buffer of the wedge."""

@@ -11,11 +11,10 @@ import numpy as np
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
 from calstudy.plotting import style
-from calstudy.products.expected_loss import EXPECTED
+from calstudy.products.expected_loss import EXPECTED, expected_loss
 from calstudy.products.files import spectrum_file
 from calstudy.products.graph import required
 from calstudy.products.observed_injection import transfer
-from calstudy.products.observed_quality import expected
 from calstudy.products.signal_loss import TRANSFER as FILE
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
     from calstudy.power.expected import ExpectedBins
     from calstudy.power.transfer import TransferFunction, TransferMap
-    from calstudy.products.observed import ObservedGraph
+    from calstudy.products.graph import MeasuredGraph
 
 MAX_DELAY = 2e-6
 LAST_K = 1.5
@@ -81,9 +80,9 @@ class ObservedSignalLoss(StudyFigure):
     shows_sky = False
     tolerances = ((r".*\.(transfer|cross_transfer|squared_coherence)", Drawn(half, "half of it")),)
 
-    def inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
         """Return measurement and expectation."""
-        prediction = expected(graph)
+        prediction = expected_loss(graph)
         return {"transfer": required(transfer(graph)), **({"expected": prediction} if prediction else {})}
 
     def draw(self, job: Job) -> Drawing:

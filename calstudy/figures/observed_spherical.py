@@ -11,7 +11,7 @@ from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
 from calstudy.plotting import style
 from calstudy.products.files import spectrum_file
-from calstudy.products.observed_spectra import observed_spectra
+from calstudy.products.observed_results import observed_spectra
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calstudy.power.spectra import SphericalSpectrum
-    from calstudy.products.observed import ObservedGraph
+    from calstudy.products.graph import MeasuredGraph
 
 MARKINGS = {
     "data": Marking("data as given", "D", style.RED, 2.5, -0.15),
@@ -86,7 +86,7 @@ class ObservedSpherical(StudyFigure):
     )
     tolerances = ((r".*\.(power|noise_error)", Drawn(half, "follows from fitted gains; half of it")),)
 
-    def inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
         """Return the averaged spectra."""
         return {"spectra": observed_spectra(graph)}
 

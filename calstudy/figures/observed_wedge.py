@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.wedge import draw_panels
 from calstudy.products.files import spectrum_file
-from calstudy.products.observed_spectra import observed_spectra
+from calstudy.products.observed_results import observed_spectra
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
 if TYPE_CHECKING:
-    from calstudy.products.observed import ObservedGraph
+    from calstudy.products.graph import MeasuredGraph
 
 TITLES = {
     "data": "data as given",
@@ -34,7 +34,7 @@ class ObservedWedge(StudyFigure):
     )
     tolerances = ((r".*\.power", Drawn(half, "follows from fitted gains; half of it")),)
 
-    def inputs(self, graph: ObservedGraph) -> Mapping[str, Task]:
+    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
         """Return the averaged spectra."""
         return {"spectra": observed_spectra(graph)}
 

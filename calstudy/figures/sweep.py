@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -30,9 +29,6 @@ SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", styl
 """Marker and colour of each band of k, from small k up."""
 SKIES = "sky.eor.seed"
 """The field whose values are further samples of the same EoR, to be pooled."""
-WHERE = ("point", "changes", "region")
-"""First columns of the summary; those of a transfer function follow."""
-SUMMARY = "summary.csv"
 COLUMNS = 2
 PANEL_HEIGHT = 1.9
 LABEL_WIDTH = 15
@@ -145,7 +141,7 @@ def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> 
 
 
 class Sweep(StudyFigure):
-    """The signal loss of all points of a sweep, with summary.csv: one row per point, region and band of k."""
+    """The signal loss of all points of a sweep."""
 
     of = ("sweep",)
     caption = "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars."
@@ -155,31 +151,15 @@ class Sweep(StudyFigure):
         return {"": required(signal_loss.transfer(graph))}
 
     def draw(self, job: Job) -> Drawing:
-        """Write summary.csv, and draw T against the varied fields."""
-        blocks = job.settings["blocks"]
-        _write_summary(job.output / SUMMARY, [point for block in blocks for point in block], job.inputs)
-        panels = [_panel(block, job.inputs) for block in blocks]
+        """Draw T against the varied fields."""
+        panels = [_panel(block, job.inputs) for block in job.settings["blocks"]]
         return Drawing(draw_sweep(panels, stand_ins=job.settings["notes"]), {"panels": panels})
 
 
-def _bands(folder: Path, region: str) -> TransferFunction:
+def _bands(folder: Path) -> TransferFunction:
     from calstudy.results.reader import Tables
 
-    return Tables((folder,)).transfer_in_bands(region)
-
-
-def _write_summary(path: Path, points: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> None:
-    from calstudy.power.tables import TRANSFER_COLUMNS
-
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*WHERE, *TRANSFER_COLUMNS])
-        for point in points:
-            changes = "; ".join(f"{field} = {text}" for field, text in point["changes"].items())
-            for region in signal_loss.REGIONS:
-                found = _bands(folders[point["label"]], region)
-                columns = (values(found).tolist() for values in TRANSFER_COLUMNS.values())
-                writer.writerows([point["label"], changes, region, *row] for row in zip(*columns, strict=True))
+    return Tables((folder,)).transfer_in_bands("outside-wedge")
 
 
 def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> Any:
@@ -192,7 +172,7 @@ def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> A
     groups: dict[tuple[str, ...], list[TransferFunction]] = {}
     for point in block:
         category = tuple(point["changes"][field] for field in shown)
-        groups.setdefault(category, []).append(_bands(folders[point["label"]], "outside-wedge"))
+        groups.setdefault(category, []).append(_bands(folders[point["label"]]))
     names = short_names(fields)
     fixed = [f"{names[field]} {block[0]['changes'][field]}" for field in fields if field not in varied]
     skies = max(len(found) for found in groups.values())

@@ -39,7 +39,9 @@ LAYOUTS: Registry[Any] = Registry(
 DEFAULT_LAYOUT = "mwa-compact-minredundant"
 Layout = Annotated[SerializeAsAny[Plugin], LAYOUTS.field(DEFAULT_LAYOUT)]
 
-BEAMS: Registry[Any] = Registry("beam", "calstudy.instrument.beam_models", "calstudy.instrument.interface:BeamModel")
+BEAMS: Registry[Any] = Registry(
+    "beam", "calstudy.instrument.beam_models", "calstudy.instrument.interface:BeamModel", families=True
+)
 DEFAULT_BEAM = "mwa-embedded-element"
 Beam = Annotated[SerializeAsAny[Plugin], BEAMS.field(DEFAULT_BEAM)]
 

@@ -22,8 +22,7 @@ from calstudy.claims.roles import (
     require_long_baselines,
     structured_gains,
 )
-from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
-from calstudy.corrupt.effects.reflection_gains import ReflectionGains
+from calstudy.corrupt.effects.gains import PerChannelGains, ReflectionGains
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement, Unevaluated
 

@@ -19,6 +19,7 @@ def input_power(settings: Eor, k: np.ndarray, cosmology: str) -> np.ndarray:
 
     Amplitude and shape in the settings of the EoR sky are in units without h.
     """
+    from calstudy.sky.eor import input_power as in_kelvin
+
     h = float(make_cosmology(cosmology).h)
-    index = settings.index if settings.spectrum == "power-law" else 0.0
-    return MILLIKELVIN2 * h**3 * settings.amplitude * (np.asarray(k) * h / settings.pivot_k) ** index
+    return MILLIKELVIN2 * h**3 * in_kelvin(settings, np.asarray(k) * h, h)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
+from calstudy.base.table import Table
 from calstudy.power.expected import ExpectedBins
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
@@ -88,7 +88,5 @@ def write_transfer_csv(path: Path, transfer: TransferFunction) -> None:
 
 def write_columns(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Write arrays of equal length as CSV, by the names of their columns."""
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True))
+    rows = list(zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True))
+    path.write_text(Table(list(columns), rows).csv(), encoding="utf-8", newline="")

@@ -9,10 +9,12 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.instrument.size import Size
 from calstudy.products import calibration, corruption, simulation
 from calstudy.products.files import DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
-from calstudy.products.graph import Graph, once, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
 
 AGREEMENT = "agreement.json"
@@ -20,7 +22,7 @@ MOST_SAMPLES = 112 * 630 * 384
 """Maximum number of visibilities compared, twice the paper's: it limits the memory."""
 
 
-@once
+@memoize
 def agreement(graph: Graph) -> Task | None:
     """Return the task that compares the calibration of variant `residual` with the truth, or None if there is none.
 
@@ -32,74 +34,92 @@ def agreement(graph: Graph) -> Task | None:
         return None
     if not (residual.effects and residual.calibrate and {"foregrounds", "noise"} <= set(residual.components)):
         return None
-    power = graph.experiment.power
-    settings: dict[str, Any] = {"buffer": power.wedge_buffer, "redundancy_tolerance": power.redundancy_tolerance}
-    size = Size.of(graph.experiment.instrument)
-    if (compared := integrations_compared(size)) < size.times:
-        settings["integrations"] = compared
-    inputs = {
-        "data": corruption.data(graph, residual, "even"),
-        "noise": corruption.data(graph, noise, "even"),
-        "foregrounds": foregrounds,
-        "gains": corruption.gains(graph),
-        "calibration": calibration.calibration(graph, residual, "even"),
-    }
-    return Task(MEASURE_AGREEMENT, "calibration against truth", settings, inputs)
-
-
-def measure(job: Job) -> Mapping[str, Any]:
-    """Write the measurements of the first polarization and the redundant fraction of the array to agreement.json."""
-    import numpy as np
-
-    from calstudy.base.errors import InputError
-    from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
-    from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth
-    from calstudy.instrument.layouts import redundant_groups
-    from calstudy.products.selection import read_gains
-
-    data = read_visibilities(job.inputs["data"] / DATA)
-    true, fitted = read_gains(job.inputs["gains"]), read_gains(job.inputs["calibration"])
-    calibrated = read_visibilities(job.inputs["calibration"] / RESIDUAL)
-    flags = flag_cube(calibrated)[..., 0]
-    solved, observed = ~flags.all(axis=(1, 2)), ~flags.all(axis=(0, 2))
-    places = np.flatnonzero(solved)
-    chosen = spread(places, job.settings.get("integrations", len(places)))
-    if not chosen.size:
-        raise InputError("calibration against truth: no integration was calibrated")
-    vectors = baseline_vectors(data)
-    pairs = antenna_pairs(data)[observed]
-    numbers = np.unique(pairs)
-    baselines = Baselines(
-        antennas=np.searchsorted(numbers, pairs),
-        lengths=np.linalg.norm(vectors[observed], axis=1),
-        frequency=data.freq_array,
-        buffer=job.settings["buffer"],
+    power, size = graph.experiment.power, Size.of(graph.experiment.instrument)
+    compared = integrations_compared(size)
+    return Agreement(
+        "calibration against truth",
+        buffer=power.wedge_buffer,
+        redundancy_tolerance=power.redundancy_tolerance,
+        integrations=compared if compared < size.times else None,
+        data=corruption.data(graph, residual, "even"),
+        noise=corruption.data(graph, noise, "even"),
+        foregrounds=foregrounds,
+        gains=corruption.gains(graph),
+        calibration=calibration.calibration(graph, residual, "even"),
     )
-    # Flagged samples are zero in all compared arrays.
-    used, known = ~flags[chosen][:, observed], ~fitted.flags[chosen][:, np.searchsorted(fitted.numbers, numbers)]
 
-    def visibilities(name: str, file: str) -> np.ndarray:
-        return used * to_cube(read_visibilities(job.inputs[name] / file))[chosen, ..., 0][:, observed]
 
-    truth = Truth(
-        gains=known * true.over(len(fitted.values), numbers)[chosen],
-        foregrounds=visibilities("foregrounds", VISIBILITIES),
-        noise=visibilities("noise", DATA),
-        data=visibilities("data", DATA),
-    )
-    gains = known * fitted.over(len(fitted.values), numbers)[chosen]
-    fit = Fit(gains, *(visibilities("calibration", name) for name in (MODEL, RESIDUAL)))
-    found = compare_with_truth(truth, fit, baselines)
-    write_json(
-        job.output / AGREEMENT,
-        {
-            "measurements": as_json(found),
-            "redundant_fraction": redundant_groups(vectors, job.settings["redundancy_tolerance"]).redundant_fraction,
-            "integrations": chosen.size,
-            "integrations_without_solution": int((~solved).sum()),
-        },
-    )
-    return {}
+class Agreement(Task, stage="agreement", version=3):
+    """A calibration against the truth, at some or all integrations."""
+
+    buffer: float
+    redundancy_tolerance: float
+    integrations: int | None = None
+    data: Input
+    noise: Input
+    foregrounds: Input
+    gains: Input
+    calibration: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write measurements of the first polarization and the redundant fraction of the array to agreement.json."""
+        import numpy as np
+
+        from calstudy.base.errors import InputError
+        from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
+        from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth
+        from calstudy.instrument.layouts import redundant_groups
+        from calstudy.products.selection import read_gains
+
+        data = read_visibilities(self.data / DATA)
+        true, fitted = read_gains(self.gains), read_gains(self.calibration)
+        calibrated = read_visibilities(self.calibration / RESIDUAL)
+        flags = flag_cube(calibrated)[..., 0]
+        solved, observed = ~flags.all(axis=(1, 2)), ~flags.all(axis=(0, 2))
+        places = np.flatnonzero(solved)
+        chosen = spread(places, self.integrations or len(places))
+        if not chosen.size:
+            raise InputError("calibration against truth: no integration was calibrated")
+        vectors = baseline_vectors(data)
+        pairs = antenna_pairs(data)[observed]
+        numbers = np.unique(pairs)
+        baselines = Baselines(
+            antennas=np.searchsorted(numbers, pairs),
+            lengths=np.linalg.norm(vectors[observed], axis=1),
+            frequency=data.freq_array,
+            buffer=self.buffer,
+        )
+        # Flagged samples are zero in all compared arrays.
+        used, known = ~flags[chosen][:, observed], ~fitted.flags[chosen][:, np.searchsorted(fitted.numbers, numbers)]
+
+        def visibilities(path: Path) -> np.ndarray:
+            return used * to_cube(read_visibilities(path))[chosen, ..., 0][:, observed]
+
+        truth = Truth(
+            gains=known * true.over(len(fitted.values), numbers)[chosen],
+            foregrounds=visibilities(self.foregrounds / VISIBILITIES),
+            noise=visibilities(self.noise / DATA),
+            data=visibilities(self.data / DATA),
+        )
+        gains = known * fitted.over(len(fitted.values), numbers)[chosen]
+        fit = Fit(gains, *(visibilities(self.calibration / name) for name in (MODEL, RESIDUAL)))
+        found = compare_with_truth(truth, fit, baselines)
+        write_json(
+            output / AGREEMENT,
+            {
+                "measurements": as_json(found),
+                "redundant_fraction": redundant_groups(vectors, self.redundancy_tolerance).redundant_fraction,
+                "integrations": chosen.size,
+                "integrations_without_solution": int((~solved).sum()),
+            },
+        )
+        return {}
+
+    def _cost(self) -> Cost:
+        size = size_of(self)
+        compared = integrations_compared(size) * size.baselines * size.channels.count
+        memory = LIBRARIES_MEMORY + (3 * size.samples + 8 * compared) * COMPLEX128
+        return Cost(1 + size.samples * 1e-7 + compared * 9e-7, memory, 1e4)
 
 
 def integrations_compared(size: Size) -> int:
@@ -112,13 +132,3 @@ def spread(places: np.ndarray, most: int) -> np.ndarray:
     import numpy as np
 
     return places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))]
-
-
-def _cost(task: Task) -> Cost:
-    size = size_of(task)
-    compared = integrations_compared(size) * size.baselines * size.channels.count
-    memory = LIBRARIES_MEMORY + (3 * size.samples + 8 * compared) * COMPLEX128
-    return Cost(1 + size.samples * 1e-7 + compared * 9e-7, memory, 1e4)
-
-
-MEASURE_AGREEMENT = Stage(name="agreement", version=3, make=measure, cost=_cost)

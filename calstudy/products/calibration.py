@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of
@@ -26,8 +26,8 @@ from calstudy.products.files import (
     write_json,
     write_visibilities,
 )
-from calstudy.products.graph import Graph, once, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,51 +35,49 @@ if TYPE_CHECKING:
     import numpy as np
     from pyuvdata import UVData
 
+    from calstudy.calibrate.preparation import PreparedFit
+    from calstudy.calibrate.records import CalibrationResult
+    from calstudy.calibrate.settings import GainFit
 
-@once
+
+@memoize
 def calibration(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of the calibration of one noise realization ("even" or "odd") of a variant."""
-    # The assumed world enters only through the sky model, which is an input.
-    inputs = calibration_inputs(graph, variant, parity)
-    model = inputs.get("sky_model")
-    calibrator = graph.experiment.calibration.for_data(inputs["data"].key, model.key if model else None)
-    return calibration_of(calibrator.with_defaults("assumed"), inputs, temporary=not graph.keep_visibilities)
+    return calibration_of(graph, calibration_inputs(graph, variant, parity))
 
 
-def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str, Task]:
+def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str, Task | None]:
     """Return the inputs of the calibration of one noise realization ("even" or "odd") of a variant."""
-    inputs, calibrator = {"data": corruption.data(graph, variant, parity)}, graph.experiment.calibration
-    if (model := sky_model.sky_model(graph)) is not None:
-        inputs["sky_model"] = model
-    if calibrator.needs_noise:
-        inputs["levels"] = corruption.levels(graph)
-    if calibrator.needs_autos:
-        inputs["autocorrelations"] = corruption.autocorrelations(graph, variant, parity)
-    return inputs
+    calibrator = graph.experiment.calibration
+    return {
+        "data": corruption.data(graph, variant, parity),
+        "sky_model": sky_model.sky_model(graph),
+        "levels": corruption.levels(graph) if calibrator.needs_noise else None,
+        "autocorrelations": corruption.autocorrelations(graph, variant, parity) if calibrator.needs_autos else None,
+    }
 
 
-def calibration_of(settings: Calibrator, inputs: Mapping[str, Task], temporary: bool = False) -> Task:
-    """Return the task of the calibration of any data.
-
-    The inputs are ``data``; ``sky_model``, if there is one; ``levels``, if the calibrator needs the level of the noise;
-    and ``autocorrelations``, if it needs them and the data have none.
-    """
-    data = inputs["data"]
+def calibration_of(graph: Graph, inputs: Mapping[str, Task | None]) -> Task:
+    """Return the task of the calibration of any data by the calibrator of a study, with the inputs of `Calibrated`."""
+    data, sky = cast(Task, inputs["data"]), inputs["sky_model"]
+    # The assumed world enters only through the sky model, which is an input.
+    settings = graph.experiment.calibration.for_data(data.key, sky.key if sky else None).with_defaults("assumed")
     solves = -(-size_of(data).times // settings.integrations_per_solve)
     # Gains smoothed in time need all integrations.
     together = settings.smooth_gains is not None and settings.smooth_gains.over_time
     count = 1 if together else min(settings.chunks, solves)
-    chunks = {
-        f"chunk{index:03d}": Task(
-            CALIBRATE_CHUNK,
+    chunks = (
+        CalibrateChunk(
             f"{data.label} {index + 1}/{count}",
-            {"calibration": settings, "index": index, "count": count},
-            inputs,
+            calibration=settings,
+            index=index,
+            count=count,
             temporary=True,
+            **inputs,
         )
         for index in range(count)
-    }
-    return Task(CALIBRATE, data.label, {}, chunks, temporary=temporary)
+    )
+    return Calibrate(data.label, chunk=tuple(chunks), temporary=not graph.keep_visibilities)
 
 
 def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.ndarray:
@@ -96,25 +94,6 @@ def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.nda
     return times[edges[index] : edges[index + 1]]
 
 
-def read_calibrated(
-    inputs: Mapping[str, Path], times: np.ndarray | None = None
-) -> tuple[UVData, UVData | None, float | None]:
-    """Read data, sky model and noise level of a calibration at some integrations (JD), by default all.
-
-    The folders are those of `calibration_inputs`; a sky model or noise level that is not an input is None.
-    """
-    from calstudy.calibrate.sky_model import common_baselines
-
-    data = read_visibilities(inputs["data"] / DATA, times)
-    sky = read_visibilities(inputs["sky_model"] / VISIBILITIES, times) if "sky_model" in inputs else None
-    if "autocorrelations" in inputs:
-        data = with_autocorrelations(data, read_visibilities(inputs["autocorrelations"] / DATA, times))
-        if sky is not None:
-            sky, data, _ = common_baselines(sky, data, autos=False)
-    noise = read_json(inputs["levels"] / LEVELS)["noise_std"] if "levels" in inputs else None
-    return data, sky, noise
-
-
 def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
     """Return data with the autocorrelations of each integration after all other baselines."""
     import numpy as np
@@ -125,54 +104,123 @@ def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
     return joined
 
 
-def calibrate_chunk(job: Job) -> Mapping[str, Any]:
-    """Calibrate a run of consecutive integrations."""
+def prepared_fit(calibrator: GainFit, data: UVData, sky: UVData | None, noise: float | None) -> PreparedFit:
+    """Return the fit of data with a sky model and the level of the noise, if they are known."""
     from calstudy.base.observation import Observation
-    from calstudy.calibrate.execution import run_calibrator
-    from calstudy.calibrate.weights import conspicuous
+    from calstudy.calibrate.interface import Assumed
+    from calstudy.calibrate.preparation import prepare
 
-    index, count, settings = (job.settings[name] for name in ("index", "count", "calibration"))
-    times = _times_of_chunk(job.inputs["data"] / DATA, index, count, settings.integrations_per_solve)
-    data, sky, noise = read_calibrated(job.inputs, times)
-    told = conspicuous(Observation(data))
-    result = run_calibrator(settings, data, sky, noise=noise)
-    result.gains.write_calh5(job.output / GAINS)
-    for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
-        write_visibilities(uvd, job.output / name, single=True)
-    summary = {**result.summary(), "told": told}
-    write_json(job.output / SOLUTION, summary)
-    return {"by_status": summary["by_status"]}
+    assumed = Assumed(None if sky is None else Observation(sky), noise=noise)
+    return prepare(Observation(data), calibrator, assumed)
 
 
-def assemble(job: Job) -> Mapping[str, Any]:
-    """Join the runs of integrations into one set of gains, model, residual and solution log."""
-    import numpy as np
+def read_result(folder: Path) -> CalibrationResult:
+    """Read a product of stage `calibrate`."""
     from pyuvdata import UVCal
 
-    folders = [job.inputs[name] for name in sorted(job.inputs, key=lambda name: int(name.removeprefix("chunk")))]
-    gains = UVCal.from_file([str(folder / GAINS) for folder in folders], axis="time")
-    gains.write_calh5(job.output / GAINS)
-    for name in (MODEL, RESIDUAL):
-        parts = [read_visibilities(folder / name) for folder in folders]
-        joined = parts[0].fast_concat(parts[1:], "blt", inplace=False) if len(parts) > 1 else parts[0]
-        write_visibilities(joined, job.output / name, single=True)
-    solutions = [read_json(folder / SOLUTION) for folder in folders]
-    records = [record for solution in solutions for record in solution["records"]]
-    told = list(dict.fromkeys(text for solution in solutions for text in solution.get("told", [])))
-    records.sort(key=lambda record: (record["polarization"], record["time"]))
-    by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
-    for record in records:
-        by_status[record["status"]] += 1
-        record["integration"] = int(np.abs(gains.time_array - record["time"]).argmin())
-    write_json(job.output / SOLUTION, {"by_status": by_status, "records": records})
-    seconds = [record["seconds"] for record in records]
-    steps = [record["n_steps"] for record in records if record["n_steps"] is not None]
-    return {
-        "by_status": by_status,
-        **({"median_steps": float(np.median(steps))} if steps else {}),
-        "median_seconds_per_solve": float(np.median(seconds)),
-        "warnings": told + _warnings(by_status, records),
-    }
+    from calstudy.calibrate.records import CalibrationResult, Solve
+
+    model, residual = (read_visibilities(folder / name) for name in (MODEL, RESIDUAL))
+    records = tuple(map(Solve.from_json, read_json(folder / SOLUTION)["records"]))
+    return CalibrationResult(gains=UVCal.from_file(folder / GAINS), model=model, residual=residual, solutions=records)
+
+
+class Calibrated(Task):
+    """What is made of data that are calibrated.
+
+    There may be a sky model, the level of the noise if the calibrator needs it, and the autocorrelations if it needs
+    them and the data have none.
+    """
+
+    data: Input
+    sky_model: Input = None
+    levels: Input = None
+    autocorrelations: Input = None
+
+    def read(self, times: np.ndarray | None = None) -> tuple[UVData, UVData | None, float | None]:
+        """Read data, sky model and noise level at some integrations (JD), by default all; None for what is lacking."""
+        from calstudy.calibrate.sky_model import common_baselines
+
+        data = read_visibilities(self.data / DATA, times)
+        sky = None if self.sky_model is None else read_visibilities(self.sky_model / VISIBILITIES, times)
+        if self.autocorrelations is not None:
+            data = with_autocorrelations(data, read_visibilities(self.autocorrelations / DATA, times))
+            if sky is not None:
+                sky, data, _ = common_baselines(sky, data, autos=False)
+        noise = None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"]
+        return data, sky, noise
+
+
+class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
+    """The calibration of a run of consecutive integrations."""
+
+    calibration: Calibrator
+    index: int
+    count: int
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Calibrate, and write gains, model, residual and the records of the solves."""
+        from calstudy.base.observation import Observation
+        from calstudy.calibrate.execution import run_calibrator
+        from calstudy.calibrate.weights import conspicuous
+
+        together = self.calibration.integrations_per_solve
+        times = _times_of_chunk(self.data / DATA, self.index, self.count, together)
+        data, sky, noise = self.read(times)
+        told = conspicuous(Observation(data))
+        result = run_calibrator(self.calibration, data, sky, noise=noise)
+        result.gains.write_calh5(output / GAINS)
+        for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
+            write_visibilities(uvd, output / name, single=True)
+        summary = {**result.summary(), "told": told}
+        write_json(output / SOLUTION, summary)
+        return {"by_status": summary["by_status"]}
+
+    def _cost(self) -> Cost:
+        size, pieces = size_of(self), self.count
+        solves = cost_of(self.calibration, replace(size, times=-(-size.times // pieces)))
+        # Data and sky model, with flags and sample counts, and results.
+        files = (COMPLEX64 + COMPLEX128 + 10 + 8 * COMPLEX128) * size.samples / pieces
+        return Cost(solves.seconds, solves.memory + files, 2 * size.samples * COMPLEX64 / pieces)
+
+
+class Calibrate(Task, stage="calibrate", version=2):
+    """The calibration of all integrations."""
+
+    chunk: tuple[Input, ...]
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Join the runs of integrations into one set of gains, model, residual and records of solves."""
+        import numpy as np
+        from pyuvdata import UVCal
+
+        gains = UVCal.from_file([str(folder / GAINS) for folder in self.chunk], axis="time")
+        gains.write_calh5(output / GAINS)
+        for name in (MODEL, RESIDUAL):
+            parts = [read_visibilities(folder / name) for folder in self.chunk]
+            joined = parts[0].fast_concat(parts[1:], "blt", inplace=False) if len(parts) > 1 else parts[0]
+            write_visibilities(joined, output / name, single=True)
+        solutions = [read_json(folder / SOLUTION) for folder in self.chunk]
+        records = [record for solution in solutions for record in solution["records"]]
+        told = list(dict.fromkeys(text for solution in solutions for text in solution.get("told", [])))
+        records.sort(key=lambda record: (record["polarization"], record["time"]))
+        by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
+        for record in records:
+            by_status[record["status"]] += 1
+            record["integration"] = int(np.abs(gains.time_array - record["time"]).argmin())
+        write_json(output / SOLUTION, {"by_status": by_status, "records": records})
+        seconds = [record["seconds"] for record in records]
+        steps = [record["n_steps"] for record in records if record["n_steps"] is not None]
+        return {
+            "by_status": by_status,
+            **({"median_steps": float(np.median(steps))} if steps else {}),
+            "median_seconds_per_solve": float(np.median(seconds)),
+            "warnings": told + _warnings(by_status, records),
+        }
+
+    def _cost(self) -> Cost:
+        disk = 2 * size_of(self).samples * COMPLEX64
+        return Cost(0.7 + disk * 5e-9, LIBRARIES_MEMORY + 3 * disk, disk)
 
 
 def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) -> list[str]:
@@ -189,20 +237,3 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
         f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
         f"{example['integration']}: {example['message']}"
     ]
-
-
-def _cost_of_chunk(task: Task) -> Cost:
-    size, pieces = size_of(task), task.settings["count"]
-    solves = cost_of(task.settings["calibration"], replace(size, times=-(-size.times // pieces)))
-    # Data and sky model, with flags and sample counts, and results.
-    files = (COMPLEX64 + COMPLEX128 + 10 + 8 * COMPLEX128) * size.samples / pieces
-    return Cost(solves.seconds, solves.memory + files, 2 * size.samples * COMPLEX64 / pieces)
-
-
-def _cost(task: Task) -> Cost:
-    disk = 2 * size_of(task).samples * COMPLEX64
-    return Cost(0.7 + disk * 5e-9, LIBRARIES_MEMORY + 3 * disk, disk)
-
-
-CALIBRATE_CHUNK = Stage(name="calibrate-chunk", version=6, make=calibrate_chunk, cost=_cost_of_chunk)
-CALIBRATE = Stage(name="calibrate", version=2, make=assemble, cost=_cost)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +12,10 @@ import numpy as np
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
 from calstudy.products import score, spectra
-from calstudy.products.files import read_json
+from calstudy.products.files import json_number, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Inputs, Task
 
 if TYPE_CHECKING:
     from calstudy.power.score import CalibratedSpectra, Score
@@ -24,9 +23,12 @@ if TYPE_CHECKING:
 CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
 """What is compared in bands of k, and how it is headed."""
+NOTE = (
+    "T is the part of the EoR's power that is left, the bias the power of the residual without EoR over that of the "
+    "EoR, both free of the flux scale s, outside the wedge, k in h/Mpc, one standard deviation. All numbers are in "
+    "comparison.md and comparison.csv."
+)
 DIFFERENCES = ("transfer", "transfer_error", "bias", "bias_error")
-SPECTRA = ("signal", "response", "cross", "residual", "residual_without_eor")
-"""What the scores are made from, and what differences of two of them are."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,9 @@ def case_name(world: int, calibrator: int) -> str:
     return f"{world:03d}:{calibrator:03d}"
 
 
-def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Task], notes: Sequence[str]) -> Task:
+def comparison(
+    title: str, labels: Mapping[str, Any], scores: Mapping[str, score.MeasureScore], notes: Sequence[str]
+) -> Task:
     """Return the task of the table.
 
     Parameters
@@ -65,22 +69,24 @@ def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Task]
     notes
         What stands in for the papers' own ingredients.
     """
-    powers = {f"{case}:{name}": task.inputs[name] for case, task in scores.items() for name in SPECTRA}
+    powers = {f"{case}:{name}": task.inputs[name] for case, task in scores.items() for name in score.SPECTRA}
     # All cases are measured alike.
-    buffers = {task.settings["power"].wedge_buffer for task in scores.values()}
-    settings = {"title": title, **labels, "notes": list(notes), "wedge_buffer": max(buffers, default=0.0)}
-    return Task(COMPARISON, "comparison", settings, {**scores, **powers})
+    buffer = max((task.power.wedge_buffer for task in scores.values()), default=0.0)
+    inputs = {**scores, **powers}
+    return Comparison("comparison", title=title, **labels, notes=list(notes), wedge_buffer=buffer, cases=inputs)
 
 
-def read_cases(job: Job) -> dict[str, dict[str, Case]]:
-    """Return the cases of a job by the labels of world and calibrator, in the order of the file; none if refused."""
+def read_cases(
+    calibrators: Sequence[str], worlds: Sequence[str], folders: Mapping[str, Path]
+) -> dict[str, dict[str, Case]]:
+    """Return the cases by the labels of world and calibrator, in the order of the file; none if refused."""
     return {
         world: {
-            calibrator: _read(job.inputs[case_name(row, column)])
-            for column, calibrator in enumerate(job.settings["calibrators"])
-            if case_name(row, column) in job.inputs
+            calibrator: _read(folders[case_name(row, column)])
+            for column, calibrator in enumerate(calibrators)
+            if case_name(row, column) in folders
         }
-        for row, world in enumerate(job.settings["worlds"])
+        for row, world in enumerate(worlds)
     }
 
 
@@ -110,74 +116,77 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-def _read_spectra(job: Job, case: str) -> CalibratedSpectra:
-    from calstudy.power.score import CalibratedSpectra
+class Comparison(Task, stage="comparison", version=3):
+    """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there."""
 
-    return CalibratedSpectra(**{name: spectra.read_delay_spectra(job.inputs[f"{case}:{name}"]) for name in SPECTRA})
+    title: str
+    calibrators: Sequence[str]
+    worlds: Sequence[str]
+    refusals: Sequence[Sequence[str]]
+    notes: Sequence[str]
+    wedge_buffer: float
+    cases: Inputs
 
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write comparison.csv, comparison.json and comparison.md."""
+        import json
 
-def differences(job: Job, world: str, found: Mapping[str, Case]) -> dict[str, list[dict[str, Any]]]:
-    """Return T and bias of every calibrator less those of the best in each band, with paired errors.
+        cases = read_cases(self.calibrators, self.worlds, self.cases)
+        less = {world: self.differences(world, found) for world, found in cases.items()}
+        (output / CSV).write_text(Table.of_records(list(_csv_rows(cases))).csv(), encoding="utf-8", newline="")
+        summaries = {
+            world: {name: {**case.summary, "differences": less[world][name]} for name, case in found.items()}
+            for world, found in cases.items()
+        }
+        text = json.dumps(summaries, indent=1, ensure_ascii=False, allow_nan=False)
+        (output / JSON).write_text(text + "\n", encoding="utf-8")
+        (output / MARKDOWN).write_text(_markdown(self, cases, less), encoding="utf-8")
+        return {}
 
-    Both are of the same sky, gains and noise, and the error is that of leaving out the same antennas in both.
+    def shown(self, folder: Path) -> Sequence[Table]:
+        """Return the scores of all calibrators, a table for each world."""
+        found = {world: cases for world, cases in read_json(folder / JSON).items() if cases}
+        return [replace(score_table(cases), title=f"Scores: {world}", note=NOTE) for world, cases in found.items()]
 
-    Parameters
-    ----------
-    job
-        With the spectra of all cases.
-    world
-        Its label.
-    found
-        The cases there, by calibrator.
+    def differences(self, world: str, found: Mapping[str, Case]) -> dict[str, list[dict[str, Any]]]:
+        """Return T and bias of every calibrator less those of the best in each band, with paired errors.
 
-    Returns
-    -------
-    By calibrator, for each band what ``best`` is called, and ``transfer`` and ``bias`` with errors; None if not known.
-    """
-    from calstudy.power.score import BANDS, difference
+        Both are of the same sky, gains and noise, and the error is that of leaving out the same antennas in both. By
+        calibrator of the cases `found` in a world, there is for each band what ``best`` is called, and ``transfer``
+        and ``bias`` with errors; None if not known.
+        """
+        from calstudy.power.score import BANDS, difference
 
-    row = job.settings["worlds"].index(world)
-    names = {name: case_name(row, place) for place, name in enumerate(job.settings["calibrators"]) if name in found}
-    scales = {name: float(case.bands.flux_scale) for name, case in found.items()}
-    leaders = [best(found, band) for band in range(len(BANDS) - 1)]
-    result: dict[str, list[dict[str, Any]]] = {
-        name: [{"k": list(BANDS[band : band + 2]), "best": leader} for band, leader in enumerate(leaders)]
-        for name in found
-    }
-    for leader in dict.fromkeys(name for name in leaders if name is not None):
-        reference = _read_spectra(job, names[leader])
-        for name, bands in result.items():
-            pair = (reference if name == leader else _read_spectra(job, names[name]), reference)
-            less = difference(pair, BANDS, job.settings["wedge_buffer"], (scales[name], scales[leader]))
-            for band, entry in enumerate(bands):
-                if entry["best"] == leader:
-                    entry |= {key: _known(getattr(less, key)[band]) for key in DIFFERENCES}
-    return result
+        row = self.worlds.index(world)
+        names = {name: case_name(row, place) for place, name in enumerate(self.calibrators) if name in found}
+        scales = {name: float(case.bands.flux_scale) for name, case in found.items()}
+        leaders = [best(found, band) for band in range(len(BANDS) - 1)]
+        result: dict[str, list[dict[str, Any]]] = {
+            name: [{"k": list(BANDS[band : band + 2]), "best": leader} for band, leader in enumerate(leaders)]
+            for name in found
+        }
+        for leader in dict.fromkeys(name for name in leaders if name is not None):
+            reference = self._spectra(names[leader])
+            for name, bands in result.items():
+                pair = (reference if name == leader else self._spectra(names[name]), reference)
+                less = difference(pair, BANDS, self.wedge_buffer, (scales[name], scales[leader]))
+                for band, entry in enumerate(bands):
+                    if entry["best"] == leader:
+                        entry |= {key: json_number(getattr(less, key)[band]) for key in DIFFERENCES}
+        return result
 
+    def _spectra(self, case: str) -> CalibratedSpectra:
+        from calstudy.power.score import CalibratedSpectra
 
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+        folders = {name: self.cases[f"{case}:{name}"] for name in score.SPECTRA}
+        return CalibratedSpectra(**{name: spectra.read_delay_spectra(folder) for name, folder in folders.items()})
 
-
-def make_tables(job: Job) -> Mapping[str, Any]:
-    """Write comparison.csv, comparison.json and comparison.md."""
-    import json
-
-    cases = read_cases(job)
-    less = {world: differences(job, world, found) for world, found in cases.items()}
-    with (job.output / CSV).open("w", newline="", encoding="utf-8") as file:
-        rows = list(_csv_rows(cases))
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    summaries = {
-        world: {name: {**case.summary, "differences": less[world][name]} for name, case in found.items()}
-        for world, found in cases.items()
-    }
-    text = json.dumps(summaries, indent=1, ensure_ascii=False, allow_nan=False)
-    (job.output / JSON).write_text(text + "\n", encoding="utf-8")
-    (job.output / MARKDOWN).write_text(_markdown(cases, less, job.settings), encoding="utf-8")
-    return {}
+    def _cost(self) -> Cost:
+        cases = len(self.worlds) * len(self.calibrators)
+        size = size_of(self)
+        # Spectra of two cases, and what their units owe to two antennas each.
+        held = 2 * len(score.SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
+        return Cost(2 + cases * (0.5 + held * 1e-8), LIBRARIES_MEMORY + held, 1e6)
 
 
 def _csv_rows(cases: Mapping[str, Mapping[str, Case]]) -> Iterator[dict[str, Any]]:
@@ -207,12 +216,12 @@ def _statuses(summary: Mapping[str, Any]) -> str:
 
 
 def _markdown(
+    task: Comparison,
     cases: Mapping[str, Mapping[str, Case]],
     less: Mapping[str, Mapping[str, Sequence[Mapping[str, Any]]]],
-    settings: Mapping[str, Any],
 ) -> str:
     lines = [
-        f"# Calibrators compared: {settings['title']}",
+        f"# Calibrators compared: {task.title}",
         "",
         "T is the part of the EoR's power that is left, and the bias the power of the residual without EoR over that "
         "of the EoR, both free of the flux scale s, outside the wedge, in bands of k in h/Mpc, with one standard "
@@ -228,10 +237,10 @@ def _markdown(
         "errors of differences are found by leaving out the same antennas in both. The best in a band has the largest "
         "T of those with |bias| + 2σ below the EoR; if none is, the smallest |bias| + 2σ.",
         "",
-        *(f"Stand-in: {note}." for note in settings["notes"]),
-        *([""] if settings["notes"] else []),
+        *(f"Stand-in: {note}." for note in task.notes),
+        *([""] if task.notes else []),
     ]
-    lines += _tolerances(cases, settings["calibrators"])
+    lines += _tolerances(cases, task.calibrators)
     for world, found in cases.items():
         lines += [f"## {world}", ""]
         if found:
@@ -239,7 +248,7 @@ def _markdown(
             lines += [_sky_models(found), "", score_table(summaries).markdown()]
         if len(found) > 1:
             lines += ["Less the best of each band:", "", _difference_table(less[world]).markdown()]
-        refused = [(name, why) for place, name, why in settings["refusals"] if place == world]
+        refused = [(name, why) for place, name, why in task.refusals if place == world]
         lines += [f"- {name} cannot work here: {why}" for name, why in refused] + ([""] if refused else [])
     return "\n".join(lines).rstrip() + "\n"
 
@@ -354,14 +363,3 @@ def _cell(value: float | None, error: float | None = None, decimals: int | None 
 
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.2g} %"
-
-
-def _cost(task: Task) -> Cost:
-    cases = len(task.settings["worlds"]) * len(task.settings["calibrators"])
-    size = size_of(task)
-    # Spectra of two cases, and what their units owe to two antennas each.
-    held = 2 * len(SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
-    return Cost(2 + cases * (0.5 + held * 1e-8), LIBRARIES_MEMORY + held, 1e6)
-
-
-COMPARISON = Stage(name="comparison", version=3, make=make_tables, cost=_cost)

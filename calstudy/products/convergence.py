@@ -13,9 +13,11 @@ from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA, VISIBILITIES, read_visibilities, write_json
 from calstudy.products.graph import Graph, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
 
     from calstudy.calibrate.agreement import Baselines, Realization
@@ -33,62 +35,129 @@ def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
     experiment = graph.experiment
     variant = experiment.variants[name]
     noise = Variant(components=("noise",))
-    inputs = {f"data {parity}": corruption.data(graph, variant, parity) for parity in PARITIES}
+    data = {f"data {parity}": corruption.data(graph, variant, parity) for parity in PARITIES}
     if "noise" in variant.components:
-        inputs |= {f"noise {parity}": corruption.data(graph, noise, parity) for parity in PARITIES}
-    inputs["eor"] = corruption.data(graph, Variant(components=("eor",)), "even")
-    if variant.effects:
-        inputs["gains"] = corruption.gains(graph)
-    if (model := sky_model.sky_model(graph)) is not None:
-        inputs["sky_model"] = model
-    settings = {
-        "calibration": experiment.calibration.with_defaults("assumed").model_copy(update={"solver": solver}),
-        "integration": integration,
-        "steps": list(experiment.outputs.convergence.steps),
-        "buffer": experiment.power.wedge_buffer,
-    }
-    return Task(CONVERGENCE, f"{solver.name} on {name}, integration {integration}", settings, inputs)
-
-
-def follow(job: Job) -> Mapping[str, Any]:
-    """Solve one integration of both realizations, and write the power they have in common after numbers of steps.
-
-    Powers are sums over the delays outside the wedge, one per baseline, of the first polarization.
-    """
-    import numpy as np
-
-    from calstudy.calibrate.agreement import cross_power
-    from calstudy.calibrate.problem import gain_products
-
-    paths, realizations = {}, {}
-    for parity in PARITIES:
-        realizations[parity], paths[parity], baselines = _solved(job, parity)
-    signal = _integration(job, "eor")
-    rows = []
-    for even, odd in _abreast(paths["even"], paths["odd"], job.settings["steps"]):
-        left = [
-            realizations[parity].residual_without_noise(gain_products(point.gains, baselines.antennas), point.model)
-            for parity, point in zip(PARITIES, (even, odd), strict=True)
-        ]
-        rows.append(
-            {
-                "steps": [even.n_steps, odd.n_steps],
-                "power": cross_power(left[0], left[1], baselines).tolist(),
-                "newton_decrement": [even.newton_decrement, odd.newton_decrement],
-                "decrement_rms": [even.decrement_rms, odd.decrement_rms],
-            }
-        )
-    power = cross_power(signal, signal, baselines)
-    write_json(
-        job.output / PATHS,
-        {
-            "checkpoints": rows,
-            "antennas": baselines.antennas.tolist(),
-            "signal": power.tolist(),
-            "signal_rms": float(np.sqrt(np.mean(np.abs(signal) ** 2))),
-        },
+        data |= {f"noise {parity}": corruption.data(graph, noise, parity) for parity in PARITIES}
+    return Convergence(
+        f"{solver.name} on {name}, integration {integration}",
+        calibration=experiment.calibration.with_defaults("assumed").model_copy(update={"solver": solver}),
+        integration=integration,
+        steps=list(experiment.outputs.convergence.steps),
+        buffer=experiment.power.wedge_buffer,
+        data=data,
+        eor=corruption.data(graph, Variant(components=("eor",)), "even"),
+        gains=corruption.gains(graph) if variant.effects else None,
+        sky_model=sky_model.sky_model(graph),
     )
-    return {"steps": [row["steps"][0] for row in rows]}
+
+
+class Convergence(Task, stage="convergence", version=4):
+    """The path of a solver on one integration of both realizations; `data` are their sums and their noise, if any."""
+
+    calibration: Any
+    integration: int
+    steps: Sequence[int]
+    buffer: float
+    data: Inputs
+    eor: Input
+    gains: Input = None
+    sky_model: Input = None
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Solve, and write the power that the realizations have in common after numbers of steps.
+
+        Powers are sums over the delays outside the wedge, one per baseline, of the first polarization.
+        """
+        import numpy as np
+
+        from calstudy.calibrate.agreement import cross_power
+        from calstudy.calibrate.problem import gain_products
+
+        paths, realizations = {}, {}
+        for parity in PARITIES:
+            realizations[parity], paths[parity], baselines = self._solved(parity)
+        signal = self._integration(self.eor)
+        rows = []
+        for even, odd in _abreast(paths["even"], paths["odd"], self.steps):
+            left = [
+                realizations[parity].residual_without_noise(gain_products(point.gains, baselines.antennas), point.model)
+                for parity, point in zip(PARITIES, (even, odd), strict=True)
+            ]
+            rows.append(
+                {
+                    "steps": [even.n_steps, odd.n_steps],
+                    "power": cross_power(left[0], left[1], baselines).tolist(),
+                    "newton_decrement": [even.newton_decrement, odd.newton_decrement],
+                    "decrement_rms": [even.decrement_rms, odd.decrement_rms],
+                }
+            )
+        power = cross_power(signal, signal, baselines)
+        write_json(
+            output / PATHS,
+            {
+                "checkpoints": rows,
+                "antennas": baselines.antennas.tolist(),
+                "signal": power.tolist(),
+                "signal_rms": float(np.sqrt(np.mean(np.abs(signal) ** 2))),
+            },
+        )
+        return {"steps": [row["steps"][0] for row in rows]}
+
+    def _integration(self, folder: Path) -> np.ndarray:
+        """Return one integration of the first polarization of data, (Nbls, Nfreqs)."""
+        from calstudy.base.visibilities import to_cube
+
+        return to_cube(read_visibilities(folder / DATA))[self.integration, ..., 0]
+
+    def _solved(self, parity: str) -> tuple[Realization, list[Checkpoint], Baselines]:
+        """Return a realization, the states of the solver after the numbers of steps, and the baselines."""
+        import numpy as np
+
+        from calstudy.base.observation import Observation
+        from calstudy.calibrate.agreement import Baselines, Realization
+        from calstudy.calibrate.calamity import make_solver
+        from calstudy.calibrate.interface import Assumed
+        from calstudy.calibrate.preparation import make_problem, prepare
+        from calstudy.calibrate.problem import gain_products
+        from calstudy.calibrate.solvers.interface import trace
+        from calstudy.products.selection import read_gains
+
+        settings = self.calibration
+        index = self.integration
+        data = read_visibilities(self.data[f"data {parity}"] / DATA)
+        chosen = np.arange(index * data.Nbls, (index + 1) * data.Nbls)
+        data = data.select(blt_inds=chosen, inplace=False, run_check=False)
+        sky = None
+        if self.sky_model is not None:
+            sky = read_visibilities(self.sky_model / VISIBILITIES)
+            sky = sky.select(blt_inds=chosen, inplace=False, run_check=False)
+        assumed = Assumed(None if sky is None else Observation(sky))
+        prepared = prepare(Observation(data), settings, assumed)
+        problem = make_problem(prepared, settings, slice(0, 1), 0)
+        if isinstance(problem, str):
+            raise InputError(f"outputs.convergence: integration {index} cannot be calibrated: {problem}")
+        if (problem.weights == 0).any():
+            raise InputError("outputs.convergence: some data are flagged, which the figure does not support")
+        antennas = prepared.structure.antennas
+        products = np.ones(problem.visibilities.shape, complex)
+        if self.gains is not None:
+            products = gain_products(read_gains(self.gains).at(index, prepared.data.numbers), antennas)
+        noise = np.zeros_like(products)
+        if f"noise {parity}" in self.data:
+            noise = self._integration(self.data[f"noise {parity}"])
+        baselines = Baselines(antennas, prepared.data.lengths, prepared.data.frequencies, self.buffer)
+        if not prepared.fitted.all():
+            raise InputError("outputs.convergence: autocorrelations cannot be among the data")
+        found = trace(problem, make_solver(settings), self.steps)
+        return Realization(problem.visibilities, noise, products), found, baselines
+
+    def _cost(self) -> Cost:
+        size, solver = size_of(self), self.calibration.solver
+        work = size.baselines * size.channels.count / PAPER_SAMPLES
+        step = 0.3 if solver.name == "gauss-newton" else ADAMAX_STEP
+        steps = 10 if solver.name == "gauss-newton" else min(solver.max_steps, max(self.steps))
+        data = 4 * size.samples * 8
+        return Cost(20 + 2 * steps * step * work, LIBRARIES_MEMORY + 1.5e9 * work + data, 1e6)
 
 
 def _abreast(
@@ -102,65 +171,3 @@ def _abreast(
         if max(first.n_steps, second.n_steps) > seen:
             seen = max(first.n_steps, second.n_steps)
             yield first, second
-
-
-def _integration(job: Job, name: str) -> np.ndarray:
-    """Return one integration of the first polarization of an input, (Nbls, Nfreqs)."""
-    from calstudy.base.visibilities import to_cube
-
-    return to_cube(read_visibilities(job.inputs[name] / DATA))[job.settings["integration"], ..., 0]
-
-
-def _solved(job: Job, parity: str) -> tuple[Realization, list[Checkpoint], Baselines]:
-    """Return a realization, the states of the solver after the numbers of steps in the settings, and the baselines."""
-    import numpy as np
-
-    from calstudy.base.observation import Observation
-    from calstudy.calibrate.agreement import Baselines, Realization
-    from calstudy.calibrate.calamity import make_solver
-    from calstudy.calibrate.interface import Assumed
-    from calstudy.calibrate.preparation import make_problem, prepare
-    from calstudy.calibrate.problem import gain_products
-    from calstudy.calibrate.solvers.interface import trace
-    from calstudy.products.selection import read_gains
-
-    settings = job.settings["calibration"]
-    index, steps = job.settings["integration"], job.settings["steps"]
-    data = read_visibilities(job.inputs[f"data {parity}"] / DATA)
-    chosen = np.arange(index * data.Nbls, (index + 1) * data.Nbls)
-    data = data.select(blt_inds=chosen, inplace=False, run_check=False)
-    sky = None
-    if "sky_model" in job.inputs:
-        sky = read_visibilities(job.inputs["sky_model"] / VISIBILITIES)
-        sky = sky.select(blt_inds=chosen, inplace=False, run_check=False)
-    assumed = Assumed(None if sky is None else Observation(sky))
-    prepared = prepare(Observation(data), settings, assumed)
-    problem = make_problem(prepared, settings, slice(0, 1), 0)
-    if isinstance(problem, str):
-        raise InputError(f"outputs.convergence: integration {index} cannot be calibrated: {problem}")
-    if (problem.weights == 0).any():
-        raise InputError("outputs.convergence: some data are flagged, which the figure does not support")
-    antennas = prepared.structure.antennas
-    products = np.ones(problem.visibilities.shape, complex)
-    if "gains" in job.inputs:
-        products = gain_products(read_gains(job.inputs["gains"]).at(index, prepared.data.numbers), antennas)
-    noise = np.zeros_like(products)
-    if f"noise {parity}" in job.inputs:
-        noise = _integration(job, f"noise {parity}")
-    baselines = Baselines(antennas, prepared.data.lengths, prepared.data.frequencies, job.settings["buffer"])
-    if not prepared.fitted.all():
-        raise InputError("outputs.convergence: autocorrelations cannot be among the data")
-    found = trace(problem, make_solver(settings), steps)
-    return Realization(problem.visibilities, noise, products), found, baselines
-
-
-def _cost(task: Task) -> Cost:
-    size, solver = size_of(task), task.settings["calibration"].solver
-    work = size.baselines * size.channels.count / PAPER_SAMPLES
-    step = 0.3 if solver.name == "gauss-newton" else ADAMAX_STEP
-    steps = 10 if solver.name == "gauss-newton" else min(solver.max_steps, max(task.settings["steps"]))
-    data = 4 * size.samples * 8
-    return Cost(20 + 2 * steps * step * work, LIBRARIES_MEMORY + 1.5e9 * work + data, 1e6)
-
-
-CONVERGENCE = Stage(name="convergence", version=4, make=follow, cost=_cost)

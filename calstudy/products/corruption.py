@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.corrupt.interface import Effect, GainEffect
-from calstudy.corrupt.settings import NoNoise, RadiometerNoise
+from calstudy.corrupt.noise import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Variant
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.settings import InstrumentSettings
@@ -22,28 +22,29 @@ from calstudy.products.files import (
     write_json,
     write_visibilities,
 )
-from calstudy.products.graph import Graph, once, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.realdata.halves import PARITIES
+from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import numpy as np
 
-PARITIES = ("even", "odd")
-"""Names of the two noise realizations."""
+    from calstudy.corrupt.settings import CorruptionSettings
+
 LEVELS, TRUTH = "levels.json", "truth.h5"
 
 
-def truths(graph: Graph) -> list[Task]:
+def truths(graph: Graph) -> tuple[Task, ...]:
     """Return the tasks that draw the truth of each effect of the experiment, in the order of the effects."""
-    return [_truth(graph, place) for place in range(len(graph.experiment.corruption.effects))]
+    return tuple(_truth(graph, place) for place in range(len(graph.experiment.corruption.effects)))
 
 
-@once
+@memoize
 def _truth(graph: Graph, place: int) -> Task:
     effect = graph.experiment.corruption.effects[place]
-    return Task(DRAW_EFFECT, effect.label, {"instrument": _antennas(graph, [effect]), "effect": effect})
+    return DrawEffect(effect.label, instrument=_antennas(graph, [effect]), effect=effect)
 
 
 def _antennas(graph: Graph, effects: Sequence[Effect]) -> InstrumentSettings:
@@ -55,35 +56,29 @@ def _antennas(graph: Graph, effects: Sequence[Effect]) -> InstrumentSettings:
     return nominal.model_copy(update={"as_built": AsBuilt(positions=instrument.as_built.positions)})
 
 
-@once
+@memoize
 def gains(graph: Graph) -> Task:
     """Return the task of the true gains: the product of all effects on the gains, unity if there are none."""
-    effects = graph.experiment.corruption.effects
-    drawn = zip(effects, truths(graph), strict=True)
-    factors = [truth for effect, truth in drawn if isinstance(effect, GainEffect)]
-    settings = {"instrument": graph.experiment.instrument.without_beams()}
-    return Task(MULTIPLY_GAINS, "true gains", settings, _numbered(factors))
+    drawn = zip(graph.experiment.corruption.effects, truths(graph), strict=True)
+    factors = tuple(truth for effect, truth in drawn if isinstance(effect, GainEffect))
+    return MultiplyGains("true gains", instrument=graph.experiment.instrument.without_beams(), truth=factors)
 
 
-def _numbered(tasks: Sequence[Task]) -> dict[str, Task]:
-    return {f"truth{place:03d}": task for place, task in enumerate(tasks)}
-
-
-@once
+@memoize
 def levels(graph: Graph) -> Task:
     """Return the task of the levels: the factors of the EoR and the noise."""
-    inputs = {"eor": simulation.eor(graph)}
-    if (foregrounds := simulation.foregrounds(graph)) is not None:
-        inputs["foregrounds"] = foregrounds
     corruption = graph.experiment.corruption.with_defaults("effects")
     noise = corruption.noise if corruption.noise.kind == "none" else corruption.noise.with_defaults("seeds")
-    settings: dict[str, Any] = {"corruption": corruption.model_copy(update={"noise": noise})}
-    if isinstance(noise, RadiometerNoise):
-        settings["instrument"] = graph.experiment.instrument
-    return Task(MEASURE_LEVELS, "levels", settings, inputs)
+    return MeasureLevels(
+        "levels",
+        corruption=corruption.model_copy(update={"noise": noise}),
+        instrument=graph.experiment.instrument if isinstance(noise, RadiometerNoise) else None,
+        eor=simulation.eor(graph),
+        foregrounds=simulation.foregrounds(graph),
+    )
 
 
-@once
+@memoize
 def data(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of one noise realization ("even" or "odd") of a variant before calibration."""
     experiment = graph.experiment
@@ -91,31 +86,30 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
     flagging = [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]
     effects = experiment.corruption.effects if variant.effects else ()
     acting = effects or [experiment.corruption.effects[place] for place in flagging]
-    settings: dict[str, Any] = {"components": sorted(variant.components), "instrument": _antennas(graph, acting)}
-    inputs = {"levels": levels(graph)}
-    label = "+".join(variant.components)
+    label, seed = "+".join(variant.components), None
     if "noise" in variant.components:
         noise = experiment.corruption.noise
         if isinstance(noise, NoNoise):
             raise LookupError(f"{label}: corruption.noise is 'none'")
         own = None if "eor" in variant.components else noise.seeds_without_eor
-        settings["noise_seed"] = (own or noise.seeds)[PARITIES.index(parity)]
+        seed = (own or noise.seeds)[PARITIES.index(parity)]
         label = f"{label} {parity}"
-    if "foregrounds" in variant.components and (foregrounds := simulation.foregrounds(graph)) is not None:
-        inputs["foregrounds"] = foregrounds
-    if "eor" in variant.components:
-        inputs["eor"] = simulation.eor(graph)
-    if effects:
-        settings["effects"] = list(effects)
-        inputs |= _numbered(truths(graph))
-        label = f"effects on ({label})"
-    elif flagging:
-        settings["flagged_by"] = acting
-        inputs |= _numbered([_truth(graph, place) for place in flagging])
-    return Task(CORRUPT, label, settings, inputs, temporary=not graph.keep_visibilities)
+    return Corrupt(
+        f"effects on ({label})" if effects else label,
+        components=sorted(variant.components),
+        instrument=_antennas(graph, acting),
+        noise_seed=seed,
+        effects=tuple(effects),
+        flagged_by=() if effects else tuple(acting),
+        levels=levels(graph),
+        foregrounds=simulation.foregrounds(graph) if "foregrounds" in variant.components else None,
+        eor=simulation.eor(graph) if "eor" in variant.components else None,
+        truth=truths(graph) if effects else tuple(_truth(graph, place) for place in flagging),
+        temporary=not graph.keep_visibilities,
+    )
 
 
-@once
+@memoize
 def autocorrelations(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of the autocorrelations of one noise realization ("even" or "odd") of a variant.
 
@@ -124,39 +118,48 @@ def autocorrelations(graph: Graph, variant: Variant, parity: str) -> Task:
     noise = graph.experiment.corruption.noise
     if isinstance(noise, NoNoise):
         raise LookupError("autocorrelations: corruption.noise is 'none'")
-    settings: dict[str, Any] = {
-        "instrument": graph.experiment.instrument.without_beams(),
-        "noise_seed": noise.seeds[PARITIES.index(parity)],
-        "nights": noise.nights if isinstance(noise, RadiometerNoise) else 1,
-    }
-    inputs = {"levels": levels(graph)}
-    if variant.effects:
-        inputs["gains"] = gains(graph)
-    return Task(AUTOCORRELATE, f"autocorrelations {parity}", settings, inputs, temporary=not graph.keep_visibilities)
+    return Autocorrelate(
+        f"autocorrelations {parity}",
+        instrument=graph.experiment.instrument.without_beams(),
+        noise_seed=noise.seeds[PARITIES.index(parity)],
+        nights=noise.nights if isinstance(noise, RadiometerNoise) else 1,
+        levels=levels(graph),
+        gains=gains(graph) if variant.effects else None,
+        temporary=not graph.keep_visibilities,
+    )
 
 
-def draw_effect(job: Job) -> Mapping[str, Any]:
-    """Write the arrays drawn by an effect to truth.h5, one data set each."""
-    import h5py
+class DrawEffect(Task, stage="effect", version=1):
+    """The truth of an effect."""
 
-    from calstudy.base.observation import Observation
-    from calstudy.corrupt.interface import draw_flags, draw_truth
-    from calstudy.instrument.telescope import make_template
+    instrument: InstrumentSettings
+    effect: Effect
 
-    effect, observation = job.settings["effect"], Observation(make_template(job.settings["instrument"], as_built=True))
-    truth = draw_truth(effect, observation)
-    with h5py.File(job.output / TRUTH, "w") as file:
-        for name, array in truth.items():
-            file[name] = array
-    notes: dict[str, Any] = {"arrays": {name: list(array.shape) for name, array in truth.items()}}
-    if (flags := draw_flags(effect, observation, truth)) is not None:
-        notes["flagged_fraction"] = float(flags.mean())
-        if flags.shape[2] > 1 and flags.any():
-            notes["warnings"] = [
-                f"effect {effect.label!r} flags {100 * flags.mean():.2g} % of the samples: spectra with gaps mix "
-                "delays, and what is left of the foregrounds leaks beyond the wedge"
-            ]
-    return notes
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the arrays drawn by the effect to truth.h5, one data set each."""
+        import h5py
+
+        from calstudy.base.observation import Observation
+        from calstudy.corrupt.interface import draw_flags, draw_truth
+        from calstudy.instrument.telescope import make_template
+
+        effect, observation = self.effect, Observation(make_template(self.instrument, as_built=True))
+        truth = draw_truth(effect, observation)
+        with h5py.File(output / TRUTH, "w") as file:
+            for name, array in truth.items():
+                file[name] = array
+        notes: dict[str, Any] = {"arrays": {name: list(array.shape) for name, array in truth.items()}}
+        if (flags := draw_flags(effect, observation, truth)) is not None:
+            notes["flagged_fraction"] = float(flags.mean())
+            if flags.shape[2] > 1 and flags.any():
+                notes["warnings"] = [
+                    f"effect {effect.label!r} flags {100 * flags.mean():.2g} % of the samples: spectra with gaps mix "
+                    "delays, and what is left of the foregrounds leaks beyond the wedge"
+                ]
+        return notes
+
+    def _cost(self) -> Cost:
+        return _cost_of_gains(self, [self.effect])
 
 
 def read_truth(folder: Path) -> dict[str, np.ndarray]:
@@ -167,158 +170,181 @@ def read_truth(folder: Path) -> dict[str, np.ndarray]:
         return {name: data[()] for name, data in file.items()}
 
 
-def multiply_gains(job: Job) -> Mapping[str, Any]:
-    """Write the product of the gains of all effects to gains.calh5."""
-    import numpy as np
+class MultiplyGains(Task, stage="gains", version=2):
+    """The product of the gains of all effects."""
 
-    from calstudy.base.gains import make_uvcal
-    from calstudy.base.visibilities import antenna_rows
-    from calstudy.instrument.telescope import make_template
+    instrument: InstrumentSettings
+    truth: tuple[Input, ...]
 
-    template = make_template(job.settings["instrument"])
-    factors = [read_truth(folder)["gains"] for folder in job.inputs.values()]
-    # Gains that are constant during the run have a single time.
-    n_times = max((gains.shape[2] for gains in factors), default=1)
-    product = np.ones((template.telescope.Nants, template.Nfreqs, n_times, template.Npols), dtype=complex)
-    rows = antenna_rows(template)
-    for gains in factors:
-        product[rows] *= gains
-    make_uvcal(template, product).write_calh5(job.output / GAINS)
-    return {}
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the gains to gains.calh5."""
+        import numpy as np
 
+        from calstudy.base.gains import make_uvcal
+        from calstudy.base.visibilities import antenna_rows
+        from calstudy.instrument.telescope import make_template
 
-def measure_levels(job: Job) -> Mapping[str, Any]:
-    """Write the scales of EoR and noise to levels.json."""
-    from calstudy.base.visibilities import to_cube
-    from calstudy.corrupt.levels import rms, set_levels
-    from calstudy.corrupt.noise import radiometer_std
+        template = make_template(self.instrument)
+        factors = [read_truth(folder)["gains"] for folder in self.truth]
+        # Gains that are constant during the run have a single time.
+        n_times = max((gains.shape[2] for gains in factors), default=1)
+        product = np.ones((template.telescope.Nants, template.Nfreqs, n_times, template.Npols), dtype=complex)
+        rows = antenna_rows(template)
+        for gains in factors:
+            product[rows] *= gains
+        make_uvcal(template, product).write_calh5(output / GAINS)
+        return {}
 
-    measured = {
-        name: rms(to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))) if name in job.inputs else 0.0
-        for name in ("foregrounds", "eor")
-    }
-    settings = job.settings["corruption"]
-    noise = settings.noise
-    radiometer = radiometer_std(noise, job.settings["instrument"]) if isinstance(noise, RadiometerNoise) else None
-    levels = set_levels(measured["foregrounds"], measured["eor"], settings, radiometer)
-    write_json(job.output / LEVELS, levels.as_json())
-    found = replace(levels, noise_spectrum=None).as_json()
-    return {"levels_jy": found, "warnings": _floor_warnings(job)}
+    def _cost(self) -> Cost:
+        return _cost_of_gains(self, [truth.effect for truth in self.truth])
 
 
-def _floor_warnings(job: Job) -> list[str]:
-    """Warn if the simulated foregrounds leak more power beyond the horizon than the EoR has."""
-    level = job.settings["corruption"].eor_level
-    if "foregrounds" not in job.inputs or level is None:
-        return []
-    floors = read_json(job.inputs["foregrounds"] / simulation.QUALITY)["delay_floor"]
-    return [
-        f"the simulated foregrounds have a delay floor of {floor['worst_db']} dB beyond the horizon "
-        f"({taper} taper), above the EoR at {level:g} dB"
-        for taper, floor in floors.items()
-        if floor["worst_db"] > level
-    ]
+class MeasureLevels(Task, stage="levels", version=2):
+    """The scales of EoR and noise."""
+
+    corruption: CorruptionSettings
+    instrument: InstrumentSettings | None = None
+    eor: Input
+    foregrounds: Input = None
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the scales to levels.json."""
+        from calstudy.base.visibilities import to_cube
+        from calstudy.corrupt.levels import rms, set_levels
+        from calstudy.corrupt.noise import radiometer_std
+
+        foregrounds, eor = (
+            0.0 if folder is None else rms(to_cube(read_visibilities(folder / VISIBILITIES)))
+            for folder in (self.foregrounds, self.eor)
+        )
+        noise, radiometer = self.corruption.noise, None
+        if isinstance(noise, RadiometerNoise) and self.instrument is not None:
+            radiometer = radiometer_std(noise, self.instrument)
+        levels = set_levels(foregrounds, eor, self.corruption, radiometer)
+        write_json(output / LEVELS, levels.as_json())
+        found = replace(levels, noise_spectrum=None).as_json()
+        return {"levels_jy": found, "warnings": self._floor_warnings()}
+
+    def _floor_warnings(self) -> list[str]:
+        """Warn if the simulated foregrounds leak more power beyond the horizon than the EoR has."""
+        level = self.corruption.eor_level
+        if self.foregrounds is None or level is None:
+            return []
+        floors = read_json(self.foregrounds / simulation.QUALITY)["delay_floor"]
+        return [
+            f"the simulated foregrounds have a delay floor of {floor['worst_db']} dB beyond the horizon "
+            f"({taper} taper), above the EoR at {level:g} dB"
+            for taper, floor in floors.items()
+            if floor["worst_db"] > level
+        ]
+
+    def _cost(self) -> Cost:
+        noise = self.corruption.noise
+        beam = 10 if isinstance(noise, RadiometerNoise) and noise.effective_area is None else 0
+        return Cost(0.5 + beam, LIBRARIES_MEMORY + 3 * size_of(self).samples * COMPLEX128, 1e5)
 
 
-def corrupt(job: Job) -> Mapping[str, Any]:
-    """Write the sum of F, S and N, or of those in the settings, after all effects, to data.uvh5.
+class Corrupt(Task, stage="corrupt", version=2):
+    """The sum of some of F, S and N after the effects.
 
-    The flags of all effects are set in all data, even where the effects do not act.
+    Effects that flag, `flagged_by`, set their flags even in data on which no effect acts.
     """
-    import numpy as np
 
-    from calstudy.base.observation import Observation
-    from calstudy.base.visibilities import flag_cube, from_cube, to_cube
-    from calstudy.corrupt.interface import apply_effect, draw_flags
-    from calstudy.corrupt.levels import Levels, rms
-    from calstudy.corrupt.noise import thermal_noise
-    from calstudy.instrument.telescope import make_template
+    components: Sequence[str]
+    instrument: InstrumentSettings
+    noise_seed: int | None = None
+    effects: tuple[Effect, ...] = ()
+    flagged_by: tuple[Effect, ...] = ()
+    levels: Input
+    foregrounds: Input = None
+    eor: Input = None
+    truth: tuple[Input, ...] = ()
 
-    found = Levels(**read_json(job.inputs["levels"] / LEVELS))
-    template = make_template(job.settings["instrument"])
-    components = job.settings["components"]
-    cube = np.zeros((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), dtype=np.complex128)
-    for name, factor in (("foregrounds", 1.0), ("eor", found.eor_factor)):
-        if name in components:
-            cube += factor * to_cube(read_visibilities(job.inputs[name] / VISIBILITIES))
-    if "noise" in components:
-        cube += thermal_noise(cube.shape, found.noise, job.settings["noise_seed"])
-    observation = Observation(make_template(job.settings["instrument"], as_built=True))
-    flags = np.zeros(cube.shape, dtype=bool)
-    for place, effect in enumerate(job.settings.get("effects", job.settings.get("flagged_by", ()))):
-        truth = read_truth(job.inputs[f"truth{place:03d}"])
-        if "effects" in job.settings:
-            cube = apply_effect(effect, cube, observation, truth)
-        if (flagged := draw_flags(effect, observation, truth)) is not None:
-            flags |= flagged
-    data = from_cube(template, cube)
-    flag_cube(data)[:] = flags
-    write_visibilities(data, job.output / DATA, single=True)
-    notes: dict[str, Any] = {"rms_jy": rms(cube)}
-    if flags.any():
-        notes["flagged_fraction"] = float(flags.mean())
-    return notes
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the data to data.uvh5."""
+        import numpy as np
 
+        from calstudy.base.observation import Observation
+        from calstudy.base.visibilities import flag_cube, from_cube, to_cube
+        from calstudy.corrupt.interface import apply_effect, draw_flags
+        from calstudy.corrupt.levels import Levels, rms
+        from calstudy.corrupt.noise import thermal_noise
+        from calstudy.instrument.telescope import make_template
 
-def autocorrelate(job: Job) -> Mapping[str, Any]:
-    """Write the autocorrelations after the gains to data.uvh5; other effects do not change them."""
-    import numpy as np
+        found = Levels(**read_json(self.levels / LEVELS))
+        template = make_template(self.instrument)
+        cube = np.zeros((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), dtype=np.complex128)
+        for folder, factor in ((self.foregrounds, 1.0), (self.eor, found.eor_factor)):
+            if folder is not None:
+                cube += factor * to_cube(read_visibilities(folder / VISIBILITIES))
+        if self.noise_seed is not None:
+            cube += thermal_noise(cube.shape, found.noise, self.noise_seed)
+        observation = Observation(make_template(self.instrument, as_built=True))
+        flags = np.zeros(cube.shape, dtype=bool)
+        for effect, folder in zip(self.effects or self.flagged_by, self.truth, strict=True):
+            truth = read_truth(folder)
+            if self.effects:
+                cube = apply_effect(effect, cube, observation, truth)
+            if (flagged := draw_flags(effect, observation, truth)) is not None:
+                flags |= flagged
+        data = from_cube(template, cube)
+        flag_cube(data)[:] = flags
+        write_visibilities(data, output / DATA, single=True)
+        notes: dict[str, Any] = {"rms_jy": rms(cube)}
+        if flags.any():
+            notes["flagged_fraction"] = float(flags.mean())
+        return notes
 
-    from calstudy.base.gains import read_gains
-    from calstudy.base.observation import Observation
-    from calstudy.base.visibilities import from_cube
-    from calstudy.corrupt.levels import Levels
-    from calstudy.corrupt.noise import autocorrelations as draw
-    from calstudy.instrument.telescope import make_template
-
-    settings = job.settings["instrument"]
-    template = make_template(settings, autos=True)
-    template.select(blt_inds=np.flatnonzero(template.ant_1_array == template.ant_2_array), run_check=False)
-    sigma = Levels(**read_json(job.inputs["levels"] / LEVELS)).noise
-    samples = settings.channels.width * settings.times.integration * job.settings["nights"]
-    cube = draw(Observation(template).shape, sigma, samples, job.settings["noise_seed"])
-    if "gains" in job.inputs:
-        true = read_gains(job.inputs["gains"] / GAINS, "true gains")
-        order = np.argsort(true.ant_array)
-        rows = order[np.searchsorted(true.ant_array, template.ant_1_array[: template.Nbls], sorter=order)]
-        cube = cube * np.moveaxis(np.abs(true.gain_array[rows]) ** 2, 2, 0)
-    write_visibilities(from_cube(template, cube.astype(complex)), job.output / DATA, single=True)
-    return {}
+    def _cost(self) -> Cost:
+        size = size_of(self)
+        effects = [effect.cost(size) for effect in self.effects]
+        seconds = 1 + size.samples * 1e-7 + sum(cost.seconds for cost in effects)
+        memory = LIBRARIES_MEMORY + 5 * size.samples * COMPLEX128 + max((cost.memory for cost in effects), default=0.0)
+        return Cost(seconds, memory, size.samples * COMPLEX64)
 
 
-def _cost_of_autocorrelations(task: Task) -> Cost:
-    size = size_of(task)
-    disk = size.antennas * size.channels.count * size.times * size.polarizations * COMPLEX64
-    return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, disk)
+class Autocorrelate(Task, stage="autocorrelations", version=1):
+    """The autocorrelations after the gains; other effects do not change them."""
+
+    instrument: InstrumentSettings
+    noise_seed: int
+    nights: float
+    levels: Input
+    gains: Input = None
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the autocorrelations to data.uvh5."""
+        import numpy as np
+
+        from calstudy.base.gains import read_gains
+        from calstudy.base.observation import Observation
+        from calstudy.base.visibilities import from_cube
+        from calstudy.corrupt.levels import Levels
+        from calstudy.corrupt.noise import autocorrelations as draw
+        from calstudy.instrument.telescope import make_template
+
+        template = make_template(self.instrument, autos=True)
+        template.select(blt_inds=np.flatnonzero(template.ant_1_array == template.ant_2_array), run_check=False)
+        sigma = Levels(**read_json(self.levels / LEVELS)).noise
+        samples = self.instrument.channels.width * self.instrument.times.integration * self.nights
+        cube = draw(Observation(template).shape, sigma, samples, self.noise_seed)
+        if self.gains is not None:
+            true = read_gains(self.gains / GAINS, "true gains")
+            order = np.argsort(true.ant_array)
+            rows = order[np.searchsorted(true.ant_array, template.ant_1_array[: template.Nbls], sorter=order)]
+            cube = cube * np.moveaxis(np.abs(true.gain_array[rows]) ** 2, 2, 0)
+        write_visibilities(from_cube(template, cube.astype(complex)), output / DATA, single=True)
+        return {}
+
+    def _cost(self) -> Cost:
+        size = size_of(self)
+        disk = size.antennas * size.channels.count * size.times * size.polarizations * COMPLEX64
+        return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, disk)
 
 
-def _cost_of_corruption(task: Task) -> Cost:
-    size = size_of(task)
-    effects = [effect.cost(size) for effect in task.settings.get("effects", ())]
-    seconds = 1 + size.samples * 1e-7 + sum(cost.seconds for cost in effects)
-    memory = LIBRARIES_MEMORY + 5 * size.samples * COMPLEX128 + max((cost.memory for cost in effects), default=0.0)
-    return Cost(seconds, memory, size.samples * COMPLEX64)
-
-
-def _cost_of_levels(task: Task) -> Cost:
-    noise = task.settings["corruption"].noise
-    beam = 10 if isinstance(noise, RadiometerNoise) and noise.effective_area is None else 0
-    return Cost(0.5 + beam, LIBRARIES_MEMORY + 3 * size_of(task).samples * COMPLEX128, 1e5)
-
-
-def _cost_of_gains(task: Task) -> Cost:
+def _cost_of_gains(task: Task, effects: Sequence[Effect]) -> Cost:
     """Return the cost of gains, whose number depends on antennas, channels and, if they drift, integrations."""
     size = size_of(task)
-    effects = (
-        [task.settings["effect"]] if "effect" in task.settings else [t.settings["effect"] for t in task.needs.values()]
-    )
     times = size.times if any(getattr(effect, "drift", None) is not None for effect in effects) else 1
     disk = size.antennas * size.channels.count * times * size.polarizations * COMPLEX128
     return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, 1e6 + disk)
-
-
-DRAW_EFFECT = Stage(name="effect", version=1, make=draw_effect, cost=_cost_of_gains)
-MULTIPLY_GAINS = Stage(name="gains", version=2, make=multiply_gains, cost=_cost_of_gains)
-MEASURE_LEVELS = Stage(name="levels", version=2, make=measure_levels, cost=_cost_of_levels)
-CORRUPT = Stage(name="corrupt", version=2, make=corrupt, cost=_cost_of_corruption)
-AUTOCORRELATE = Stage(name="autocorrelations", version=1, make=autocorrelate, cost=_cost_of_autocorrelations)

@@ -1,4 +1,4 @@
-"""Fraction of the EoR that the fit of one integration leaves, to first order, from its own tangent space."""
+"""Fraction of the EoR that a fit leaves, to first order, from its own tangent space, of simulated and measured data."""
 
 from __future__ import annotations
 
@@ -8,69 +8,101 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
-from calstudy.base.resources import LIBRARIES_MEMORY, Cost
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
-from calstudy.products import calibration, corruption
+from calstudy.instrument.size import Size
+from calstudy.power.settings import PowerSettings
+from calstudy.products import calibration, corruption, observed
+from calstudy.products.calibration import Calibrated, prepared_fit, read_result
 from calstudy.products.files import DATA, MODEL, integration_times, json_number, read_visibilities, write_json
-from calstudy.products.graph import Graph, once, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
+from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
 
     from calstudy.calibrate.expected_loss import ExpectedTransfer
     from calstudy.calibrate.problem import CalibrationProblem
+    from calstudy.calibrate.records import CalibrationResult
     from calstudy.power.expected import ExpectedBins
-    from calstudy.power.settings import PowerSettings
     from calstudy.power.spectra import BaselineModes
 
 EXPECTED, RESPONSE = "expected-loss.h5", "linear-response.json"
+TRANSFER = "expected-transfer"
+"""Start of the names of the files of the expected transfer functions, which a polarization follows."""
 # Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
 # further within a bin.
 PROBES = 16
 LARGEST = 4.0
 """Visibilities of an integration, over those of the paper's, up to which scores have the linear response: the tangent
 space takes 1.5 GB for the paper's."""
+LABEL = "expected signal loss"
+NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
+"""Fields of the power section that have no effect on one integration."""
 
 
-@once
-def expected_loss(graph: Graph) -> Task:
-    """Return the task that predicts T for the middle integration of the variant `residual`."""
-    return Task(EXPECTED_LOSS, "expected signal loss", _settings(graph) | {"probes": PROBES}, _inputs(graph))
+@memoize
+def expected_loss(graph: Graph) -> Task | None:
+    """Return the task that predicts T for the middle integration, or the middle solve of measured data.
+
+    Measured data without a fit by least squares have none.
+    """
+    power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
+    if not isinstance(graph, MeasuredGraph):
+        return ExpectedLoss(LABEL, probes=PROBES, power=power, **_solved(graph))
+    if not isinstance(graph.experiment.calibration, GainFit):
+        return None
+    return ExpectedLossOfData(LABEL, power=power, **_of_data(graph, "even"))
 
 
-@once
+@memoize
+def expected_transfer(graph: MeasuredGraph, part: str) -> Task:
+    """Return the task of the expected transfer function of every baseline, delay and polarization of a part."""
+    return ExpectedTransfers(LABEL, **_of_data(graph, part))
+
+
+@memoize
 def linear_response(graph: Graph) -> Task | None:
     """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T.
 
     Calibrators must fit each integration by least squares and use the gains without smoothing. Spectra must be of each
     baseline with itself, because a fit responds differently on different baselines of a group. Large arrays have none.
     """
-    fit = graph.experiment.calibration
+    fit, power = graph.experiment.calibration, graph.experiment.power
     fits = isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None
-    size = graph.size
+    size = Size.of(graph.experiment.instrument)
     large = size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES
-    if not fits or large or graph.experiment.power.pairs == "redundant-group":
+    if not fits or large or power.pairs == "redundant-group":
         return None
-    inputs = _inputs(graph) | {"signal": corruption.data(graph, Variant(components=("eor",)), "even")}
-    settings = _settings(graph)
-    settings["power"] = settings["power"].with_defaults("bins", "length_bin")
-    return Task(LINEAR_RESPONSE, "linear response to the EoR", settings, inputs)
+    return LinearResponse(
+        "linear response to the EoR",
+        power=power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin"),
+        signal=corruption.data(graph, Variant(components=("eor",)), "even"),
+        **_solved(graph),
+    )
 
 
-def _inputs(graph: Graph) -> dict[str, Task]:
+def _solved(graph: Graph) -> dict[str, Any]:
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
-    inputs = calibration.calibration_inputs(graph, residual, "even")
-    return inputs | {"calibration": calibration.calibration(graph, residual, "even")}
-
-
-def _settings(graph: Graph) -> dict[str, Any]:
     return {
-        "calibration": graph.experiment.calibration.with_defaults("assumed"),
-        "power": graph.experiment.power.with_defaults("pairs", "redundancy_tolerance", "coherent_time"),
+        **calibration.calibration_inputs(graph, residual, "even"),
+        "calibration": calibration.calibration(graph, residual, "even"),
+        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
         "integration": graph.experiment.instrument.times.count // 2,
+    }
+
+
+def _of_data(graph: MeasuredGraph, part: str) -> dict[str, Any]:
+    return {
+        "data": observed.observed(graph, part),
+        "calibration": observed.calibrated(graph, part),
+        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
+        "sky_model": graph.experiment.observed.sky_model is not None,
+        "probes": PROBES,
     }
 
 
@@ -86,82 +118,186 @@ class _Solution:
     frequency: np.ndarray
 
 
-def _solution(job: Job) -> _Solution | None:
-    """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
-    import numpy as np
+class _Solved(Calibrated):
+    """A calibrated integration of simulated data."""
 
-    from calstudy.base.observation import Observation
-    from calstudy.base.visibilities import antenna_pairs, to_cube
-    from calstudy.calibrate.interface import Assumed
-    from calstudy.calibrate.preparation import prepare, problem_at
-    from calstudy.products.selection import read_gains
+    calibration: Input
+    calibrator: GainFit = called("calibration")
+    power: PowerSettings
+    integration: int
 
-    settings, index = job.settings["calibration"], job.settings["integration"]
-    times = integration_times(job.inputs["data"] / DATA)[[index]]
-    data, sky, noise = calibration.read_calibrated(job.inputs, times)
-    prepared = prepare(Observation(data), settings, Assumed(None if sky is None else Observation(sky), noise=noise))
-    fitted = read_gains(job.inputs["calibration"])
-    gains = fitted.at(index, prepared.data.numbers)
-    problem = problem_at(prepared, settings, slice(0, 1), 0, gains)
-    if isinstance(problem, str) or fitted.flags[index].any():
-        return None
-    model = read_visibilities(job.inputs["calibration"] / MODEL, times)
-    return _Solution(
-        problem,
-        gains,
-        to_cube(model)[0, ..., 0],
-        [(int(first), int(second)) for first, second in antenna_pairs(model)],
-        prepared.data.lengths,
-        np.asarray(data.freq_array, float),
-    )
+    def solution(self) -> _Solution | None:
+        """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
+        import numpy as np
 
+        from calstudy.base.visibilities import antenna_pairs, to_cube
+        from calstudy.calibrate.preparation import problem_at
+        from calstudy.products.selection import read_gains
 
-def expect(job: Job) -> Mapping[str, Any]:
-    """Write the expected T of one calibrated integration, in bins of k and of baseline length and delay."""
-    from calstudy.calibrate.expected_loss import DelayModes, expected_transfer
-    from calstudy.power.tables import save_spectrum
-
-    power, index = job.settings["power"], job.settings["integration"]
-    solution = _solution(job)
-    if solution is None:
-        raise InputError(
-            f"expected-loss: integration {index} was not calibrated in all antennas and channels, and flagged data are "
-            "not supported"
+        data, sky, noise = self.read(self.times)
+        prepared = prepared_fit(self.calibrator, data, sky, noise)
+        fitted = read_gains(self.calibration)
+        gains = fitted.at(self.integration, prepared.data.numbers)
+        problem = problem_at(prepared, self.calibrator, slice(0, 1), 0, gains)
+        if isinstance(problem, str) or fitted.flags[self.integration].any():
+            return None
+        model = read_visibilities(self.calibration / MODEL, self.times)
+        return _Solution(
+            problem,
+            gains,
+            to_cube(model)[0, ..., 0],
+            [(int(first), int(second)) for first, second in antenna_pairs(model)],
+            prepared.data.lengths,
+            np.asarray(data.freq_array, float),
         )
-    modes = DelayModes(solution.frequency, power.taper)
-    expected = expected_transfer(solution.problem, solution.gains, solution.model, modes, job.settings["probes"])
-    found = binned(expected, solution.lengths, float(solution.frequency.mean()), power)
-    save_spectrum(job.output / EXPECTED, found)
-    return {"integration": index, "probes": job.settings["probes"]}
+
+    @property
+    def times(self) -> np.ndarray:
+        """Julian date of the integration, (1,)."""
+        return integration_times(self.data / DATA)[[self.integration]]
+
+    def _cost(self) -> Cost:
+        size = size_of(self)
+        work = size.baselines * size.channels.count / PAPER_SAMPLES
+        return Cost(6 + 0.8 * getattr(self, "probes", 1) * work, LIBRARIES_MEMORY + 1.5e9 * work, 1e6)
 
 
-def respond(job: Job) -> Mapping[str, Any]:
-    """Write T and C of the linear response of one integration to the EoR in the bands of scores; null if flagged."""
-    from calstudy.base.visibilities import antenna_pairs, to_cube
-    from calstudy.calibrate.expected_loss import DelayModes
-    from calstudy.calibrate.expected_loss import linear_response as response_to
-    from calstudy.power.expected import bin_response
-    from calstudy.power.score import BANDS
+class ExpectedLoss(_Solved, stage="expected-loss", version=4):
+    """The expected T of one calibrated integration."""
 
-    power, solution = job.settings["power"], _solution(job)
-    if solution is None:
-        write_json(job.output / RESPONSE, {"bands": None})
+    probes: int
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the expected T in bins of k and of baseline length and delay."""
+        from calstudy.calibrate.expected_loss import DelayModes
+        from calstudy.calibrate.expected_loss import expected_transfer as expected_of
+        from calstudy.power.tables import save_spectrum
+
+        solution = self.solution()
+        if solution is None:
+            raise InputError(
+                f"expected-loss: integration {self.integration} was not calibrated in all antennas and channels, and "
+                "flagged data are not supported"
+            )
+        modes = DelayModes(solution.frequency, self.power.taper)
+        expected = expected_of(solution.problem, solution.gains, solution.model, modes, self.probes)
+        found = binned(expected, solution.lengths, float(solution.frequency.mean()), self.power)
+        save_spectrum(output / EXPECTED, found)
+        return {"integration": self.integration, "probes": self.probes}
+
+
+class LinearResponse(_Solved, stage="linear-response", version=1):
+    """T and C of the linear response of one integration to the EoR."""
+
+    signal: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write T and C in the bands of scores; null if flagged."""
+        from calstudy.base.visibilities import antenna_pairs, to_cube
+        from calstudy.calibrate.expected_loss import DelayModes
+        from calstudy.calibrate.expected_loss import linear_response as response_to
+        from calstudy.power.expected import bin_response
+        from calstudy.power.score import BANDS
+
+        power, solution = self.power, self.solution()
+        if solution is None:
+            write_json(output / RESPONSE, {"bands": None})
+            return {}
+        eor = read_visibilities(self.signal / DATA, self.times)
+        places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(eor).tolist())}
+        signal = to_cube(eor)[0, [places[pair] for pair in solution.pairs], :, 0]
+        left = response_to(solution.problem, solution.gains, solution.model, signal)
+        modes = DelayModes(solution.frequency, power.taper)
+        where = _modes(modes.delay, solution.lengths, float(solution.frequency.mean()), power)
+        put_in, answered = modes.amplitudes(signal), modes.amplitudes(left)
+        transfer, cross = bin_response(where, put_in, answered, BANDS, power.wedge_buffer)
+        bands = [
+            {"k": list(edges), "transfer": json_number(t), "cross_transfer": json_number(c)}
+            for edges, t, c in zip(pairwise(BANDS), transfer, cross, strict=True)
+        ]
+        write_json(output / RESPONSE, {"bands": bands})
         return {}
-    times = integration_times(job.inputs["data"] / DATA)[[job.settings["integration"]]]
-    eor = read_visibilities(job.inputs["signal"] / DATA, times)
-    places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(eor).tolist())}
-    signal = to_cube(eor)[0, [places[pair] for pair in solution.pairs], :, 0]
-    left = response_to(solution.problem, solution.gains, solution.model, signal)
-    modes = DelayModes(solution.frequency, power.taper)
-    where = _modes(modes.delay, solution.lengths, float(solution.frequency.mean()), power)
-    put_in, answered = modes.amplitudes(signal), modes.amplitudes(left)
-    transfer, cross = bin_response(where, put_in, answered, BANDS, power.wedge_buffer)
-    bands = [
-        {"k": list(edges), "transfer": json_number(t), "cross_transfer": json_number(c)}
-        for edges, t, c in zip(pairwise(BANDS), transfer, cross, strict=True)
-    ]
-    write_json(job.output / RESPONSE, {"bands": bands})
-    return {}
+
+
+class _OfData(Task):
+    """The calibration of a part of measured data, which have the sky model and the noise with them."""
+
+    data: Input
+    calibration: Input
+    calibrator: GainFit = called("calibration")
+    sky_model: bool
+    probes: int
+
+    def expect(self, result: CalibrationResult, polarization: int, taper: str) -> ExpectedTransfer | None:
+        """Return the expected remainder of a white signal in the middle one of the usable solves, or None without any.
+
+        It is exact for arrays whose matrices are small, and from random vectors for others. The baselines are those of
+        the model, repeated for each integration where several were solved together.
+        """
+        import numpy as np
+
+        from calstudy.base.visibilities import to_cube
+        from calstudy.calibrate.expected_loss import DENSE, DelayModes, jacobian_size
+        from calstudy.calibrate.expected_loss import expected_transfer as expected_of
+        from calstudy.calibrate.preparation import problem_at
+
+        number = int(result.model.polarization_array[polarization])
+        usable = [record for record in result.solutions if record.polarization == number and record.usable]
+        if not usable:
+            return None
+        record = usable[len(usable) // 2]
+        times = slice(record.integration, record.integration + record.n_integrations)
+        prepared = prepared_fit(self.calibrator, *observed.read_observed(self.data, self.calibrator, self.sky_model))
+        order = np.argsort(result.gains.ant_array)
+        rows = order[np.searchsorted(result.gains.ant_array, prepared.data.numbers, sorter=order)]
+        gains = result.gains.gain_array[rows, :, times.start, polarization]
+        problem = problem_at(prepared, self.calibrator, times, polarization, gains)
+        if isinstance(problem, str):
+            return None
+        model = to_cube(result.model)[times, :, :, polarization].reshape(problem.visibilities.shape)
+        probes = None if jacobian_size(problem) <= DENSE else self.probes
+        return expected_of(problem, gains, model, DelayModes(prepared.data.frequencies, taper), probes)
+
+    def _cost(self) -> Cost:
+        return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * size_of(self).samples * COMPLEX128, 1e6)
+
+
+class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=2):
+    """The expected T of the middle solve of one half of measured data."""
+
+    power: PowerSettings
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the expected T in bins of k and of length and delay."""
+        import numpy as np
+
+        from calstudy.base.visibilities import baseline_vectors
+        from calstudy.power.tables import save_spectrum
+
+        result = read_result(self.calibration)
+        found = self.expect(result, 0, self.power.taper)
+        if found is None:
+            raise InputError("expected-loss: no solve of the calibration gave gains")
+        lengths: np.ndarray = np.linalg.norm(baseline_vectors(result.model), axis=1)
+        centre = float(np.mean(result.model.freq_array))
+        save_spectrum(output / EXPECTED, binned(found, np.resize(lengths, len(found.transfer)), centre, self.power))
+        return {"probes": self.probes}
+
+
+class ExpectedTransfers(_OfData, stage="expected-transfer", version=1):
+    """The expected transfer functions of all polarizations of measured data."""
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the transfer function of every polarization that has solutions to a file of its own."""
+        from calstudy.calibrate.expected_loss import TAPER
+        from calstudy.power.tables import save_spectrum
+
+        result = read_result(self.calibration)
+        for index, name in enumerate(result.model.get_pols()):
+            found: Any = self.expect(result, index, TAPER)
+            if found is not None:
+                save_spectrum(output / f"{TRANSFER}.{name}.h5", found)
+        return {"probes": self.probes}
 
 
 def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
@@ -185,13 +321,3 @@ def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power
     modes = _modes(expected.delay, lengths, centre, power)
     edges = make_bin_edges(power.bins)
     return bin_expected(modes, expected.transfer, expected.error, edges, power.wedge_buffer, power.length_bin)
-
-
-def _cost(task: Task) -> Cost:
-    size = size_of(task)
-    work = size.baselines * size.channels.count / PAPER_SAMPLES
-    return Cost(6 + 0.8 * task.settings.get("probes", 1) * work, LIBRARIES_MEMORY + 1.5e9 * work, 1e6)
-
-
-EXPECTED_LOSS = Stage(name="expected-loss", version=4, make=expect, cost=_cost)
-LINEAR_RESPONSE = Stage(name="linear-response", version=1, make=respond, cost=_cost)

@@ -1,30 +1,24 @@
-"""The graph of an experiment: its tasks, each made once and shared by all tasks that need it."""
+"""The graph of a study: the tasks of one experiment or of measured data, each made once and shared by all."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.size import Size
 from calstudy.run.task import Task
 
-Made = TypeVar("Made")
+if TYPE_CHECKING:
+    from calstudy.instrument.settings import Beam, Channels
+    from calstudy.realdata.halves import Parts
+
+Found = TypeVar("Found")
 Arguments = ParamSpec("Arguments")
 
 
-class Memory:
-    """Cache of the objects that are made from one file; see `once`."""
-
-    def __init__(self) -> None:
-        self.made: dict[Hashable, Any] = {}
-
-
-Owner = TypeVar("Owner", bound=Memory)
-
-
-class Graph(Memory):
+class Graph:
     """The tasks of one experiment; each module of this package makes those of its own products.
 
     If `keep_visibilities` is false, measurements and calibrated visibilities are removed from the store as soon as all
@@ -32,26 +26,62 @@ class Graph(Memory):
     """
 
     def __init__(self, experiment: Experiment, keep_visibilities: bool = True) -> None:
-        super().__init__()
+        self.found: dict[Hashable, Any] = {}
         self.experiment = experiment
         self.keep_visibilities = keep_visibilities
-        self.size = Size.of(experiment.instrument)
+
+    @property
+    def beam(self) -> Beam:
+        """The beam of power spectra."""
+        return self.experiment.instrument.beam
+
+    @property
+    def channels(self) -> Channels:
+        """The channels of power spectra."""
+        return self.experiment.instrument.channels
 
 
-def once(make: Callable[Concatenate[Owner, Arguments], Made]) -> Callable[Concatenate[Owner, Arguments], Made]:
+class MeasuredGraph(Graph):
+    """The tasks of measured data.
+
+    The experiment is their file: `calibration` and `power` are those of any experiment, `observed` and `injection` its
+    own. `parts` are the parts of the data that are calibrated by themselves.
+    """
+
+    experiment: Any
+
+    def __init__(self, file: Any, parts: Parts) -> None:
+        super().__init__(file)
+        self.parts = parts
+
+    @property
+    def beam(self) -> Beam:
+        """The beam of power spectra."""
+        return self.experiment.observed.beam
+
+    @property
+    def channels(self) -> Channels:
+        """The channels of power spectra."""
+        return self.parts.facts["even"].channels
+
+
+Owner = TypeVar("Owner", bound=Graph)
+
+
+def memoize(make: Callable[Concatenate[Owner, Arguments], Found]) -> Callable[Concatenate[Owner, Arguments], Found]:
     """Make ``make(graph, ...)`` return the same object whenever it is called with the same graph and arguments."""
 
     @wraps(make)
-    def task(graph: Owner, *arguments: Arguments.args, **named: Arguments.kwargs) -> Made:
+    def task(graph: Owner, *arguments: Arguments.args, **named: Arguments.kwargs) -> Found:
         key = (make, arguments, tuple(named.items()))
-        if key not in graph.made:
-            graph.made[key] = make(graph, *arguments, **named)
-        return graph.made[key]
+        if key not in graph.found:
+            graph.found[key] = make(graph, *arguments, **named)
+        return graph.found[key]
 
     return task
 
 
-def required(task: Task | None) -> Task:
+def required(task: Found | None) -> Found:
     """Return a task that an experiment may lack; raises LookupError if it is None."""
     if task is None:
         raise LookupError("the experiment does not have a product that is needed of it")
@@ -67,8 +97,8 @@ def size_of(task: Task) -> Size:
 
 
 def _size_in(task: Task) -> Size | None:
-    if "instrument" in task.settings:
-        return Size.of(task.settings["instrument"])
-    if "size" in task.settings:
-        return Size(**task.settings["size"])
+    if (instrument := getattr(task, "instrument", None)) is not None:
+        return Size.of(instrument)
+    if (size := getattr(task, "size", None)) is not None:
+        return Size(**size)
     return next((found for found in map(_size_in, task.needs.values()) if found is not None), None)

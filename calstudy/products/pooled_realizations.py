@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,11 @@ from calstudy.experiment.realizations import described
 from calstudy.power.corrected import Corrected
 from calstudy.power.realizations import QUANTITIES, TRANSFER_QUANTITIES, PooledRegion, error_ratio, mean_over_bins
 from calstudy.products import realizations
-from calstudy.products.graph import Graph, once
+from calstudy.products.graph import Graph, memoize
 from calstudy.products.realization_results import JUDGED_K, JUDGED_REGION, RegionResults, judge, read_results
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.criterion import Finding, Verdict
-from calstudy.verdicts.tables import tally, to_json, to_markdown
+from calstudy.verdicts.tables import from_json, tally, to_json, to_markdown, verdict_table
 
 CSV, MARKDOWN, VERDICTS = "realizations.csv", "realizations.md", "realizations.json"
 PULLS = ("pull_eor", "pull_input", "pull_without_eor")
@@ -27,30 +26,38 @@ BANDS = ((0.1, 0.2), (0.2, 0.3), (0.3, 0.5), (0.5, 1.0), (JUDGED_K, np.inf))
 """Bands of k, h/Mpc, of the summary; the last is that of the verdicts."""
 
 
-@once
+@memoize
 def pooled(graph: Graph) -> Task:
     """Return the task that pools all realizations of an experiment into tables and verdicts."""
-    settings = {**realizations.settings(graph), "title": graph.experiment.name}
-    return Task(POOL, "realizations", settings, realizations.inputs(graph))
+    settings = realizations.settings(graph)
+    return Pooled("realizations", title=graph.experiment.name, **settings, realizations=realizations.inputs(graph))
 
 
-def make_tables(job: Job) -> Mapping[str, Any]:
-    """Write realizations.csv, realizations.md, and the verdicts in realizations.json."""
-    results = read_results(job.settings, job.inputs)
-    verdicts = judge(results[JUDGED_REGION])
-    _write_csv(job.output / CSV, results, job.settings["blocks"])
-    (job.output / MARKDOWN).write_text(_markdown(results, verdicts, job.settings), encoding="utf-8")
-    (job.output / VERDICTS).write_text(to_json(verdicts) + "\n", encoding="utf-8")
-    return {"verdicts": tally(verdicts), "failed": [item.name for item in verdicts if item.verdict == "FAIL"]}
+class Pooled(Task, stage="pooled-realizations", version=4):
+    """All realizations of an experiment."""
 
+    title: str
+    draws: Sequence[Mapping[str, Any]]
+    blocks: Sequence[Mapping[str, Any]]
+    realizations: Inputs
 
-def _write_csv(path: Path, results: Mapping[str, RegionResults], blocks: Sequence[Mapping[str, Any]]) -> None:
-    rows = [row for region, found in results.items() for row in _csv_rows(region, found, blocks)]
-    columns = list(dict.fromkeys(column for row in rows for column in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write realizations.csv, realizations.md, and the verdicts in realizations.json."""
+        results = read_results(self.settings, self.realizations)
+        verdicts = judge(results[JUDGED_REGION])
+        rows = [row for region, found in results.items() for row in _csv_rows(region, found, self.blocks)]
+        (output / CSV).write_text(Table.of_records(rows).csv(), encoding="utf-8", newline="")
+        (output / MARKDOWN).write_text(_markdown(results, verdicts, self.title, self.blocks), encoding="utf-8")
+        (output / VERDICTS).write_text(to_json(verdicts) + "\n", encoding="utf-8")
+        return {"verdicts": tally(verdicts), "failed": [item.name for item in verdicts if item.verdict == "FAIL"]}
+
+    def shown(self, folder: Path) -> Sequence[Table]:
+        """Return the verdicts."""
+        verdicts = from_json((folder / VERDICTS).read_text(encoding="utf-8"))
+        return [verdict_table(verdicts, "Realizations", "All numbers are in realizations.md and realizations.csv.")]
+
+    def _cost(self) -> Cost:
+        return Cost(5, disk=1e6)
 
 
 def _csv_rows(
@@ -92,8 +99,9 @@ def _mean_of_known(values: np.ndarray) -> float:
     return float(values[known].mean()) if known.any() else float("nan")
 
 
-def _markdown(results: Mapping[str, RegionResults], verdicts: Sequence[Verdict], settings: Mapping[str, Any]) -> str:
-    blocks = settings["blocks"]
+def _markdown(
+    results: Mapping[str, RegionResults], verdicts: Sequence[Verdict], title: str, blocks: Sequence[Mapping[str, Any]]
+) -> str:
     drawn = "; ".join(f"{len(block['members'])} realizations of {described(block['draw'])}" for block in blocks)
     summary = (
         f"{drawn}. The first realization, the experiment itself, is in every block. {tally(verdicts)}.\n\n"
@@ -102,7 +110,7 @@ def _markdown(results: Mapping[str, RegionResults], verdicts: Sequence[Verdict],
         "Coverage is that of the block that draws the noise (for P^S) or the EoR (for the input). P^R0 is P^R of data "
         "without the EoR."
     )
-    text = [to_markdown(verdicts, f"Realizations: {settings['title']}", ("criterion", "wanted"), summary)]
+    text = [to_markdown(verdicts, f"Realizations: {title}", ("criterion", "wanted"), summary)]
     for region, found in results.items():
         text += [f"## {region.replace('-', ' ').capitalize()}", ""]
         if found.corrected is not None:
@@ -221,6 +229,3 @@ def _of_other_realizations(corrected: Corrected) -> str:
         f"other EoR, gains and noise{same if (shared > 0).any() else ''}. There is no result where T or C is not above "
         "five times its error, or C is not above half of T; realizations.csv says why."
     )
-
-
-POOL = Stage(name="pooled-realizations", version=4, make=make_tables, cost=lambda task: Cost(5, disk=1e6))

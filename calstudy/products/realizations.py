@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
-from calstudy.experiment.realizations import Realization, expand_realizations, members
+from calstudy.experiment.realizations import expand_realizations, members
 from calstudy.products import corruption, signal_loss, spectra
 from calstudy.products.corruption import LEVELS
 from calstudy.products.files import read_json, spectrum_file, write_json
-from calstudy.products.graph import Graph, once, required
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize, required
+from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
     from calstudy.power.realizations import Sample
+    from calstudy.power.settings import PowerSettings
+    from calstudy.sky.settings import Eor
 
 NOISE = "noise"
 INPUT = "input.json"
@@ -25,31 +26,22 @@ REGIONS = ("outside-wedge", "inside-wedge", "all-modes")
 """Parts of Fourier space in which spectra are averaged; the transfer function is known in those of `signal_loss`."""
 
 
-@dataclass(frozen=True)
-class RealizationGraph:
-    """One realization, and the graph of its experiment."""
-
-    realization: Realization
-    graph: Graph
-
-
-@once
-def realization_graphs(graph: Graph) -> list[RealizationGraph]:
+@memoize
+def realization_graphs(graph: Graph) -> list[Graph]:
     """Return the graphs of all realizations of an experiment; the first is the experiment's own.
 
     Visibilities of the others are removed from the store after their reduction.
     """
-    first, *others = expand_realizations(graph.experiment)
-    found = [RealizationGraph(first, Graph(first.experiment))]
-    return found + [RealizationGraph(item, Graph(item.experiment, keep_visibilities=False)) for item in others]
+    found = expand_realizations(graph.experiment)
+    return [Graph(item.experiment, keep_visibilities=place == 0) for place, item in enumerate(found)]
 
 
 def inputs(graph: Graph) -> dict[str, Task]:
     """Return the tasks of all inputs of pooling: ``spectra:n`` and ``transfer:n`` of realization n, counted from 0."""
     found = {}
     for number, item in enumerate(realization_graphs(graph)):
-        found[f"spectra:{number}"] = _reduced(item.graph)
-        found[f"transfer:{number}"] = required(signal_loss.transfer(item.graph))
+        found[f"spectra:{number}"] = _reduced(item)
+        found[f"transfer:{number}"] = required(signal_loss.transfer(item))
     return found
 
 
@@ -59,52 +51,68 @@ def settings(graph: Graph) -> dict[str, Any]:
         {"draw": list(block.draw), "members": places}
         for block, places in zip(graph.experiment.realizations, members(graph.experiment), strict=True)
     ]
-    return {"draws": [dict(item.realization.draws) for item in realization_graphs(graph)], "blocks": blocks}
+    return {"draws": [dict(item.draws) for item in expand_realizations(graph.experiment)], "blocks": blocks}
 
 
-@once
+@memoize
 def _reduced(graph: Graph) -> Task:
     experiment = graph.experiment
-    needed = {name: spectra.power(graph, name) for name in SIGNAL_LOSS_VARIANTS}
-    needed["levels"] = corruption.levels(graph)
+    residual, without, eor = (spectra.power(graph, name) for name in SIGNAL_LOSS_VARIANTS)
     noisy = "noise" in experiment.variants[SIGNAL_LOSS_VARIANTS[0]].components
-    if noisy:
-        needed[NOISE] = spectra.variant_power(graph, NOISE, Variant(components=("noise",)))
-    return Task(REDUCE, "spectra of a realization", {"power": experiment.power, "eor": experiment.sky.eor}, needed)
+    return Reduced(
+        "spectra of a realization",
+        power=experiment.power,
+        eor_settings=experiment.sky.eor,
+        residual=residual,
+        residual_without_eor=without,
+        eor=eor,
+        levels=corruption.levels(graph),
+        noise=spectra.variant_power(graph, NOISE, Variant(components=("noise",))) if noisy else None,
+    )
 
 
-def reduce(job: Job) -> Mapping[str, Any]:
-    """Write P^R with and without the EoR and P^S in all regions with their errors, and the input power at the same k.
+class Reduced(Task, stage="realization", version=1):
+    """P^R with and without the EoR and P^S in all regions, with errors as in `calstudy.products.spectra`."""
 
-    Errors are as in `calstudy.products.spectra`.
-    """
-    from calstudy.power.drawn import input_power
-    from calstudy.power.errors import noise_level, with_errors
-    from calstudy.power.spherical import make_bin_edges, spherical_average
-    from calstudy.power.tables import save_spectrum
+    power: PowerSettings
+    eor_settings: Eor = called("eor")
+    residual: Input
+    residual_without_eor: Input
+    eor: Input
+    levels: Input
+    noise: Input = None
 
-    power = job.settings["power"]
-    names = [*SIGNAL_LOSS_VARIANTS, *([NOISE] if NOISE in job.inputs else [])]
-    delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in names}
-    sigma_noise = noise_level(delays[NOISE]) if NOISE in delays else 0.0
-    residual, without, eor = SIGNAL_LOSS_VARIANTS
-    for region in REGIONS:
-        means = {
-            name: spherical_average(delays[name], power, region == "outside-wedge", region == "inside-wedge")
-            for name in SIGNAL_LOSS_VARIANTS
-        }
-        errors: dict[str, dict[str, Any]] = {
-            residual: {"noise": sigma_noise, "signal": means[eor]},
-            without: {"noise": sigma_noise},
-            eor: {"signal": means[eor]},
-        }
-        for name, mean in means.items():
-            save_spectrum(job.output / spectrum_file(name, region), with_errors(mean, **errors[name]))
-    edges = make_bin_edges(power.bins)
-    put_in = input_power(job.settings["eor"], (edges[1:] + edges[:-1]) / 2, power.cosmology)
-    factor = read_json(job.inputs["levels"] / LEVELS)["eor_factor"]
-    write_json(job.output / INPUT, {"power_mk2_h3_mpc3": (factor**2 * put_in).tolist()})
-    return {}
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the spectra, and the input power at the same k."""
+        from calstudy.power.drawn import input_power
+        from calstudy.power.errors import noise_level, with_errors
+        from calstudy.power.spherical import make_bin_edges, spherical_average
+        from calstudy.power.tables import save_spectrum
+
+        power = self.power
+        delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SIGNAL_LOSS_VARIANTS}
+        sigma_noise = 0.0 if self.noise is None else noise_level(spectra.read_delay_spectra(self.noise))
+        residual, without, eor = SIGNAL_LOSS_VARIANTS
+        for region in REGIONS:
+            means = {
+                name: spherical_average(found, power, region == "outside-wedge", region == "inside-wedge")
+                for name, found in delays.items()
+            }
+            errors: dict[str, dict[str, Any]] = {
+                residual: {"noise": sigma_noise, "signal": means[eor]},
+                without: {"noise": sigma_noise},
+                eor: {"signal": means[eor]},
+            }
+            for name, mean in means.items():
+                save_spectrum(output / spectrum_file(name, region), with_errors(mean, **errors[name]))
+        edges = make_bin_edges(power.bins)
+        put_in = input_power(self.eor_settings, (edges[1:] + edges[:-1]) / 2, power.cosmology)
+        factor = read_json(self.levels / LEVELS)["eor_factor"]
+        write_json(output / INPUT, {"power_mk2_h3_mpc3": (factor**2 * put_in).tolist()})
+        return {}
+
+    def _cost(self) -> Cost:
+        return Cost(10, disk=1e6)
 
 
 def read_samples(folders: Mapping[str, Path], count: int, region: str) -> Sequence[Sample]:
@@ -129,6 +137,3 @@ def read_samples(folders: Mapping[str, Path], count: int, region: str) -> Sequen
         put_in = np.array(read_json(folder / INPUT)["power_mk2_h3_mpc3"])
         samples.append(Sample(residual, without, eor, put_in, loss))
     return samples
-
-
-REDUCE = Stage(name="realization", version=1, make=reduce, cost=lambda task: Cost(10, disk=1e6))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
 from calstudy.base.schema import Section
+from calstudy.base.table import Table
 from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES, Dimensions, basis_vectors, solve_memory
 from calstudy.calibrate.settings import BasisSettings
 from calstudy.instrument.settings import Channels, Layout
 from calstudy.instrument.size import antenna_count
 from calstudy.products.files import read_json, write_json
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,48 +40,115 @@ class TimedArray(Section):
     basis: BasisSettings
 
 
-def time_steps(job: Job) -> Mapping[str, Any]:
-    """Time all solvers on one array, in a separate process."""
-    import numpy as np
+class Timed(Task):
+    """Solvers on an array, of which the longest baseline, m, is given."""
 
-    from calstudy.products.step_times import Samples, time_steps_apart
+    array: TimedArray
+    longest: float
 
-    settings = job.settings
-    array = settings["array"].model_dump(mode="json")
-    found = asdict(time_steps_apart(array, Samples(**settings["samples"]), settings["device"]))
-    case = {name: settings[name] for name in ("panel", "size", "device", "machine")}
-    write_json(job.output / CASE, {**case, **found})
-    return {f"median {name}": float(np.median(samples)) for name, samples in found["seconds"].items()}
+    @property
+    def antennas(self) -> int:
+        """Number of antennas."""
+        return antenna_count(self.array.layout)
 
+    @property
+    def dimensions(self) -> Dimensions:
+        """Size of the problem, in which every baseline has the basis of the longest."""
+        vectors = basis_vectors(self.longest, self.array.channels, self.array.basis)
+        baselines = self.antennas * (self.antennas - 1) // 2
+        channels = self.array.channels.count
+        return Dimensions(self.antennas, baselines, baselines, channels, vectors, baselines * vectors)
 
-def count_steps(job: Job) -> Mapping[str, Any]:
-    """Run the paper's solver for `max_steps`, and count the steps to each of `EXCESSES`."""
-    import numpy as np
-
-    from calstudy.products.step_times import descend_apart
-
-    found = descend_apart(job.settings["array"].model_dump(mode="json"), job.settings["max_steps"])
-    np.savez(job.output / LOSSES, allow_pickle=False, losses=found.losses, floor=found.floor)
-    counted = {
-        "antennas": found.antennas,
-        "max_steps": job.settings["max_steps"],
-        "steps_to": {excess: found.steps_to(float(excess)) for excess in EXCESSES},
-        "best": float(found.losses.min() / found.floor - 1),
-    }
-    write_json(job.output / DESCENT, counted)
-    return counted
+    @property
+    def work(self) -> float:
+        """Number of visibilities over that of the paper."""
+        return self.dimensions.baselines * self.array.channels.count / PAPER_SAMPLES
 
 
-def summarize(job: Job) -> Mapping[str, Any]:
-    """Write medians and central 95 % intervals of all times to runtime.json and runtime.csv."""
-    cases = [read_json(folder / CASE) for name, folder in sorted(job.inputs.items()) if name != "descent"]
-    descent = read_json(job.inputs["descent"] / DESCENT)
-    for case in cases:
-        del case["machine"]
-        case["seconds"] = {name: _quantiles(samples) for name, samples in case["seconds"].items()}
-    write_json(job.output / RUNTIME, {"machine": job.settings["machine"], "cases": cases, "descent": descent})
-    _write_csv(job.output / "runtime.csv", cases)
-    return {}
+class TimeSteps(Timed, stage="step-times", version=4):
+    """Times of all solvers on one array, measured in a separate process."""
+
+    machine: Mapping[str, Any]
+    panel: str
+    size: float
+    samples: Mapping[str, int]
+    device: str
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Time the solvers, and write all samples to case.json."""
+        import numpy as np
+
+        from calstudy.products.step_times import Samples, time_steps_apart
+
+        array = self.array.model_dump(mode="json")
+        found = asdict(time_steps_apart(array, Samples(**self.samples), self.device))
+        case = {name: getattr(self, name) for name in ("panel", "size", "device", "machine")}
+        write_json(output / CASE, {**case, **found})
+        return {f"median {name}": float(np.median(samples)) for name, samples in found["seconds"].items()}
+
+    def _cost(self) -> Cost:
+        dimensions, samples = self.dimensions, self.samples
+        padded = 4 * dimensions.coefficients * self.array.channels.count
+        solves = samples["solves"] * (0.4 + 1.3 * self.work)
+        steps = PADDED_SECONDS * padded * samples["steps"] + 50 * ADAMAX_STEP * self.work * samples["calls"]
+        return Cost(30 + steps + solves, solve_memory(dimensions, Calamity()) + PADDED_COPIES * padded, 1e5)
+
+
+class CountSteps(Timed, stage="descent", version=2):
+    """The descent of the paper's solver to the minimum."""
+
+    max_steps: int
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Run the solver for `max_steps`, and count the steps to each of `EXCESSES`."""
+        import numpy as np
+
+        from calstudy.products.step_times import descend_apart
+
+        found = descend_apart(self.array.model_dump(mode="json"), self.max_steps)
+        np.savez(output / LOSSES, allow_pickle=False, losses=found.losses, floor=found.floor)
+        counted = {
+            "antennas": found.antennas,
+            "max_steps": self.max_steps,
+            "steps_to": {excess: found.steps_to(float(excess)) for excess in EXCESSES},
+            "best": float(found.losses.min() / found.floor - 1),
+        }
+        write_json(output / DESCENT, counted)
+        return counted
+
+    def _cost(self) -> Cost:
+        return Cost(20 + ADAMAX_STEP * self.work * self.max_steps, solve_memory(self.dimensions, Calamity()), 1e6)
+
+
+class RunTimes(Task, stage="runtime", version=2):
+    """Medians and central 95 % intervals of all times."""
+
+    machine: Mapping[str, Any]
+    cases: Inputs
+    descent: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the times to runtime.json and runtime.csv."""
+        cases = [read_json(folder / CASE) for _, folder in sorted(self.cases.items())]
+        descent = read_json(self.descent / DESCENT)
+        for case in cases:
+            del case["machine"]
+            case["seconds"] = {name: _quantiles(samples) for name, samples in case["seconds"].items()}
+        write_json(output / RUNTIME, {"machine": self.machine, "cases": cases, "descent": descent})
+        rows = [
+            (
+                *(case[name.partition(" ")[0]] for name in COLUMNS[:-1]),
+                *(name, *(found[key] for key in ("median", "low", "high", "count"))),
+            )
+            for case in cases
+            for name, found in case["seconds"].items()
+        ]
+        columns = (*COLUMNS, "median [s]", "2.5 % [s]", "97.5 % [s]", "samples")
+        (output / "runtime.csv").write_text(Table(columns, rows).csv(), encoding="utf-8", newline="")
+        return {}
+
+    def _cost(self) -> Cost:
+        return Cost(1, disk=1e5)
 
 
 def _quantiles(samples: Sequence[float]) -> dict[str, float]:
@@ -89,16 +156,6 @@ def _quantiles(samples: Sequence[float]) -> dict[str, float]:
 
     low, median, high = (float(value) for value in np.quantile(samples, QUANTILES))
     return {"median": median, "low": low, "high": high, "count": len(samples)}
-
-
-def _write_csv(path: Path, cases: Sequence[Mapping[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow((*COLUMNS, "median [s]", "2.5 % [s]", "97.5 % [s]", "samples"))
-        for case in cases:
-            known = [case[name.partition(" ")[0]] for name in COLUMNS[:-1]]
-            for name, found in case["seconds"].items():
-                writer.writerow([*known, name, *(found[key] for key in ("median", "low", "high", "count"))])
 
 
 @dataclass(frozen=True)
@@ -125,33 +182,3 @@ def fit_power_law(size: np.ndarray, value: np.ndarray) -> PowerLaw:
         raise ValueError(f"a power law needs positive values at three sizes or more, got {len(value)} at {len(size)}")
     (exponent, logarithm), covariance = np.polyfit(np.log(size), np.log(value), 1, cov=True)
     return PowerLaw(float(np.exp(logarithm)), float(exponent), float(covariance[0, 0] ** 0.5))
-
-
-def _cost_of_timing(task: Task) -> Cost:
-    array, samples = task.settings["array"], task.settings["samples"]
-    antennas, channels = antenna_count(array.layout), array.channels
-    vectors = basis_vectors(task.settings["longest"], channels, array.basis)
-    baselines = antennas * (antennas - 1) // 2
-    padded = 4 * vectors * baselines * channels.count
-    work = baselines * channels.count / PAPER_SAMPLES
-    solves = samples["solves"] * (0.4 + 1.3 * work)
-    steps = PADDED_SECONDS * padded * samples["steps"] + 50 * ADAMAX_STEP * work * samples["calls"]
-    dimensions = Dimensions(antennas, baselines, baselines, channels.count, vectors, baselines * vectors)
-    memory = solve_memory(dimensions, Calamity()) + PADDED_COPIES * padded
-    return Cost(30 + steps + solves, memory, 1e5)
-
-
-def _cost_of_descent(task: Task) -> Cost:
-    array = task.settings["array"]
-    antennas = antenna_count(array.layout)
-    baselines = antennas * (antennas - 1) // 2
-    work = baselines * array.channels.count / PAPER_SAMPLES
-    vectors = basis_vectors(task.settings["longest"], array.channels, array.basis)
-    dimensions = Dimensions(antennas, baselines, baselines, array.channels.count, vectors, baselines * vectors)
-    memory = solve_memory(dimensions, Calamity())
-    return Cost(20 + ADAMAX_STEP * work * task.settings["max_steps"], memory, 1e6)
-
-
-TIME_STEPS = Stage(name="step-times", version=4, make=time_steps, cost=_cost_of_timing)
-COUNT_STEPS = Stage(name="descent", version=2, make=count_steps, cost=_cost_of_descent)
-SUMMARIZE = Stage(name="runtime", version=2, make=summarize, cost=lambda task: Cost(1, disk=1e5))

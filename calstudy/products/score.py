@@ -12,15 +12,20 @@ from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.products import calibration, corruption, expected_loss, signal_loss, sky_model, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA, MODEL, SOLUTION, json_number, read_in_parts, read_json, write_json
-from calstudy.products.graph import Graph, once, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
 
     from calstudy.power.score import CalibratedSpectra, Score
+    from calstudy.power.settings import PowerSettings
     from calstudy.products.selection import Gains
 
+SPECTRA = ("signal", "response", "cross", "residual", "residual_without_eor")
+"""What the scores are made from, and what differences of two of them are."""
 BINS, BANDS, SUMMARY = "score-bins.h5", "score-bands.h5", "score.json"
 MEASURED = 2
 """Version of T and the bias; scores of different versions are not ranked together."""
@@ -28,61 +33,170 @@ SAMPLES_AT_A_TIME = 14 * 630 * 384
 """Number of visibilities of each data set that are in memory together."""
 
 
-@once
-def score(graph: Graph) -> Task | None:
+@memoize
+def score(graph: Graph) -> MeasureScore | None:
     """Return the task of the scores, or None if the experiment does not calibrate data with the EoR and without."""
     if (loss := signal_loss.transfer(graph)) is None:
         return None
     residual, without, _ = SIGNAL_LOSS_VARIANTS
-    variant = graph.experiment.variants[residual]
-    inputs = {
-        **{name: loss.inputs[name] for name in ("signal", "response", "cross", "scale")},
-        "residual": spectra.power(graph, residual),
-        "residual_without_eor": spectra.power(graph, without),
-    }
-    for parity in PARITIES:
-        inputs[f"calibration:{parity}"] = calibration.calibration(graph, variant, parity)
-        inputs[f"data:{parity}"] = corruption.data(graph, variant, parity)
-        inputs[f"calibration_without_eor:{parity}"] = calibration.calibration(
-            graph, graph.experiment.variants[without], parity
-        )
-    if variant.effects:
-        inputs["gains"] = corruption.gains(graph)
-    if (error := sky_model.error(graph)) is not None:
-        inputs["sky_model_error"] = error
-    if (linear := expected_loss.linear_response(graph)) is not None:
-        inputs["linear_response"] = linear
-    return Task(SCORE, "score", {"power": graph.experiment.power}, inputs)
+    variant, other = (graph.experiment.variants[name] for name in (residual, without))
+    return MeasureScore(
+        "score",
+        power=graph.experiment.power,
+        signal=loss.signal,
+        response=loss.response,
+        cross=loss.cross,
+        scale=loss.scale,
+        residual=spectra.power(graph, residual),
+        residual_without_eor=spectra.power(graph, without),
+        calibration={parity: calibration.calibration(graph, variant, parity) for parity in PARITIES},
+        data={parity: corruption.data(graph, variant, parity) for parity in PARITIES},
+        calibration_without_eor={parity: calibration.calibration(graph, other, parity) for parity in PARITIES},
+        gains=corruption.gains(graph) if variant.effects else None,
+        sky_model_error=sky_model.error(graph),
+        linear_response=expected_loss.linear_response(graph),
+    )
 
 
-def make_score(job: Job) -> Mapping[str, Any]:
-    """Write the scores in bins and in bands of k, and all numbers to score.json."""
-    from calstudy.power.score import BANDS as EDGES
-    from calstudy.power.score import CalibratedSpectra
-    from calstudy.power.score import score as measure
-    from calstudy.power.spectra import of_common_units
-    from calstudy.power.spherical import make_bin_edges
-    from calstudy.power.tables import save_spectrum
+class MeasureScore(Task, stage="score", version=4):
+    """The scores in bins and in bands of k, and other numbers by which calibrators are compared."""
 
-    names = ("signal", "response", "cross", "residual", "residual_without_eor")
-    delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in names}
-    measured = CalibratedSpectra(**of_common_units(delays))
-    known = read_json(job.inputs["scale"] / signal_loss.SCALE)["flux_scale"]
-    scale, power = math.nan if known is None else known, job.settings["power"]
-    save_spectrum(job.output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
-    bands = measure(measured, EDGES, power.wedge_buffer, scale)
-    linear = _linear_transfer(job, measured)
-    save_spectrum(job.output / BANDS, bands)
-    summary = {
-        "bands": _in_bands(bands, linear),
-        "flux_scale": known,
-        "sky_model_error": _sky_model_error(job),
-        **_gain_errors(job),
-        "held_out_chi_squared": _held_out_chi_squared(job),
-        **_solves(job),
-    }
-    write_json(job.output / SUMMARY, summary)
-    return {}
+    power: PowerSettings
+    signal: Input
+    response: Input
+    cross: Input
+    scale: Input
+    residual: Input
+    residual_without_eor: Input
+    calibration: Mapping[str, Input]
+    data: Mapping[str, Input]
+    calibration_without_eor: Mapping[str, Input]
+    gains: Input = None
+    sky_model_error: Input = None
+    linear_response: Input = None
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the scores, and all numbers to score.json."""
+        from calstudy.power.score import BANDS as EDGES
+        from calstudy.power.score import CalibratedSpectra
+        from calstudy.power.score import score as measure
+        from calstudy.power.spectra import of_common_units
+        from calstudy.power.spherical import make_bin_edges
+        from calstudy.power.tables import save_spectrum
+
+        delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SPECTRA}
+        measured = CalibratedSpectra(**of_common_units(delays))
+        known = read_json(self.scale / signal_loss.SCALE)["flux_scale"]
+        scale, power = math.nan if known is None else known, self.power
+        save_spectrum(output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
+        bands = measure(measured, EDGES, power.wedge_buffer, scale)
+        linear = self._linear_transfer(measured)
+        save_spectrum(output / BANDS, bands)
+        summary = {
+            "bands": _in_bands(bands, linear),
+            "flux_scale": known,
+            "sky_model_error": self._sky_model_error(),
+            **self._gain_errors(),
+            "held_out_chi_squared": self._held_out_chi_squared(),
+            **self._solves(),
+        }
+        write_json(output / SUMMARY, summary)
+        return {}
+
+    def _linear_transfer(self, measured: CalibratedSpectra) -> np.ndarray | None:
+        """Return T of the linear response in bands, or None if it is not known or of other baselines."""
+        import numpy as np
+
+        if self.linear_response is None or np.any(measured.signal.n_pairs != 1):
+            return None
+        bands = read_json(self.linear_response / expected_loss.RESPONSE)["bands"]
+        return None if bands is None else np.array([band["transfer"] for band in bands], float)
+
+    def _sky_model_error(self) -> float | None:
+        """Return the rms of the sky model's error over that of the true foregrounds; zero for a perfect sky model."""
+        if self.sky_model_error is None:
+            return 0.0
+        return read_json(self.sky_model_error / sky_model.ERROR)["relative_error"]
+
+    def _known_gains(self, parity: str) -> tuple[Gains, np.ndarray]:
+        """Return fitted gains, and the true ones of the same antennas and integrations."""
+        import numpy as np
+
+        from calstudy.products.selection import read_gains
+
+        fitted = read_gains(self.calibration[parity])
+        if self.gains is None:
+            return fitted, np.ones(fitted.values.shape)
+        return fitted, read_gains(self.gains).over(len(fitted.values), fitted.numbers)
+
+    def _gain_errors(self) -> dict[str, float | None]:
+        """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
+        import numpy as np
+
+        from calstudy.calibrate.agreement import aligned_gains, gain_errors
+
+        fitted, true = self._known_gains(PARITIES[0])
+        solved = ~fitted.flags.all(axis=(1, 2))
+        if not solved.any():
+            return {"gain_error_aligned": None, "gain_error_as_fitted": None}
+        found, true = (np.where(fitted.flags, 0, gains)[solved] for gains in (fitted.values, true))
+        return {
+            "gain_error_aligned": float(np.median(gain_errors(aligned_gains(found, true), true))),
+            "gain_error_as_fitted": float(np.median(gain_errors(found, true))),
+        }
+
+    def _held_out_chi_squared(self) -> float | None:
+        """Return chi^2 per sample of the odd data under gains and model that were fitted to the even data.
+
+        The variance of the noise is half the mean square of the difference of the two. Apart from the power of the EoR,
+        chi^2 is 1 for the true gains and foregrounds.
+        """
+        import numpy as np
+
+        from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+
+        fitted, _ = self._known_gains(PARITIES[0])
+        paths = [self.data[parity] / DATA for parity in PARITIES]
+        paths.append(self.calibration[PARITIES[0]] / MODEL)
+        misfit = noise = 0.0
+        for part, (even, odd, model) in read_in_parts(paths, SAMPLES_AT_A_TIME):
+            places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(even).tolist())}
+            rows = [places[tuple(pair)] for pair in antenna_pairs(model).tolist()]
+            first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
+            cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
+            flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
+            unsolved = flag_cube(model)[..., 0]
+            for place, time in enumerate(part):
+                gains = fitted.values[time]
+                lacking = fitted.flags[time][first] | fitted.flags[time][second]
+                used = ~(flags[place][rows] | unsolved[place] | lacking)
+                predicted = gains[first] * gains[second].conj() * cubes[2][place]
+                misfit += float(np.sum(np.abs(cubes[1][place][rows] - predicted)[used] ** 2))
+                noise += float(np.sum(np.abs(cubes[1][place][rows] - cubes[0][place][rows])[used] ** 2)) / 2
+        return misfit / noise if noise > 0 else None
+
+    def _solves(self) -> dict[str, Any]:
+        """Return the status and cost of all solves of data with the EoR and without; None where it is not known."""
+        records = [
+            record
+            for calibrations in (self.calibration, self.calibration_without_eor)
+            for parity in PARITIES
+            for record in read_json(calibrations[parity] / SOLUTION)["records"]
+        ]
+        statuses = [record["status"] for record in records]
+        by_status = {status: statuses.count(status) for status in sorted(set(statuses))}
+        if set(statuses) == {"by-file"}:
+            return {"by_status": by_status, "cpu_seconds_per_integration": None, "peak_memory": None}
+        return {
+            "by_status": by_status,
+            "cpu_seconds_per_integration": cpu_seconds_per_integration(records),
+            "peak_memory": max(record["peak_memory"] for record in records),
+        }
+
+    def _cost(self) -> Cost:
+        size = size_of(self)
+        part = min(size.samples, max(SAMPLES_AT_A_TIME, size.samples // size.times))
+        return Cost(0.5 + size.samples * 1.5e-7, LIBRARIES_MEMORY + 8 * part * COMPLEX128, 1e6)
 
 
 def _in_bands(bands: Score, linear: np.ndarray | None) -> list[dict[str, Any]]:
@@ -97,102 +211,6 @@ def _in_bands(bands: Score, linear: np.ndarray | None) -> list[dict[str, Any]]:
     ]
 
 
-def _linear_transfer(job: Job, measured: CalibratedSpectra) -> np.ndarray | None:
-    """Return T of the linear response in bands, or None if it is not known or of other baselines."""
-    import numpy as np
-
-    if "linear_response" not in job.inputs or np.any(measured.signal.n_pairs != 1):
-        return None
-    bands = read_json(job.inputs["linear_response"] / expected_loss.RESPONSE)["bands"]
-    return None if bands is None else np.array([band["transfer"] for band in bands], float)
-
-
-def _sky_model_error(job: Job) -> float | None:
-    """Return the rms of the sky model's error over that of the true foregrounds; zero for a perfect sky model."""
-    if "sky_model_error" not in job.inputs:
-        return 0.0
-    return read_json(job.inputs["sky_model_error"] / sky_model.ERROR)["relative_error"]
-
-
-def _known_gains(job: Job, parity: str) -> tuple[Gains, np.ndarray]:
-    """Return fitted gains, and the true ones of the same antennas and integrations."""
-    import numpy as np
-
-    from calstudy.products.selection import read_gains
-
-    fitted = read_gains(job.inputs[f"calibration:{parity}"])
-    if "gains" not in job.inputs:
-        return fitted, np.ones(fitted.values.shape)
-    return fitted, read_gains(job.inputs["gains"]).over(len(fitted.values), fitted.numbers)
-
-
-def _gain_errors(job: Job) -> dict[str, float | None]:
-    """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
-    import numpy as np
-
-    from calstudy.calibrate.agreement import aligned_gains, gain_errors
-
-    fitted, true = _known_gains(job, PARITIES[0])
-    solved = ~fitted.flags.all(axis=(1, 2))
-    if not solved.any():
-        return {"gain_error_aligned": None, "gain_error_as_fitted": None}
-    found, true = (np.where(fitted.flags, 0, gains)[solved] for gains in (fitted.values, true))
-    return {
-        "gain_error_aligned": float(np.median(gain_errors(aligned_gains(found, true), true))),
-        "gain_error_as_fitted": float(np.median(gain_errors(found, true))),
-    }
-
-
-def _held_out_chi_squared(job: Job) -> float | None:
-    """Return chi^2 per sample of the odd data under gains and model that were fitted to the even data.
-
-    The variance of the noise is half the mean square of the difference of the two. Apart from the power of the EoR,
-    chi^2 is 1 for the true gains and foregrounds.
-    """
-    import numpy as np
-
-    from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
-
-    fitted, _ = _known_gains(job, PARITIES[0])
-    paths = [job.inputs[f"data:{parity}"] / DATA for parity in PARITIES]
-    paths.append(job.inputs[f"calibration:{PARITIES[0]}"] / MODEL)
-    misfit = noise = 0.0
-    for part, (even, odd, model) in read_in_parts(paths, SAMPLES_AT_A_TIME):
-        places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(even).tolist())}
-        rows = [places[tuple(pair)] for pair in antenna_pairs(model).tolist()]
-        first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
-        cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
-        flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
-        unsolved = flag_cube(model)[..., 0]
-        for place, time in enumerate(part):
-            gains = fitted.values[time]
-            lacking = fitted.flags[time][first] | fitted.flags[time][second]
-            used = ~(flags[place][rows] | unsolved[place] | lacking)
-            predicted = gains[first] * gains[second].conj() * cubes[2][place]
-            misfit += float(np.sum(np.abs(cubes[1][place][rows] - predicted)[used] ** 2))
-            noise += float(np.sum(np.abs(cubes[1][place][rows] - cubes[0][place][rows])[used] ** 2)) / 2
-    return misfit / noise if noise > 0 else None
-
-
-def _solves(job: Job) -> dict[str, Any]:
-    """Return the status and cost of all solves of data with the EoR and without; None where the cost is not known."""
-    records = [
-        record
-        for kind in ("calibration", "calibration_without_eor")
-        for parity in PARITIES
-        for record in read_json(job.inputs[f"{kind}:{parity}"] / SOLUTION)["records"]
-    ]
-    statuses = [record["status"] for record in records]
-    by_status = {status: statuses.count(status) for status in sorted(set(statuses))}
-    if set(statuses) == {"by-file"}:
-        return {"by_status": by_status, "cpu_seconds_per_integration": None, "peak_memory": None}
-    return {
-        "by_status": by_status,
-        "cpu_seconds_per_integration": cpu_seconds_per_integration(records),
-        "peak_memory": max(record["peak_memory"] for record in records),
-    }
-
-
 def cpu_seconds_per_integration(records: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the processor seconds per integration, with all of its polarizations, from summaries of `Solve`.
 
@@ -204,12 +222,3 @@ def cpu_seconds_per_integration(records: Sequence[Mapping[str, Any]]) -> float |
         return None
     polarizations = len({record["polarization"] for record in solved})
     return polarizations * statistics.median(record["cpu_seconds"] / record["n_integrations"] for record in solved)
-
-
-def _cost(task: Task) -> Cost:
-    size = size_of(task)
-    part = min(size.samples, max(SAMPLES_AT_A_TIME, size.samples // size.times))
-    return Cost(0.5 + size.samples * 1.5e-7, LIBRARIES_MEMORY + 8 * part * COMPLEX128, 1e6)
-
-
-SCORE = Stage(name="score", version=4, make=make_score, cost=_cost)

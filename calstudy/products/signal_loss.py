@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
+from calstudy.base.table import Table
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.products import calibration, corruption, spectra
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import AVERAGE, read_json, read_visibilities, spectrum_file, write_json, write_visibilities
-from calstudy.products.graph import Graph, once, size_of
+from calstudy.products.files import (
+    AVERAGE,
+    json_number,
+    read_json,
+    read_visibilities,
+    spectrum_file,
+    write_json,
+    write_visibilities,
+)
+from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,36 +36,38 @@ REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Parts of Fourier space; true for the part inside the wedge."""
 TRANSFER = "transfer"
 BAND = "transfer-bands"
-SCALE = "scale.json"
+SCALE, SUMMARY = "scale.json", "summary.csv"
+NOTE = (
+    "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR. "
+    "The squared coherence of response and EoR is free of the error of the calibration's flux scale; for spectra "
+    "of each baseline with itself it is the fraction of the power that is retained. One standard deviation."
+)
 
 
-@once
-def transfer(graph: Graph) -> Task | None:
+@memoize
+def transfer(graph: Graph) -> Transfer | None:
     """Return the task that measures T, or None if the experiment does not calibrate data with the EoR and without."""
     if not graph.experiment.measures_signal_loss:
         return None
     residual, without, eor = (graph.experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS)
-    responses = {
-        parity: Task(
-            DIFFERENCE,
-            f"response to the EoR {parity}",
-            {},
-            {
-                "with_signal": spectra.average(graph, residual, parity),
-                "without_signal": spectra.average(graph, without, parity),
-            },
+    label = "response to the EoR"
+    responses = [
+        Difference(
+            f"{label} {parity}",
+            with_signal=spectra.average(graph, residual, parity),
+            without_signal=spectra.average(graph, without, parity),
         )
         for parity in PARITIES
-    }
-    signal = spectra.average(graph, eor, "even")
-    inputs = {
-        "signal": spectra.power(graph, "eor"),
-        "response": spectra.crossed(graph, "response to the EoR", responses),
-        "cross": spectra.crossed(graph, "EoR x response", {"even": signal, "odd": responses["odd"]}),
-        "spectra": spectra.spectra(graph),
-        "scale": _flux_scale(graph),
-    }
-    return Task(TRANSFER_STAGE, "signal loss", {"power": graph.experiment.power}, inputs)
+    ]
+    return Transfer(
+        "signal loss",
+        power=graph.experiment.power,
+        signal=spectra.power(graph, "eor"),
+        response=spectra.cross_power(graph, label, responses),
+        cross=spectra.cross_power(graph, "EoR x response", [spectra.average(graph, eor, "even"), responses[1]]),
+        spectra=spectra.spectra(graph),
+        scale=_flux_scale(graph),
+    )
 
 
 def _flux_scale(graph: Graph) -> Task:
@@ -64,38 +76,89 @@ def _flux_scale(graph: Graph) -> Task:
     It is a separate product, so that T can be made again without another calibration if calibrations are not kept.
     """
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
-    inputs = {parity: calibration.calibration(graph, residual, parity) for parity in PARITIES}
-    if residual.effects:
-        inputs["gains"] = corruption.gains(graph)
-    return Task(FLUX_SCALE, "flux scale", {"taper": graph.experiment.power.taper}, inputs)
+    even, odd = (calibration.calibration(graph, residual, parity) for parity in PARITIES)
+    gains = corruption.gains(graph) if residual.effects else None
+    return FluxScale("flux scale", taper=graph.experiment.power.taper, even=even, odd=odd, gains=gains)
 
 
-def difference(job: Job) -> Mapping[str, Any]:
-    """Write the response of an averaged residual to the signal to average.uvh5."""
-    from calstudy.power.transfer import signal_response
+class Difference(Task, stage="difference", version=2):
+    """The response of an averaged residual to the signal."""
 
-    with_signal, without = (read_visibilities(job.inputs[name] / AVERAGE) for name in ("with_signal", "without_signal"))
-    write_visibilities(signal_response(with_signal, without), job.output / AVERAGE)
-    return {}
+    with_signal: Input
+    without_signal: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the response to average.uvh5."""
+        from calstudy.power.transfer import signal_response
+
+        found = (read_visibilities(folder / AVERAGE) for folder in (self.with_signal, self.without_signal))
+        write_visibilities(signal_response(*found), output / AVERAGE)
+        return {}
+
+    def _cost(self) -> Cost:
+        blocks = blocks_in(self.inputs.values())
+        return Cost(0.3 * blocks, disk=blocks * size_of(self).baselines * 1e4)
 
 
-def measure(job: Job) -> Mapping[str, Any]:
-    """Write T per k outside and inside the wedge and per (|b|, tau), and the residual's power corrected by T."""
-    from calstudy.power.spectra import SphericalSpectrum, of_common_units
-    from calstudy.power.tables import load_spectrum
-    from calstudy.power.transfer import Injection
+class Injected(Task):
+    """The power of a signal and of the response to it, and the spectra of the residual."""
 
-    settings = job.settings["power"]
-    delays = {name: spectra.read_delay_spectra(job.inputs[name]) for name in ("signal", "response", "cross")}
-    known = read_json(job.inputs["scale"] / SCALE)["flux_scale"]
-    scale = math.nan if known is None else known
-    summary = write_transfer(job.output, Injection(**of_common_units(delays)), settings, scale)
-    residual, signal = (
-        load_spectrum(job.inputs["spectra"] / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
-        for name in ("residual", "eor")
-    )
-    write_corrected(job.output, residual, signal)
-    return {"transfer": summary, "flux_scale": _json(scale)}
+    power: PowerSettings
+    signal: Input
+    response: Input
+    cross: Input
+    spectra: Input
+
+    def read(self) -> Injection:
+        """Read the delay spectra, in common units."""
+        from calstudy.power.spectra import of_common_units
+        from calstudy.power.transfer import Injection
+
+        folders = {"signal": self.signal, "response": self.response, "cross": self.cross}
+        delays = {name: spectra.read_delay_spectra(folder) for name, folder in folders.items()}
+        return Injection(**of_common_units(delays))
+
+    def shown(self, folder: Path) -> Sequence[Table]:
+        """Return T and the squared coherence in bands of k."""
+        from calstudy.power.tables import load_spectrum
+        from calstudy.power.transfer import TransferFunction
+
+        outside, inside = (load_spectrum(folder / spectrum_file(BAND, part), TransferFunction) for part in REGIONS)
+        columns = ("k (h/Mpc)", "T outside the wedge", "squared coherence outside", "T inside the wedge")
+        rows = [
+            (
+                f"{outside.bin_edges[band]:g} to {outside.bin_edges[band + 1]:g}",
+                _with_error(outside.transfer[band], outside.transfer_error[band]),
+                _with_error(outside.squared_coherence[band], outside.squared_coherence_error[band]),
+                _with_error(inside.transfer[band], inside.transfer_error[band]),
+            )
+            for band in range(outside.k.size)
+        ]
+        return [Table(columns, rows, "Signal loss", NOTE)]
+
+
+class Transfer(Injected, stage="transfer", version=4):
+    """T per k outside and inside the wedge and per (|b|, tau)."""
+
+    scale: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write T, and the residual's power corrected by T."""
+        from calstudy.power.spectra import SphericalSpectrum
+        from calstudy.power.tables import load_spectrum
+
+        known = read_json(self.scale / SCALE)["flux_scale"]
+        scale = math.nan if known is None else known
+        summary = write_transfer(output, self.read(), self.power, scale)
+        residual, signal = (
+            load_spectrum(self.spectra / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
+            for name in ("residual", "eor")
+        )
+        write_corrected(output, residual, signal)
+        return {"transfer": summary, "flux_scale": _json(scale)}
+
+    def _cost(self) -> Cost:
+        return Cost(1, disk=1e6)
 
 
 def write_transfer(
@@ -128,24 +191,80 @@ def write_transfer(
     return summary
 
 
-def measure_flux_scale(job: Job) -> Mapping[str, Any]:
-    """Write the flux scale of the first polarization, null if it is not known, to scale.json."""
-    import numpy as np
+class SweepSummary(Task, stage="sweep-summary", version=1):
+    """T of all points of a sweep, which have their label and what was changed as text."""
 
-    from calstudy.power.delay import make_taper
-    from calstudy.power.transfer import flux_scale, gain_ratio
-    from calstudy.products.selection import read_gains
+    points: Sequence[Mapping[str, Any]]
+    transfers: Inputs
 
-    ratios = []
-    for parity in PARITIES:
-        fitted = read_gains(job.inputs[parity])
-        true = np.ones(fitted.values.shape)
-        if "gains" in job.inputs:
-            true = read_gains(job.inputs["gains"]).over(len(fitted.values), fitted.numbers)
-        ratios.append(gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values)))
-    scale = flux_scale(ratios[0], ratios[1], make_taper(job.settings["taper"], fitted.frequency.size) ** 2)
-    write_json(job.output / SCALE, {"flux_scale": scale if math.isfinite(scale) else None})
-    return {}
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write summary.csv: a row for each point, region and band of k."""
+        from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum
+        from calstudy.power.transfer import TransferFunction
+
+        rows: list[list[Any]] = []
+        for point in self.points:
+            changes = "; ".join(f"{field} = {text}" for field, text in point["changes"].items())
+            for region in REGIONS:
+                path = self.transfers[point["label"]] / spectrum_file(BAND, region)
+                found = load_spectrum(path, TransferFunction)
+                columns = (values(found).tolist() for values in TRANSFER_COLUMNS.values())
+                rows += [[point["label"], changes, region, *row] for row in zip(*columns, strict=True)]
+        text = Table(["point", "changes", "region", *TRANSFER_COLUMNS], rows).csv()
+        (output / SUMMARY).write_text(text, encoding="utf-8", newline="")
+        return {}
+
+    def shown(self, folder: Path) -> Sequence[Table]:
+        """Return T outside the wedge, a row for each point and a column for each band."""
+        points: dict[str, dict[str, str]] = {}
+        with (folder / SUMMARY).open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                if row["region"] == "outside-wedge":
+                    band = f"k = {float(row['k from [h/Mpc]']):g} to {float(row['k to [h/Mpc]']):g} h/Mpc"
+                    cell = _with_error(float(row["transfer"]), float(row["transfer error"]))
+                    points.setdefault(row["point"], {})[band] = cell
+        bands = list(dict.fromkeys(band for found in points.values() for band in found))
+        rows = [(point, *(found[band] for band in bands)) for point, found in points.items()]
+        note = "T = P^R / P^S outside the wedge, one standard deviation."
+        return [Table(("point", *bands), rows, "Signal loss of every point", note)]
+
+    def _cost(self) -> Cost:
+        return Cost(1, disk=1e5)
+
+
+class FluxScale(Task, stage="flux-scale", version=1):
+    """The flux scale of a calibration."""
+
+    taper: str
+    even: Input
+    odd: Input
+    gains: Input = None
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the flux scale of the first polarization, null if it is not known, to scale.json."""
+        import numpy as np
+
+        from calstudy.power.delay import make_taper
+        from calstudy.power.transfer import flux_scale, gain_ratio
+        from calstudy.products.selection import read_gains
+
+        ratios = []
+        for folder in (self.even, self.odd):
+            fitted = read_gains(folder)
+            true = np.ones(fitted.values.shape)
+            if self.gains is not None:
+                true = read_gains(self.gains).over(len(fitted.values), fitted.numbers)
+            ratios.append(gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values)))
+        scale = flux_scale(ratios[0], ratios[1], make_taper(self.taper, fitted.frequency.size) ** 2)
+        write_json(output / SCALE, {"flux_scale": json_number(scale)})
+        return {}
+
+    def _cost(self) -> Cost:
+        return Cost(0.5 + size_of(self).samples * 2.5e-7, disk=1e3)
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.3f} ± {error:.3f}" if math.isfinite(value) else "no modes"
 
 
 def _json(value: float) -> float | None:
@@ -178,17 +297,3 @@ def write_corrected(folder: Path, residual: SphericalSpectrum, signal: Spherical
             f"eor {unit}": signal.power.real,
         },
     )
-
-
-def _cost_of_difference(task: Task) -> Cost:
-    blocks = blocks_in(task.inputs.values())
-    return Cost(0.3 * blocks, disk=blocks * size_of(task).baselines * 1e4)
-
-
-def _cost_of_flux_scale(task: Task) -> Cost:
-    return Cost(0.5 + size_of(task).samples * 2.5e-7, disk=1e3)
-
-
-DIFFERENCE = Stage(name="difference", version=2, make=difference, cost=_cost_of_difference)
-FLUX_SCALE = Stage(name="flux-scale", version=1, make=measure_flux_scale, cost=_cost_of_flux_scale)
-TRANSFER_STAGE = Stage(name="transfer", version=4, make=measure, cost=lambda task: Cost(1, disk=1e6))

@@ -14,8 +14,8 @@ from calstudy.instrument.distinct_beams import beam_count
 from calstudy.instrument.layouts import layout_of
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
-from calstudy.products.graph import Graph, once
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize
+from calstudy.run.task import Piece, Task
 from calstudy.simulate.interface import SimulationSize
 from calstudy.simulate.nodes import (
     EARTH_ROTATION_RATE,
@@ -30,6 +30,8 @@ from calstudy.sky.counts import FAINTEST, expected_sources
 from calstudy.sky.settings import Eor, Foregrounds, NoSources, PointSources, SyntheticSources
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pyuvdata import UVData
 
     from calstudy.instrument.settings import InstrumentSettings
@@ -57,7 +59,7 @@ DIPOLE_SECONDS, DIPOLE_MEMORY, WORKERS = 20.0, 0.6e9, 4
 """Cost of the fields of the single dipoles of a tile, which each worker makes for its first chunk."""
 
 
-@once
+@memoize
 def foregrounds(graph: Graph) -> Task | None:
     """Return the task of the foreground visibilities F, or None if the sky has none."""
     return foregrounds_of(graph, "foregrounds", graph.experiment.sky, graph.experiment.instrument)
@@ -70,81 +72,137 @@ def foregrounds_of(graph: Graph, label: str, sky: SkySettings, instrument: Instr
     """
     if not sky.has_foregrounds:
         return None
-    diffuse = {} if sky.diffuse.kind == "none" else {"diffuse": sky.diffuse}
-    return _simulation(graph, label, {"instrument": instrument, "sky": sky.foregrounds, **diffuse})
+    diffuse = None if sky.diffuse.kind == "none" else sky.diffuse
+    return _simulation(graph, label, instrument=instrument, sky=sky.foregrounds, diffuse=diffuse)
 
 
-@once
+@memoize
 def eor(graph: Graph) -> Task:
     """Return the task of the EoR visibilities S, in absolute units."""
     experiment = graph.experiment
     settings = {"instrument": experiment.instrument, "sky": experiment.sky.eor, "cosmology": experiment.power.cosmology}
-    return _simulation(graph, "eor", settings)
+    return _simulation(graph, "eor", **settings)
 
 
-def _simulation(graph: Graph, component: str, settings: Mapping[str, Any]) -> Task:
-    experiment = graph.experiment
-    settings = {**settings, "simulation": experiment.simulation}
-    count = _pieces(experiment.simulation, settings["sky"], experiment.instrument)
-    chunks = {
-        f"chunk{index:03d}": Task(
-            SIMULATE_CHUNK,
-            f"{component} {index + 1}/{count}",
-            {**settings, "chunks": experiment.simulation.chunks, "index": index},
+def _simulation(graph: Graph, label: str, **settings: Any) -> Task:
+    simulation = graph.experiment.simulation
+    count = _pieces(simulation, settings["sky"], graph.experiment.instrument)
+    chunks = (
+        SimulateChunk(
+            f"{label} {index + 1}/{count}",
+            **settings,
+            simulation=simulation,
+            chunks=simulation.chunks,
+            index=index,
             temporary=True,
         )
         for index in range(count)
-    }
-    return Task(SIMULATE, component, settings, pieces=chunks)
-
-
-def _component(job: Job) -> Component:
-    from calstudy.simulate.chunks import Component
-
-    settings = job.settings
-    return Component(
-        settings["instrument"],
-        settings["simulation"],
-        settings["sky"],
-        settings.get("cosmology", "Planck15"),
-        settings.get("diffuse"),
     )
+    return Simulate(label, **settings, simulation=simulation, chunk=tuple(chunks))
 
 
-def simulate_chunk(job: Job) -> Mapping[str, Any]:
-    """Write a block of frequency nodes at all integrations to chunk.uvh5; a chunk beyond the last node stays empty."""
-    from calstudy.base.visibilities import from_cube
-    from calstudy.instrument.telescope import subset_template
-    from calstudy.simulate.chunks import simulate_chunk as simulate
-    from calstudy.simulate.nodes import integration_times
+class _Simulated(Task):
+    """What a simulation reads: foregrounds with the cosmology None, or the EoR."""
 
-    component = _component(job)
-    if job.settings["index"] >= len(component.chunks):
-        return {"empty": True}
-    chunk = component.chunks[job.settings["index"]]
-    sky = component.sky(chunk.channels if component.is_eor else slice(None))
-    cube = simulate(component.engine, sky, component.beam, component.as_built, chunk)
-    frame = subset_template(component.template, integration_times(component.template), chunk.frequencies)
-    write_visibilities(from_cube(frame, cube), job.output / CHUNK)
-    return {"frequencies": len(chunk.frequencies), "components": int(sky.Ncomponents)}
+    instrument: InstrumentSettings
+    sky: Foregrounds | Eor
+    simulation: SimulationSettings
+    cosmology: str | None = None
+    diffuse: Any = None
+
+    @property
+    def component(self) -> Component:
+        """The component, ready to be simulated."""
+        from calstudy.simulate.chunks import Component
+
+        cosmology = self.cosmology or "Planck15"
+        return Component(self.instrument, self.simulation, self.sky, cosmology, self.diffuse)
 
 
-def assemble(job: Job) -> Mapping[str, Any]:
-    """Write the visibilities at all channels to visibilities.uvh5, and measures of their quality to quality.json."""
-    from calstudy.base.visibilities import from_cube, to_cube
-    from calstudy.simulate.chunks import assemble as join
+class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
+    """A block of frequency nodes of a component at all integrations."""
 
-    component = _component(job)
-    count = len(component.chunks)
-    cubes = (to_cube(read_visibilities(job.inputs[f"chunk{index:03d}"] / CHUNK)) for index in range(count))
-    data = from_cube(component.template, join(component.chunks, cubes))
-    quality: dict[str, Any] = {"interpolation": component.interpolation_error(to_cube(data))}
-    if not component.is_eor:
-        quality["delay_floor"] = _floors(data)
-    write_visibilities(data, job.output / VISIBILITIES)
-    write_json(job.output / QUALITY, quality)
-    warnings = [*_warnings(component, quality), *_coarse_pixels(job.settings)]
-    return {**quality, "stand_ins": component.stand_ins, "warnings": warnings}
+    chunks: int
+    index: int
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the visibilities to chunk.uvh5; a chunk beyond the last node stays empty."""
+        from calstudy.base.visibilities import from_cube
+        from calstudy.instrument.telescope import subset_template
+        from calstudy.simulate.chunks import simulate_chunk as simulate
+        from calstudy.simulate.nodes import integration_times
+
+        component = self.component
+        if self.index >= len(component.chunks):
+            return {"empty": True}
+        chunk = component.chunks[self.index]
+        sky = component.sky(chunk.channels if component.is_eor else slice(None))
+        cube = simulate(component.engine, sky, component.beam, component.as_built, chunk)
+        frame = subset_template(component.template, integration_times(component.template), chunk.frequencies)
+        write_visibilities(from_cube(frame, cube), output / CHUNK)
+        return {"frequencies": len(chunk.frequencies), "components": int(sky.Ncomponents)}
+
+    def _cost(self) -> Cost:
+        instrument, simulation, sky = self.instrument, self.simulation, self.sky
+        size, eor = Size.of(instrument), isinstance(sky, Eor)
+        sources = 12 * sky.nside**2 if isinstance(sky, Eor) else _sources(self)
+        kept = 0.0 if eor else DRAWN_SOURCE * _drawn(sky)
+        accuracy = simulation.nodes.for_eor(True) if eor else simulation.nodes.for_foregrounds(True, smooth_sky=True)
+        nodes = _node_counts(instrument, accuracy, size.longest)
+        patches = _node_counts(instrument, accuracy, size.longest * _patch_radius(sources), TYPICAL_ERROR)
+        pieces = _pieces(simulation, sky, instrument)
+        beams = beam_count(instrument, size.antennas)
+        engine = simulation.engine.cost(
+            SimulationSize(
+                sources=sources,
+                slots=nodes[0] * nodes[1] / pieces,
+                patch_slots=(patches[0] * patches[1] + _crossing(instrument) * nodes[1]) / pieces,
+                antennas=size.antennas,
+                beams=beams,
+                tolerance=accuracy.tolerance,
+                regular=_is_regular(instrument),
+            )
+        )
+        total = size.samples / size.channels.count * nodes[1] * COMPLEX128
+        disk = total / (pieces if eor else frequency_blocks(total, pieces))
+        channels = nodes[1] / pieces
+        # Directions of all, and of those above the horizon in another order.
+        followed = 36 * chebyshev_count(_rotation(instrument) / 2, 1e-15) + 100
+        memory = engine.memory + kept + followed * sources + (30 * sources * channels if eor else 0) + 4 * disk
+        seconds = 3 + engine.seconds
+        if beams > 1:
+            seconds += beams * TABLE_SECONDS * size.polarizations * channels
+            memory += beams * (TABLE_MEMORY * size.polarizations * channels + 2e7)
+        if instrument.as_built.dipoles.differ:
+            seconds += DIPOLE_SECONDS * min(1, WORKERS / pieces)
+            memory += DIPOLE_MEMORY
+        return Cost(seconds, memory, disk)
+
+
+class Simulate(_Simulated, stage="simulate", version=3):
+    """The visibilities of a component at all channels."""
+
+    chunk: tuple[Piece, ...]
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the visibilities to visibilities.uvh5, and measures of their quality to quality.json."""
+        from calstudy.base.visibilities import from_cube, to_cube
+        from calstudy.simulate.chunks import assemble
+
+        component = self.component
+        cubes = (to_cube(read_visibilities(folder / CHUNK)) for folder in self.chunk[: len(component.chunks)])
+        data = from_cube(component.template, assemble(component.chunks, cubes))
+        quality: dict[str, Any] = {"interpolation": component.interpolation_error(to_cube(data))}
+        if not component.is_eor:
+            quality["delay_floor"] = _floors(data)
+        write_visibilities(data, output / VISIBILITIES)
+        write_json(output / QUALITY, quality)
+        warnings = [*_warnings(component, quality), *_coarse_pixels(self)]
+        return {**quality, "stand_ins": component.stand_ins, "warnings": warnings}
+
+    def _cost(self) -> Cost:
+        disk = Size.of(self.instrument).samples * COMPLEX128
+        return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 4 * disk, disk)
 
 
 def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
@@ -159,13 +217,13 @@ def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _coarse_pixels(settings: Mapping[str, Any]) -> list[str]:
+def _coarse_pixels(task: _Simulated) -> list[str]:
     """Warn of map pixels larger than half a fringe: as point sources, they are aliased by long baselines."""
-    if "diffuse" not in settings:
+    if task.diffuse is None:
         return []
-    pixel = (4 * math.pi / (12 * settings["diffuse"].nside ** 2)) ** 0.5
-    longest = Size.of(settings["instrument"]).longest
-    fringe = SPEED_OF_LIGHT / (settings["instrument"].channels.band[1] * longest)
+    pixel = (4 * math.pi / (12 * task.diffuse.nside**2)) ** 0.5
+    longest = Size.of(task.instrument).longest
+    fringe = SPEED_OF_LIGHT / (task.instrument.channels.band[1] * longest)
     if pixel <= fringe / 2:
         return []
     return [
@@ -190,43 +248,6 @@ def _as_json(floor: DelayFloor) -> dict[str, Any]:
         for name in ("edges", "rms_db", "max_db")
     }
     return {**rounded, "buffer_s": floor.buffer, "worst_db": round(floor.worst_db, 2)}
-
-
-def _cost_of_chunk(task: Task) -> Cost:
-    instrument, simulation, sky = (task.settings[name] for name in ("instrument", "simulation", "sky"))
-    size, eor = Size.of(instrument), isinstance(sky, Eor)
-    sources = 12 * sky.nside**2 if isinstance(sky, Eor) else _sources(task.settings)
-    kept = 0.0 if eor else DRAWN_SOURCE * _drawn(task.settings["sky"])
-    accuracy = simulation.nodes.for_eor(True) if eor else simulation.nodes.for_foregrounds(True, smooth_sky=True)
-    nodes = _node_counts(instrument, accuracy, size.longest)
-    patches = _node_counts(instrument, accuracy, size.longest * _patch_radius(sources), TYPICAL_ERROR)
-    pieces = _pieces(simulation, sky, instrument)
-    beams = beam_count(instrument, size.antennas)
-    engine = simulation.engine.cost(
-        SimulationSize(
-            sources=sources,
-            slots=nodes[0] * nodes[1] / pieces,
-            patch_slots=(patches[0] * patches[1] + _crossing(instrument) * nodes[1]) / pieces,
-            antennas=size.antennas,
-            beams=beams,
-            tolerance=accuracy.tolerance,
-            regular=_is_regular(instrument),
-        )
-    )
-    total = size.samples / size.channels.count * nodes[1] * COMPLEX128
-    disk = total / (pieces if eor else frequency_blocks(total, pieces))
-    channels = nodes[1] / pieces
-    # Directions of all, and of those above the horizon in another order.
-    followed = 36 * chebyshev_count(_rotation(instrument) / 2, 1e-15) + 100
-    memory = engine.memory + kept + followed * sources + (30 * sources * channels if eor else 0) + 4 * disk
-    seconds = 3 + engine.seconds
-    if beams > 1:
-        seconds += beams * TABLE_SECONDS * size.polarizations * channels
-        memory += beams * (TABLE_MEMORY * size.polarizations * channels + 2e7)
-    if instrument.as_built.dipoles.differ:
-        seconds += DIPOLE_SECONDS * min(1, WORKERS / pieces)
-        memory += DIPOLE_MEMORY
-    return Cost(seconds, memory, disk)
 
 
 def _node_counts(
@@ -273,24 +294,15 @@ def _patch_radius(sources: float) -> float:
     return 0.7 / nside if nside else 1.0
 
 
-def _drawn(sky: Foregrounds) -> float:
+def _drawn(sky: Foregrounds | Eor) -> float:
     """Estimate the number of drawn sources, of which only the brightest are used."""
     return expected_sources(max(sky.flux_limit, FAINTEST)) if isinstance(sky, SyntheticSources) else 0.0
 
 
-def _sources(settings: Mapping[str, Any]) -> int:
+def _sources(task: _Simulated) -> int:
     """Estimate the number of foreground components: sources from their counts above the flux limit, pixels of a map."""
-    sky, found = settings["sky"], 12 * settings["diffuse"].nside ** 2 if "diffuse" in settings else 0
+    sky, found = task.sky, 0 if task.diffuse is None else 12 * task.diffuse.nside**2
     if isinstance(sky, PointSources):
         expected = int(expected_sources(max(sky.flux_limit, FAINTEST)))
         return found + max(min(sky.count or expected, expected), 1)
     return found if isinstance(sky, NoSources) else found + SOURCES
-
-
-def _cost(task: Task) -> Cost:
-    disk = Size.of(task.settings["instrument"]).samples * COMPLEX128
-    return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 4 * disk, disk)
-
-
-SIMULATE_CHUNK = Stage(name="simulate-chunk", version=4, make=simulate_chunk, cost=_cost_of_chunk)
-SIMULATE = Stage(name="simulate", version=3, make=assemble, cost=_cost)

@@ -11,16 +11,16 @@ from calstudy.base import paths
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.assumed import SKY_MODEL, AssumedWorld, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import InstrumentSettings
 from calstudy.products import simulation
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
-from calstudy.products.graph import Graph, once, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.run.task import Input, Task
 
 ERROR = "sky-model.json"
 
 
-@once
+@memoize
 def sky_model(graph: Graph) -> Task | None:
     """Return the task of the visibilities of the calibrator's sky model, or None if there is none.
 
@@ -29,7 +29,7 @@ def sky_model(graph: Graph) -> Task | None:
     changes = assumed_changes(graph.experiment.calibration.assumed)
     if SKY_MODEL in changes:
         path = Path(changes[SKY_MODEL])
-        return Task(READ, path.name, {"path": path, "instrument": graph.experiment.instrument.without_beams()})
+        return ReadSkyModel(path.name, path=path, instrument=graph.experiment.instrument.without_beams())
     world, true = assumed_world(graph.experiment), simulation.foregrounds(graph)
     assumed = simulation.foregrounds_of(graph, "assumed foregrounds", world.sky, world.instrument)
     return true if assumed is not None and true is not None and assumed.key == true.key else assumed
@@ -41,13 +41,13 @@ def is_perfect(graph: Graph) -> bool:
     return model is not None and model is simulation.foregrounds(graph)
 
 
-@once
+@memoize
 def error(graph: Graph) -> Task | None:
     """Return the task that measures the error of the sky model, or None if it is perfect or there is no sky model."""
     model, true = sky_model(graph), simulation.foregrounds(graph)
     if model is None or true is None or is_perfect(graph):
         return None
-    return Task(MEASURE_ERROR, "sky model against truth", {}, {"foregrounds": true, "sky_model": model})
+    return SkyModelError("sky model against truth", foregrounds=true, sky_model=model)
 
 
 def differences(graph: Graph) -> list[tuple[str, str, str]]:
@@ -94,45 +94,51 @@ def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def read(job: Job) -> Mapping[str, Any]:
-    """Write the visibilities of a file, at the samples of the data, to visibilities.uvh5."""
-    from calstudy.calibrate.sky_model import read_sky_model
-    from calstudy.instrument.telescope import make_template
+class ReadSkyModel(Task, stage="sky-model", version=1):
+    """The visibilities of a file, at the samples of the data."""
 
-    sky = read_sky_model(job.settings["path"], make_template(job.settings["instrument"]))
-    write_visibilities(sky, job.output / VISIBILITIES)
-    return {"file": str(job.settings["path"])}
+    path: Path
+    instrument: InstrumentSettings
 
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the visibilities to visibilities.uvh5."""
+        from calstudy.calibrate.sky_model import read_sky_model
+        from calstudy.instrument.telescope import make_template
 
-def measure_error(job: Job) -> Mapping[str, Any]:
-    """Write the rms of the true foregrounds, of the sky model, and of their difference to sky-model.json, Jy."""
-    from calstudy.base.visibilities import to_cube
-    from calstudy.corrupt.levels import rms
+        write_visibilities(read_sky_model(self.path, make_template(self.instrument)), output / VISIBILITIES)
+        return {"file": str(self.path)}
 
-    true, model = (to_cube(read_visibilities(job.inputs[name] / VISIBILITIES)) for name in ("foregrounds", "sky_model"))
-    true_rms, difference = rms(true), rms(model - true)
-    found = {
-        "true_rms_jy": true_rms,
-        "sky_model_rms_jy": rms(model),
-        "difference_rms_jy": difference,
-        "relative_error": difference / true_rms if true_rms else None,
-    }
-    write_json(job.output / ERROR, found)
-    if difference == 0:
-        # This product exists only if the experiment asks for an error of the sky model.
-        return {**found, "warnings": ["the sky model that the calibrator assumes is equal to the true foregrounds"]}
-    return found
+    def _cost(self) -> Cost:
+        disk = size_of(self).samples * COMPLEX128
+        return Cost(3 + disk * 4e-9, LIBRARIES_MEMORY + 5 * disk, disk)
 
 
-def _cost_of_reading(task: Task) -> Cost:
-    disk = Size.of(task.settings["instrument"]).samples * COMPLEX128
-    return Cost(3 + disk * 4e-9, LIBRARIES_MEMORY + 5 * disk, disk)
+class SkyModelError(Task, stage="sky-model-error", version=1):
+    """The error of the sky model."""
 
+    foregrounds: Input
+    sky_model: Input
 
-def _cost_of_error(task: Task) -> Cost:
-    samples = size_of(task).samples
-    return Cost(0.3 + samples * 1e-7, LIBRARIES_MEMORY + 4 * samples * COMPLEX128, 1e3)
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the rms of the true foregrounds, of the sky model, and of their difference to sky-model.json, Jy."""
+        from calstudy.base.visibilities import to_cube
+        from calstudy.corrupt.levels import rms
 
+        folders = (self.foregrounds, self.sky_model)
+        true, model = (to_cube(read_visibilities(folder / VISIBILITIES)) for folder in folders)
+        true_rms, difference = rms(true), rms(model - true)
+        found = {
+            "true_rms_jy": true_rms,
+            "sky_model_rms_jy": rms(model),
+            "difference_rms_jy": difference,
+            "relative_error": difference / true_rms if true_rms else None,
+        }
+        write_json(output / ERROR, found)
+        if difference == 0:
+            # This product exists only if the experiment asks for an error of the sky model.
+            return {**found, "warnings": ["the sky model that the calibrator assumes is equal to the true foregrounds"]}
+        return found
 
-READ = Stage(name="sky-model", version=1, make=read, cost=_cost_of_reading)
-MEASURE_ERROR = Stage(name="sky-model-error", version=1, make=measure_error, cost=_cost_of_error)
+    def _cost(self) -> Cost:
+        samples = size_of(self).samples
+        return Cost(0.3 + samples * 1e-7, LIBRARIES_MEMORY + 4 * samples * COMPLEX128, 1e3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,19 +12,19 @@ from calstudy.experiment.model import Component, Variant
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import AVERAGE, DATA, RESIDUAL, read_visibilities, spectrum_file, write_visibilities
-from calstudy.products.graph import Graph, once, size_of
-from calstudy.run.task import Job, Stage, Task
+from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pyuvdata import UVData
 
+    from calstudy.instrument.settings import Beam, Channels
     from calstudy.power.average import Block
+    from calstudy.power.settings import PowerSettings
     from calstudy.power.spectra import DelaySpectra
 
-# Further inputs of the spectra; names of variants cannot contain a colon.
-EOR_REFERENCE, NOISE_REFERENCE = "reference:eor", "reference:noise"
 EXCISION = {"all-modes": False, "outside-wedge": True}
 """Spherical averages; true for the one without the wedge."""
 NOT_OF_DELAY_SPECTRA = ("coherent_time", "bins", "wedge_buffer", "length_bin")
@@ -32,7 +32,7 @@ NOT_OF_DELAY_SPECTRA = ("coherent_time", "bins", "wedge_buffer", "length_bin")
 DELAY_SPECTRA = "delay-spectra.h5"
 
 
-@once
+@memoize
 def average(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of one realization ("even" or "odd") of a variant, fringe-stopped and averaged over the run."""
     make = calibration.calibration if variant.calibrate else corruption.data
@@ -41,8 +41,7 @@ def average(graph: Graph, variant: Variant, parity: str) -> Task:
     file = RESIDUAL if variant.calibrate else DATA
     times = graph.experiment.instrument.times
     count = graph.experiment.power.n_blocks(times.integration * times.count, times.integration)
-    settings = {"file": file} if count == 1 else {"file": file, "blocks": count}
-    return Task(AVERAGE_STAGE, label, settings, {"data": source})
+    return Average(label, file=file, blocks=count, data=source)
 
 
 def power(graph: Graph, name: str) -> Task:
@@ -50,32 +49,32 @@ def power(graph: Graph, name: str) -> Task:
     return variant_power(graph, name, graph.experiment.variants[name])
 
 
-@once
+@memoize
 def variant_power(graph: Graph, label: str, variant: Variant) -> Task:
     """Return the task of the delay power spectra of a variant, which need not be one of the experiment's."""
-    return crossed(graph, label, {parity: average(graph, variant, parity) for parity in PARITIES})
+    return cross_power(graph, label, [average(graph, variant, parity) for parity in PARITIES])
 
 
-def crossed(graph: Graph, label: str, averages: Mapping[str, Task]) -> Task:
-    """Return the task of the delay power spectra of two averaged data sets, "even" x "odd"."""
-    instrument = graph.experiment.instrument
-    settings = {
-        "beam": instrument.beam,
-        "channels": instrument.channels,
-        "power": graph.experiment.power.with_defaults(*NOT_OF_DELAY_SPECTRA),
-    }
-    return Task(POWER, label, settings, averages)
+def cross_power(graph: Graph, label: str, averages: Sequence[Task], power: PowerSettings | None = None) -> Task:
+    """Return the task of the delay power spectra of two averages; `power` replaces the study's own settings."""
+    even, odd = averages
+    used = (power or graph.experiment.power).with_defaults(*NOT_OF_DELAY_SPECTRA)
+    return Power(label, beam=graph.beam, channels=graph.channels, power=used, even=even, odd=odd)
 
 
-@once
+@memoize
 def spectra(graph: Graph) -> Task:
     """Return the task of the wedge and spherical spectra of all variants, with errors."""
-    variants = graph.experiment.variants
-    inputs = {name: power(graph, name) for name in variants}
-    inputs[EOR_REFERENCE] = _reference(graph, "eor")
+    variants, reference = graph.experiment.variants, {"eor": _reference(graph, "eor")}
     if any("noise" in variant.components for variant in variants.values()):
-        inputs[NOISE_REFERENCE] = _reference(graph, "noise")
-    return Task(SPECTRA, "wedge and spherical", {"power": graph.experiment.power, "variants": variants}, inputs)
+        reference["noise"] = _reference(graph, "noise")
+    return Spectra(
+        "wedge and spherical",
+        power=graph.experiment.power,
+        variants=variants,
+        spectra={name: power(graph, name) for name in variants},
+        reference=reference,
+    )
 
 
 def _reference(graph: Graph, component: Component) -> Task:
@@ -83,53 +82,87 @@ def _reference(graph: Graph, component: Component) -> Task:
     return variant_power(graph, component, Variant(components=(component,)))
 
 
-def make_average(job: Job) -> Mapping[str, Any]:
-    """Write the fringe-stopped average of a data set, or of each of its blocks, to average.uvh5."""
-    from calstudy.power.average import average_in_blocks
+class InBlocks(Task):
+    """An average in the `kept` ones of `blocks` blocks within `span`, or in one with the phase centre `centre`."""
 
-    data = read_visibilities(job.inputs["data"] / job.settings["file"])
-    write_visibilities(average_in_blocks(data, blocks_of(job, data)), job.output / AVERAGE)
-    return {}
+    blocks: int = 1
+    centre: float | None = None
+    span: Sequence[float] | None = None
+    kept: Sequence[int] | None = None
 
+    def blocks_of(self, data: UVData) -> list[Block]:
+        """Return the blocks of a data set."""
+        import numpy as np
 
-def blocks_of(job: Job, data: UVData) -> list[Block]:
-    """Return the blocks in which the settings of a task divide a data set.
+        from calstudy.power.average import Block, divide
 
-    They are the `kept` ones of `blocks` blocks within `span`, or one block with the phase centre `centre`.
-    """
-    import numpy as np
-
-    from calstudy.power.average import Block, divide
-
-    times, settings = np.unique(data.time_array), job.settings
-    if "blocks" not in settings:
-        return [Block(np.arange(times.size), settings.get("centre"))]
-    found = divide(times, float(data.integration_time[0]), settings["blocks"], settings.get("span"))
-    return [block for block in found if block.number in settings.get("kept", range(settings["blocks"]))]
+        times = np.unique(data.time_array)
+        if self.blocks == 1:
+            return [Block(np.arange(times.size), self.centre)]
+        found = divide(times, float(data.integration_time[0]), self.blocks, self.span)
+        return [block for block in found if self.kept is None or block.number in self.kept]
 
 
-def estimate(job: Job) -> Mapping[str, Any]:
-    """Write the delay spectra even x odd to delay-spectra.h5, and the files of the estimator itself.
+class Average(InBlocks, stage="average", version=2):
+    """The fringe-stopped average of a data set, or of each of its blocks."""
 
-    Spectra are NaN if all data are flagged because no solve gave gains.
-    """
-    import numpy as np
+    file: str
+    data: Input
 
-    from calstudy.instrument.beams import make_beam
-    from calstudy.power.interface import estimate_spectra
-    from calstudy.power.tables import save_spectrum
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the average to average.uvh5."""
+        from calstudy.power.average import average_in_blocks
 
-    even, odd = averages = [read_visibilities(job.inputs[parity] / AVERAGE) for parity in PARITIES]
-    beam = make_beam(job.settings["beam"], job.settings["channels"])
-    empty = any(uvd.flag_array.all() for uvd in averages)
-    if empty:
-        for uvd in averages:
-            uvd.flag_array[:] = False
-    found = estimate_spectra(even, odd, beam, job.settings["power"], job.output)
-    if empty:
-        found = replace(found, power=np.full_like(found.power, np.nan))
-    save_spectrum(job.output / DELAY_SPECTRA, found)
-    return {"units": len(found.n_pairs), "pairs": int(found.n_pairs.sum())}
+        data = read_visibilities(self.data / self.file)
+        write_visibilities(average_in_blocks(data, self.blocks_of(data)), output / AVERAGE)
+        return {}
+
+    def _cost(self) -> Cost:
+        size, blocks = size_of(self), self.blocks
+        disk = blocks * size.samples / size.times * COMPLEX128
+        seconds = 0.5 + 0.15 * (blocks - 1) + size.samples * 8e-8
+        return Cost(seconds, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
+
+
+class Power(Task, stage="power", version=4):
+    """The delay power spectra of two averages."""
+
+    beam: Beam
+    channels: Channels
+    power: PowerSettings
+    even: Input
+    odd: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the delay spectra even x odd to delay-spectra.h5, and the files of the estimator itself.
+
+        Spectra are NaN if all data are flagged because no solve gave gains.
+        """
+        import numpy as np
+
+        from calstudy.instrument.beams import make_beam
+        from calstudy.power.interface import estimate_spectra
+        from calstudy.power.tables import save_spectrum
+
+        even, odd = averages = [read_visibilities(folder / AVERAGE) for folder in (self.even, self.odd)]
+        empty = any(uvd.flag_array.all() for uvd in averages)
+        if empty:
+            for uvd in averages:
+                uvd.flag_array[:] = False
+        found = estimate_spectra(even, odd, make_beam(self.beam, self.channels), self.power, output)
+        if empty:
+            found = replace(found, power=np.full_like(found.power, np.nan))
+        save_spectrum(output / DELAY_SPECTRA, found)
+        return {"units": len(found.n_pairs), "pairs": int(found.n_pairs.sum())}
+
+    def _cost(self) -> Cost:
+        # Differences and noise are made from averages.
+        behind = [average for source in (self.even, self.odd) for average in source.inputs.values()]
+        size, blocks = size_of(self), blocks_in([self.even, self.odd, *behind])
+        # Each block has a file of the estimator; spectra and each unit's shares of its antennas are of all blocks.
+        spectra = size.baselines * size.channels.count
+        seconds = 2 + 1e-5 * spectra + (blocks - 1) * (0.9 + 0.005 * size.baselines)
+        return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
 
 
 def read_delay_spectra(folder: Path) -> DelaySpectra:
@@ -140,59 +173,49 @@ def read_delay_spectra(folder: Path) -> DelaySpectra:
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
 
 
-def average_spectra(job: Job) -> Mapping[str, Any]:
-    """Write, for every variant, wedge.h5 and the two spherical spectra with their errors, as HDF5 and CSV.
+class Spectra(Task, stage="spectra", version=3):
+    """Wedge and spherical spectra of all variants, with errors.
 
     The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
     (paper section Reduction of Simulation Products); each enters the variants that contain its component.
     """
-    import numpy as np
 
-    from calstudy.power.cylindrical import cylindrical_average
-    from calstudy.power.errors import noise_level, with_errors
-    from calstudy.power.spherical import spherical_average
-    from calstudy.power.tables import save_spectrum, write_csv
+    power: PowerSettings
+    variants: Mapping[str, Variant]
+    spectra: Inputs
+    reference: Mapping[str, Input]
 
-    settings = job.settings["power"]
-    delays = {name: read_delay_spectra(folder) for name, folder in job.inputs.items()}
-    sigma_noise = noise_level(delays[NOISE_REFERENCE]) if NOISE_REFERENCE in delays else 0.0
-    signals = {name: spherical_average(delays[EOR_REFERENCE], settings, excise) for name, excise in EXCISION.items()}
-    for name, variant in job.settings["variants"].items():
-        if not np.isfinite(delays[name].power).any():
-            raise InputError(f"variants.{name}: all data are flagged, because no solve of the calibration gave gains")
-        save_spectrum(job.output / spectrum_file(name, "wedge"), cylindrical_average(delays[name], settings))
-        for modes, excise in EXCISION.items():
-            spectrum = with_errors(
-                spherical_average(delays[name], settings, excise),
-                noise=sigma_noise if "noise" in variant.components else 0.0,
-                signal=signals[modes] if "eor" in variant.components else None,
-            )
-            save_spectrum(job.output / spectrum_file(name, modes), spectrum)
-            write_csv(job.output / f"{name}.{modes}.csv", spectrum)
-    return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write, for every variant, wedge.h5 and the two spherical spectra, as HDF5 and CSV."""
+        import numpy as np
+
+        from calstudy.power.cylindrical import cylindrical_average
+        from calstudy.power.errors import noise_level, with_errors
+        from calstudy.power.spherical import spherical_average
+        from calstudy.power.tables import save_spectrum, write_csv
+
+        reference = {name: read_delay_spectra(folder) for name, folder in self.reference.items()}
+        sigma_noise = noise_level(reference["noise"]) if "noise" in reference else 0.0
+        signals = {name: spherical_average(reference["eor"], self.power, excise) for name, excise in EXCISION.items()}
+        for name, variant in self.variants.items():
+            found = read_delay_spectra(self.spectra[name])
+            if not np.isfinite(found.power).any():
+                raise InputError(f"variants.{name}: all data are flagged, because no solve gave gains")
+            save_spectrum(output / spectrum_file(name, "wedge"), cylindrical_average(found, self.power))
+            for modes, excise in EXCISION.items():
+                spectrum = with_errors(
+                    spherical_average(found, self.power, excise),
+                    noise=sigma_noise if "noise" in variant.components else 0.0,
+                    signal=signals[modes] if "eor" in variant.components else None,
+                )
+                save_spectrum(output / spectrum_file(name, modes), spectrum)
+                write_csv(output / f"{name}.{modes}.csv", spectrum)
+        return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
+
+    def _cost(self) -> Cost:
+        return Cost(2, disk=5e6)
 
 
 def blocks_in(averages: Iterable[Task]) -> int:
     """Return the largest number of blocks of any of the averages."""
-    return max(task.settings.get("blocks", 1) for task in averages)
-
-
-def _cost_of_average(task: Task) -> Cost:
-    size, blocks = size_of(task), task.settings.get("blocks", 1)
-    disk = blocks * size.samples / size.times * COMPLEX128
-    return Cost(0.5 + 0.15 * (blocks - 1) + size.samples * 8e-8, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
-
-
-def _cost_of_power(task: Task) -> Cost:
-    # Differences and noise are made from averages.
-    behind = [average for source in task.inputs.values() for average in source.inputs.values()]
-    size, blocks = size_of(task), blocks_in([*task.inputs.values(), *behind])
-    # Each block has a file of the estimator; spectra and each unit's shares of its antennas are of all blocks.
-    spectra = size.baselines * size.channels.count
-    seconds = 2 + 1e-5 * spectra + (blocks - 1) * (0.9 + 0.005 * size.baselines)
-    return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
-
-
-AVERAGE_STAGE = Stage(name="average", version=2, make=make_average, cost=_cost_of_average)
-POWER = Stage(name="power", version=4, make=estimate, cost=_cost_of_power)
-SPECTRA = Stage(name="spectra", version=3, make=average_spectra, cost=lambda task: Cost(2, disk=5e6))
+    return max(getattr(task, "blocks", 1) for task in averages)

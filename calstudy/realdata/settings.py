@@ -23,7 +23,7 @@ from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Decibel, FluxDensity
 from calstudy.calibrate.interface import CALIBRATORS
-from calstudy.corrupt.temperature import SystemTemperature
+from calstudy.corrupt.noise import SystemTemperature
 from calstudy.instrument.settings import BEAMS
 from calstudy.realdata.selection import Selection, parse_values
 from calstudy.simulate.settings import SimulationSettings

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from calstudy.base.errors import InputError
 from calstudy.base.table import Table
-from calstudy.products.pooled_realizations import VERDICTS
-from calstudy.report import measured
 from calstudy.report.charts import Chart, read_charts
 from calstudy.report.headline import Number, read_headline, read_signal
 from calstudy.results.folder import EXPERIMENT, MANIFEST, RunFolder
 from calstudy.run.progress import duration
-from calstudy.verdicts.tables import CLAIMS_JSON, marked, tally
-from calstudy.verdicts.tables import measured as number_measured
+from calstudy.verdicts.standing import answers, standing_table
+from calstudy.verdicts.tables import CLAIMS_JSON, tally, verdict_table
 
-SUMMARY, COMPARISON = "summary.csv", "comparison.csv"
 CLAIMS_TITLE = "Claims of the paper"
 
 
@@ -40,20 +34,22 @@ class Picture:
 class Contents:
     """All contents of a report.
 
-    Facts are short statements by name, such as the time, the machine and versions. Pictures and tables are in the
-    order of the page, below the headline. Files, tables and records, are relative to the run folder. Parts are the
-    run folders of which this one consists: name and relative path of their reports. The experiment is the resolved
-    file, or empty.
+    Facts are short statements by name, such as the time, the machine and versions. Answers say which calibrators of a
+    comparison pass. Pictures and tables are in the order of the page, below the headline. Files, tables and records,
+    are relative to the run folder. Parts are the run folders of which this one consists: name and relative path of
+    their reports. The experiment is the resolved file, or empty.
     """
 
     title: str
     description: str
+    setup: str
     facts: Mapping[str, str]
     stand_ins: Sequence[str]
     warnings: Sequence[str]
     pictures: Sequence[Picture]
     tables: Sequence[Table]
     headline: Sequence[Number] = ()
+    answers: Sequence[str] = ()
     files: Sequence[str] = ()
     parts: Sequence[tuple[str, str]] = field(default=())
     experiment: str = ""
@@ -65,13 +61,11 @@ def read_contents(run: RunFolder) -> Contents:
     experiment = run.path / EXPERIMENT
     text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
     sky_model = f" Sky model: {manifest['sky_model']}." if "sky_model" in manifest else ""
+    found = run.standings()
     tables = [
+        standing_table(found) if found else None,
         _claims(run),
-        _summary(run.path),
-        _comparison(run.path),
-        _realizations(run),
-        *measured.tables(run.path),
-        _signal_loss(run, sky_model),
+        *run.shown,
         _convergence(run.products, sky_model),
         _simulation(run.products),
         _stages(run.products),
@@ -81,12 +75,14 @@ def read_contents(run: RunFolder) -> Contents:
     return Contents(
         title=run.name,
         description=manifest.get("description") or (run.content.get("description", "") if text else ""),
+        setup=manifest.get("setup", ""),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
         warnings=[*excess, *(f"{label}: {text}" for label, text in _warnings(run.products))],
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),
+        answers=answers(found),
         files=_files(run.path),
         parts=_parts(run),
         experiment=text,
@@ -152,121 +148,9 @@ def _claims(run: RunFolder) -> Table | None:
     if not evaluated:
         reasons = [text for item in run.products for text in item.get("notes", {}).get("without_role", [])]
         return Table((), (), CLAIMS_TITLE, " ".join(reasons)) if reasons else None
-    rows = [
-        (
-            claim.section,
-            marked(claim, claim.sentence),
-            claim.quantity,
-            number_measured(claim),
-            claim.threshold,
-            claim.verdict,
-        )
-        for claim in evaluated
-    ]
     others = len(claims) - len(evaluated)
     lacking = f" {others} further claims were not evaluated; claims.md says why." if others else ""
-    columns = ("section", "the paper says", "measured is", "measured", "must be", "verdict")
-    return Table(columns, rows, CLAIMS_TITLE, f"{tally(claims)}.{lacking}")
-
-
-def with_error(value: float | None, error: float | None) -> str:
-    """Write a number with its uncertainty, three digits each."""
-    if value is None:
-        return ""
-    return f"{value:.3g} ± {error:.2g}" if error else f"{value:.3g}"
-
-
-def _read_csv(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def _band(row: Mapping[str, str]) -> str:
-    return f"{float(row['k from [h/Mpc]']):g} to {float(row['k to [h/Mpc]']):g}"
-
-
-def _number(value: float, error: float) -> str:
-    return f"{value:.3f} ± {error:.3f}" if math.isfinite(value) else "no modes"
-
-
-def _signal_loss(run: RunFolder, sky_model: str) -> Table | None:
-    try:
-        outside, inside = (run.tables.transfer_in_bands(region) for region in ("outside-wedge", "inside-wedge"))
-    except InputError:
-        return None
-    rows = [
-        (
-            f"{outside.bin_edges[band]:g} to {outside.bin_edges[band + 1]:g}",
-            _number(outside.transfer[band], outside.transfer_error[band]),
-            _number(outside.squared_coherence[band], outside.squared_coherence_error[band]),
-            _number(inside.transfer[band], inside.transfer_error[band]),
-        )
-        for band in range(outside.k.size)
-    ]
-    note = (
-        "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR. "
-        "The squared coherence of response and EoR is free of the error of the calibration's flux scale; for spectra "
-        "of each baseline with itself it is the fraction of the power that is retained. One standard deviation."
-    )
-    columns = ("k (h/Mpc)", "T outside the wedge", "squared coherence outside", "T inside the wedge")
-    return Table(columns, rows, "Signal loss", note + sky_model)
-
-
-def _summary(folder: Path) -> Table | None:
-    path = folder / "tables" / SUMMARY
-    if not path.is_file():
-        return None
-    rows = [row for row in _read_csv(path) if row["region"] == "outside-wedge"]
-    bands = list(dict.fromkeys(_band(row) for row in rows))
-    points: dict[str, dict[str, str]] = {}
-    for row in rows:
-        points.setdefault(row["point"], {})[_band(row)] = _number(float(row["transfer"]), float(row["transfer error"]))
-    cells = [(point, *(found[band] for band in bands)) for point, found in points.items()]
-    columns = ("point", *(f"k = {band} h/Mpc" for band in bands))
-    return Table(
-        columns, cells, "Signal loss of every point", "T = P^R / P^S outside the wedge, one standard deviation."
-    )
-
-
-def _comparison(folder: Path) -> Table | None:
-    """Return the scores of every calibrator in every world, one row each."""
-    path = folder / "tables" / COMPARISON
-    if not path.is_file():
-        return None
-    rows = _read_csv(path)
-    bands = list(dict.fromkeys((row["k from [h/Mpc]"], row["k to [h/Mpc]"]) for row in rows))
-    cells: dict[tuple[str, str], list[str]] = {}
-    for name in ("transfer", "bias"):
-        for row in rows:
-            cell = with_error(float(row[name]), float(row[f"{name} error"])) if row[name] else "-"
-            cells.setdefault((row["world"], row["calibrator"]), []).append(cell)
-    last = {(row["world"], row["calibrator"]): row["solves"] for row in rows}
-    measured = [f"{symbol}, k = {low} to {high}" for symbol in ("T", "bias") for low, high in bands]
-    note = (
-        "T is the part of the EoR's power that is left, the bias the power of the residual without EoR over that of "
-        "the EoR, both free of the flux scale, outside the wedge, k in h/Mpc, one standard deviation. All numbers are "
-        "in comparison.md and comparison.csv."
-    )
-    columns = ("world", "calibrator", *measured, "solves")
-    return Table(columns, [(*case, *found, last[case]) for case, found in cells.items()], "Calibrators compared", note)
-
-
-def _realizations(run: RunFolder) -> Table | None:
-    """Return the verdicts on the realizations of an experiment."""
-    verdicts = run.verdicts(run.path / "tables" / VERDICTS)
-    rows = [
-        (
-            item.sentence,
-            item.quantity,
-            item.reason or with_error(item.measured, item.uncertainty),
-            item.threshold,
-            item.verdict,
-        )
-        for item in verdicts
-    ]
-    columns = ("wanted", "measured is", "measured", "must be", "verdict")
-    note = "All numbers are in realizations.md and realizations.csv."
-    return Table(columns, rows, "Realizations", note) if rows else None
+    return verdict_table(evaluated, CLAIMS_TITLE, f"{tally(claims)}.{lacking}")
 
 
 def _convergence(products: Sequence[Mapping[str, Any]], sky_model: str) -> Table | None:

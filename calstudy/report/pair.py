@@ -83,5 +83,5 @@ def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -
         (*statement, *(text for pair in zip_longest(*(side or ("", "") for side in sides)) for text in pair))
         for statement, sides in rows.items()
     ]
-    columns = ("section", "the paper says", "measured is", "must be", *names, *(f"verdict, {name}" for name in names))
+    columns = ("section", "sentence", "measured is", "must be", *names, *(f"verdict, {name}" for name in names))
     return Table(columns, cells, CLAIMS_TITLE) if cells else None

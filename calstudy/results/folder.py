@@ -13,14 +13,18 @@ from typing import Any
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.table import Table, from_json
 from calstudy.experiment.files import validate
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import read_mapping
+from calstudy.products import comparison
 from calstudy.results.reader import Tables
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.tables import CLAIMS_JSON, from_json
+from calstudy.verdicts.standing import LIMIT, InBand, standings
+from calstudy.verdicts.tables import CLAIMS_JSON
+from calstudy.verdicts.tables import from_json as verdicts_from_json
 
-MANIFEST, EXPERIMENT = "manifest.json", "experiment.yaml"
+MANIFEST, EXPERIMENT, SHOWN = "manifest.json", "experiment.yaml", "tables.json"
 NO_RUN = "is not the folder of a finished run; give one that 'calstudy run' printed"
 
 
@@ -103,6 +107,12 @@ class RunFolder:
         return Tables((self.path / "tables",))
 
     @property
+    def shown(self) -> list[Table]:
+        """The tables of a report that were made with the products; none in runs of earlier versions."""
+        path = self.path / "tables" / SHOWN
+        return from_json(path.read_text(encoding="utf-8")) if path.is_file() else []
+
+    @property
     def figures(self) -> Path:
         """The folder of the figures; that of a reference is the folder itself."""
         inside = self.path / "figures"
@@ -114,6 +124,29 @@ class RunFolder:
             return {path.stem: _arrays(path) for path in sorted(self.figures.glob("*.npz"))}
         except (OSError, ValueError, KeyError) as error:
             raise InputError(f"{self.path}: its figures cannot be read ({error})") from None
+
+    def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> list[InBand]:
+        """Return how calibrators stand against a limit of the bias, in all or some worlds; empty without comparison."""
+        scores = self._scores
+        for world in worlds or ():
+            if world not in scores:
+                raise InputError(f"{world!r}: no world of the comparison (there are: {', '.join(scores)})")
+        chosen = {world: scores[world] for world in worlds or scores}
+        return standings(chosen, self.manifest.get("refusals", ()), limit)
+
+    @property
+    def _scores(self) -> Mapping[str, Mapping[str, Any]]:
+        """The scores of a comparison by world and calibrator; empty for other runs."""
+        path = self.path / "tables" / comparison.JSON
+        if not path.is_file():
+            return {}
+        try:
+            scores = json.loads(path.read_text(encoding="utf-8"))
+            # Reads all that is needed.
+            standings(scores)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError):
+            raise InputError(f"{path}: is damaged; run the comparison again") from None
+        return scores
 
     @property
     def has_claims(self) -> bool:
@@ -130,7 +163,7 @@ class RunFolder:
         if not path.is_file():
             return []
         try:
-            return from_json(path.read_text(encoding="utf-8"))
+            return verdicts_from_json(path.read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError, KeyError):
             raise InputError(f"{path}: is damaged; {remedy}") from None
 

@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -58,7 +58,7 @@ class Workers:
 
     `count` worker processes are started on this machine; with one, the work is done in this process. They append their
     standard error to the file `log`. `scheduler` is the address of a running dask scheduler whose workers are used
-    instead, or None.
+    instead, or the file in which it has its address, or None.
     """
 
     count: int
@@ -179,9 +179,11 @@ def _client(workers: Workers) -> Iterator[Client]:
         return
     from distributed import Client
 
+    path = Path(workers.scheduler)
+    address = {"scheduler_file": str(path)} if path.is_file() else {"address": workers.scheduler}
     try:
-        client = Client(workers.scheduler, timeout="20 s")
-    except (OSError, ValueError) as error:
+        client = Client(**address, timeout="20 s")
+    except (OSError, ValueError, KeyError) as error:
         raise InputError(f"--scheduler {workers.scheduler}: cannot connect ({error})") from None
     with client:
         yield client
@@ -192,7 +194,7 @@ def _announce_and_perform(order: WorkOrder) -> Product:
     from distributed import get_worker
 
     worker = get_worker()
-    worker.log_event(BEGUN, {"worker": worker.address, "product": f"{order.stage.name} ({order.label})"})
+    worker.log_event(BEGUN, {"worker": worker.address, "product": order.name})
     return perform(order, lambda text: worker.log_event(WAITS, text))
 
 
@@ -339,18 +341,6 @@ def _all_tasks(targets: Iterable[Task]) -> list[Task]:
             found[id(task)] = task
             waiting += task.needs.values()
     return list(found.values())
-
-
-def drop(tasks: Iterable[Task], store: Store) -> None:
-    """Remove existing products of tasks that were made as temporary ones.
-
-    Products that another run made to be kept stay, and so does everything in a read-only store.
-    """
-    for task in tasks:
-        product = store.find(task.stage.name, task.key)
-        if product is not None and product.record.get("temporary"):
-            with suppress(OSError):
-                store.discard(task.stage.name, task.key)
 
 
 def largest_disk(targets: Iterable[Task], todo: Sequence[Task]) -> float:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
@@ -16,7 +15,7 @@ from calstudy.base.resources import Usage
 from calstudy.base.schema import plain
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, processor
 from calstudy.run.store import Product, Store
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Task
 
 logger = logging.getLogger(__name__)
 
@@ -25,28 +24,23 @@ logger = logging.getLogger(__name__)
 class WorkOrder:
     """A task without the tasks behind it, as sent to a worker."""
 
-    stage: Stage
+    task: Task
     key: str
-    label: str
-    settings: Mapping[str, Any]
     inputs: Mapping[str, tuple[str, str]]
     store: Path
-    temporary: bool
     again: bool
 
     @classmethod
     def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
         """Return the order for `task`; with `again`, its product is made even if it exists."""
-        return cls(
-            stage=task.stage,
-            key=task.key,
-            label=task.label,
-            settings=task.settings,
-            inputs={name: (needed.stage.name, needed.key) for name, needed in task.needs.items()},
-            store=store.root,
-            temporary=task.temporary,
-            again=again,
-        )
+        inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
+        bare = task.given({name: name for name in inputs})
+        return cls(task=bare, key=task.key, inputs=inputs, store=store.root, again=again)
+
+    @property
+    def name(self) -> str:
+        """The stage and the label of the product."""
+        return f"{self.task.stage.name} ({self.task.label})"
 
 
 def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> Product:
@@ -58,24 +52,24 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
     store = Store(order.store)
     if not store.root.is_dir():
         raise InputError(
-            f"outputs.store = {str(store.root)!r}: {order.stage.name} ({order.label}): the worker on "
+            f"outputs.store = {str(store.root)!r}: {order.name}: the worker on "
             f"{socket.gethostname()} has no such folder; all workers must see the store under this path"
         )
     try:
-        with store.lock(order.stage.name, order.key, told):
-            existing = None if order.again else store.verify(order.stage.name, order.key)
+        with store.lock(order.task.stage.name, order.key, told):
+            existing = None if order.again else store.verify(order.task.stage.name, order.key)
             return existing if existing is not None else _make(order, store)
     except InputError:
         raise
     except SystemExit as error:
         # It would end the thread of the worker silently, and the run would wait for it forever.
-        raise RuntimeError(f"{order.stage.name} ({order.label}): the process was told to exit") from error
+        raise RuntimeError(f"{order.name}: the process was told to exit") from error
     except (OSError, RuntimeError) as error:
         reason = _unwritable(error, store.root)
         if reason is None:
             raise
         raise DiskError(
-            f"outputs.store = {str(store.root)!r}: {order.stage.name} ({order.label}) could not be written ({reason}); "
+            f"outputs.store = {str(store.root)!r}: {order.name} could not be written ({reason}); "
             "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
         ) from None
 
@@ -95,30 +89,29 @@ def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Product]:
     damaged = [f"{order.inputs[name][0]}/{order.inputs[name][1]}" for name, found in products.items() if found is None]
     if damaged:
         raise InputError(
-            f"{order.stage.name} ({order.label}): its input {damaged[0]} was removed or damaged while the run was "
+            f"{order.name}: its input {damaged[0]} was removed or damaged while the run was "
             "going on; run again to rebuild it"
         )
     return {name: product for name, product in products.items() if product is not None}
 
 
 def _make(order: WorkOrder, store: Store) -> Product:
-    inputs = _verified_inputs(order, store)
+    task, inputs = order.task, _verified_inputs(order, store)
     started = datetime.now(UTC)
     logging.captureWarnings(True)
-    with store.building(order.stage.name, order.key) as folder:
+    with store.building(task.stage.name, order.key) as folder:
         with Usage() as usage:
-            paths = {name: product.path for name, product in inputs.items()}
-            notes = order.stage.make(Job(settings=order.settings, inputs=paths, output=folder))
-        own = made_with(order.stage.make, order.settings)
+            notes = task.given({name: product.path for name, product in inputs.items()}).make(folder)
+        own = made_with(task)
         record = {
-            "stage": order.stage.name,
-            "stage_version": order.stage.version,
+            "stage": task.stage.name,
+            "stage_version": task.stage.version,
             "key": order.key,
-            "label": order.label,
-            "settings": plain(order.settings),
+            "label": task.label,
+            "settings": plain(task.settings),
             "inputs": order.inputs,
             "notes": notes,
-            "temporary": order.temporary,
+            "temporary": task.temporary,
             "calstudy": __version__,
             "made_with": own,
             "lineage": lineage(own, [product.record["lineage"] for product in inputs.values()]),

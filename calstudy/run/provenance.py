@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import subprocess
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -65,12 +65,12 @@ def _version(package: str) -> str | None:
         return _version("tensorflow-cpu") if package == "tensorflow" else None
 
 
-def made_with(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the digest of the source of a stage, and the versions and data files of the packages that it uses.
+def made_with(task: Task) -> dict[str, Any]:
+    """Return the digest of the source of a product, and the versions and data files of the packages that it uses.
 
     Together with its key they determine a product.
     """
-    source = source_of(make, settings)
+    source = source_of(type(task), task.settings)
     versions = {name: _version(name) for name in PACKAGES if IMPORTED_AS.get(name, name) in source.packages}
     files = {f"{file.package}/{file.name}": _digest_of(file) for file in sorted(source.files)}
     return {"source": source.digest, "versions": versions, "files": files}
@@ -100,7 +100,7 @@ def lineages(tasks: Iterable[Task]) -> dict[str, str]:
     found: dict[str, str] = {}
     for task in tasks:
         needs = [found[needed.key] for needed in task.needs.values()]
-        found[task.key] = lineage(made_with(task.stage.make, task.settings), needs)
+        found[task.key] = lineage(made_with(task), needs)
     return found
 
 

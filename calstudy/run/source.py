@@ -2,9 +2,9 @@
 
 A definition is a function, a class or an assignment at the top of a module. Whole modules would be too coarse: through
 the schema of experiment files the module of a stage imports a hundred others, while ``difference`` reaches nine
-definitions and ``simulate-chunk`` about three hundred. From the function that makes a product and from the classes of
-its settings, which include its plug-ins, names are followed from definition to definition through the imports of
-calstudy.
+definitions and ``simulate-chunk`` about three hundred. From the class of a product and from the classes of its
+settings, which include its plug-ins, names are followed from definition to definition through the imports of
+calstudy. Of a kind of product the estimate of the cost is left out, and what all tasks have in common.
 
 A digest does not depend on docstrings, comments, layout, annotations of functions, the order of definitions, or the
 module that contains a definition. It is the same for all versions of Python that calstudy supports.
@@ -30,13 +30,15 @@ from calstudy.base.files import replacing
 from calstudy.base.identity import digest_json
 from calstudy.base.package_files import PackageFile
 from calstudy.base.plugins import FILE_MODULE
-from calstudy.run.task import Stage
+from calstudy.run.task import Task
 
 PACKAGE = __name__.partition(".")[0]
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 UNREAD = {"ctx", "kind", "returns", "type_comment", "type_params"}
 """Fields of syntax trees that have no effect on a definition."""
+PLANNED = ("_cost", "task", "shown")
+"""Methods of a kind of product that have no effect on it."""
 EFFECTS = ""
 """Name of the statements of a module that define nothing, such as a call; each definition of the module needs them."""
 
@@ -151,7 +153,9 @@ def _reach(root: Address) -> frozenset[Address]:
     while waiting:
         address = waiting.pop()
         module = _module(address[0])
-        if address in found or module is None or address[1] not in module.statements.keys() | module.imports.keys():
+        if address in found or module is None or address[0] == Task.__module__:
+            continue
+        if address[1] not in module.statements.keys() | module.imports.keys():
             continue
         found.add(address)
         waiting += [(address[0], EFFECTS), *_definition(address).needs]
@@ -173,6 +177,8 @@ def _module(name: str) -> _Module | None:
     module = _Module()
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for statement in tree.body:
+        if isinstance(statement, ast.ClassDef) and any(item.arg == "stage" for item in statement.keywords):
+            statement.body = [item for item in statement.body if getattr(item, "name", "") not in PLANNED]
         for defined in _defined(statement):
             module.statements.setdefault(defined, []).append(statement)
     for imported, target in _imports(tree):
@@ -198,8 +204,6 @@ def _defined(statement: ast.stmt) -> set[str]:
     if isinstance(statement, ast.Import | ast.ImportFrom) or _for_types(statement) or _is_text(statement):
         return set()
     if isinstance(statement, ast.Assign | ast.AnnAssign):
-        if _calls(statement.value, Stage):
-            return set()  # The output of another stage is read as a product, which has its own source.
         targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
         return {node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)}
     return {EFFECTS}

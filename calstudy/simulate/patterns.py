@@ -10,7 +10,7 @@ from pyuvdata import BeamInterface, UVBeam
 from pyuvdata.analytic_beam import AnalyticBeam
 
 from calstudy.base.errors import InputError
-from calstudy.instrument.splines import bspline_coefficients, cells, spline_fields
+from calstudy.instrument.beam_grid import bspline_coefficients, cells, spline_fields
 
 # Pixels by which pyuvdata extends a beam in azimuth so that its splines see it wrap.
 AZIMUTH_EXTENSION = 3

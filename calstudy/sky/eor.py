@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from functools import cached_property
+from io import StringIO
+from pathlib import Path
 
 import healpy
 import numpy as np
@@ -12,6 +14,7 @@ from pyradiosky import SkyModel
 from scipy.interpolate import CubicSpline
 
 from calstudy.base.constants import HYDROGEN_LINE
+from calstudy.base.errors import InputError
 from calstudy.sky.settings import Eor
 
 # Nodes of the radial wavenumber integral: per logarithmic interval near zero, per channel beyond.
@@ -25,8 +28,8 @@ class EorField:
     """A Gaussian random sky of known P(k), computed for any subset of the channels.
 
     The flat spectrum is one independent normal number per pixel and channel with variance σ²(ν) = P / V(ν), where V is
-    the comoving volume of the voxel (paper §Simulations; Mpc without h). A power law is correlated between channels;
-    see `channel_covariance`.
+    the comoving volume of the voxel (paper §Simulations; Mpc without h). A power law, or a table, is correlated between
+    channels; see `channel_covariance`.
 
     The field is not smoothed over the channel (P is white up to the Nyquist wavenumber of the channel spacing) nor over
     the pixel (maps are samples at pixel centres, band-limited at ℓ = 3 nside − 1 for the power law). A delay spectrum
@@ -45,7 +48,7 @@ class EorField:
         spacing = np.diff(frequencies)
         if not len(spacing) or spacing.min() <= 0 or np.ptp(spacing) > 1e-6 * spacing.mean():
             raise ValueError("frequencies: an EoR field needs at least two channels, equally spaced and increasing")
-        self.settings = settings
+        self.settings, self._hubble = settings, float(cosmology.h)
         self.frequencies = frequencies
         self.distance, self.depth = comoving_geometry(frequencies, float(spacing.mean()), cosmology)
 
@@ -121,7 +124,7 @@ class EorField:
         return harmonics
 
     def channel_covariance(self, ell: int) -> np.ndarray:
-        """Return C_ℓ(ν, ν') of a power-law spectrum in K² sr, (Nfreqs, Nfreqs).
+        """Return C_ℓ(ν, ν') of a spectrum that is not flat in K² sr, (Nfreqs, Nfreqs).
 
         In the flat-sky limit, with the line of sight in units of channels (κ = k_∥ Δr(ν), |κ| < π),
 
@@ -148,10 +151,41 @@ class EorField:
         """Return F, (Nfreqs, 2 Nnodes), with C_ℓ = F Fᵀ: a cosine and a sine wave per quadrature node."""
         phase, weight = _phase_quadrature(len(self.frequencies))
         wavenumber = np.hypot(phase / self.depth[:, None], (ell + 0.5) / self.distance[:, None])
-        power = self.settings.amplitude * (wavenumber / self.settings.pivot_k) ** self.settings.index
+        power = input_power(self.settings, wavenumber, self._hubble)
         amplitude = np.sqrt(power * weight) / (self.distance * np.sqrt(self.depth))[:, None]
         turns = np.arange(len(self.frequencies))[:, None] * phase
         return np.concatenate([amplitude * np.cos(turns), amplitude * np.sin(turns)], axis=1)
+
+
+def input_power(settings: Eor, k: np.ndarray, hubble: float) -> np.ndarray:
+    """Return the P(k) that is put in, in K² Mpc³ without h, at wavenumbers `k` in 1/Mpc, of any shape.
+
+    `hubble` is h, in which the units of tables are. Raises InputError if a table cannot be used.
+    """
+    k = np.asarray(k, dtype=float)
+    if settings.path is not None:
+        known, power = read_power_table(settings.path)
+        return 1e-6 / hubble**3 * np.exp(np.interp(np.log(k / hubble), np.log(known), np.log(power)))
+    index = settings.index if settings.spectrum == "power-law" else 0.0
+    return settings.amplitude * (k / settings.pivot_k) ** index
+
+
+def read_power_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return k and P(k) of a text file with two columns, separated by commas or blanks; lines with # are comments.
+
+    Raises InputError if it cannot be read, or numbers are not positive, or k does not increase.
+    """
+    try:
+        text = path.read_text(encoding="utf-8").replace(",", " ")
+        found = np.loadtxt(StringIO(text), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"sky.eor.path = {str(path)!r}: cannot be read as a table of numbers ({error})") from None
+    if found.shape[0] < 2 or found.shape[1] != 2:
+        rows, columns = found.shape
+        raise InputError(f"sky.eor.path = {str(path)!r}: needs two columns and two rows, has {columns} and {rows}")
+    if not (np.isfinite(found).all() and (found > 0).all() and (np.diff(found[:, 0]) > 0).all()):
+        raise InputError(f"sky.eor.path = {str(path)!r}: k and P(k) must be positive, and k must increase")
+    return found[:, 0], found[:, 1]
 
 
 def comoving_geometry(

@@ -226,19 +226,27 @@ Diffuse = Annotated[HaslamMap | SyntheticDiffuse | NoDiffuse, choice("kind")]
 class Eor(Section):
     """Gaussian random 21 cm brightness with a known power spectrum, as one HEALPix map per channel."""
 
-    spectrum: Literal["flat", "power-law"] = "flat"
+    spectrum: Literal["flat", "power-law", "table"] = "flat"
     amplitude: PowerDensity = Field(
         12482.356, gt=0, description="P(k), or P at `pivot_k` for a power law (paper §Simulations)."
     )
     index: float = Field(0.0, ge=-3.5, le=1.0, description="P(k) = amplitude (k / pivot)^index; only for a power law.")
     pivot_k: float = Field(0.1, gt=0, description="Pivot of the power law, in 1/Mpc (no h).")
+    path: Path | None = Field(
+        None,
+        strict=False,
+        description="For spectrum: table, a text file with k in h/Mpc and P(k) in mK^2 h^-3 Mpc^3 in two columns, for "
+        "the redshift of the data. P is a power law between two k, and constant beyond the first and the last.",
+    )
     nside: Literal[16, 32, 64, 128, 256] = Field(256, description="HEALPix resolution.")
     seed: int = Field(2, ge=0, description="Seed of the maps.")
 
     @model_validator(mode="after")
-    def _index_is_used(self) -> Eor:
-        if self.index and self.spectrum == "flat":
-            raise fault("index", f"{self.index:g} has no effect with spectrum: flat; use spectrum: power-law")
+    def _fields_are_used(self) -> Eor:
+        if self.index and self.spectrum != "power-law":
+            raise fault("index", f"{self.index:g} has no effect with spectrum: {self.spectrum}; use power-law")
+        if (self.path is None) == (self.spectrum == "table"):
+            raise fault("path", "is needed with spectrum: table, and has no effect with others")
         return self
 
 

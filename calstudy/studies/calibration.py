@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,9 +27,11 @@ from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
+from calstudy.products.expected_loss import TRANSFER, expected_transfer
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, read_json
-from calstudy.products.observed import DataGraph, calibrated, observed, read_part
-from calstudy.products.observed_quality import QUALITY, TRANSFER, expected_transfer, quality
+from calstudy.products.graph import MeasuredGraph
+from calstudy.products.observed import calibrated, observed
+from calstudy.products.observed_results import QUALITY, quality
 from calstudy.realdata.halves import WHOLE, Facts, Parts, modelled, read_facts
 from calstudy.realdata.interference import require_surroundings
 from calstudy.realdata.settings import DataSettings, with_defaults
@@ -150,11 +152,11 @@ class CalibrationFile(DataFile):
 
 
 class DataCalibration(DataStudy):
-    """The calibration of all data of a file together, in their own unit."""
+    """The calibration of all data together, in their own unit."""
 
     def __init__(self, file: CalibrationFile, data: Parts) -> None:
         super().__init__(file, data)
-        self.graph = DataGraph(file.observed, file.calibration, data)
+        self.graph = MeasuredGraph(file, data)
 
     @classmethod
     def load(cls, file: StudyFile) -> DataCalibration:
@@ -162,7 +164,7 @@ class DataCalibration(DataStudy):
         content = read_file(CalibrationFile, file)
         if content.expected_loss and not isinstance(content.calibration, GainFit):
             label = content.calibration.label
-            raise InputError(f"--expected-loss: is known for fits by least squares, and {label} is none")
+            raise InputError(f"expected_loss: is known for fits by least squares, and {label} is none")
         return cls(content, Parts({WHOLE: read_selected(content, content.observed.data, even=False)}))
 
     @property
@@ -202,7 +204,7 @@ class DataCalibration(DataStudy):
         from calstudy.base.observation import Observation
         from calstudy.calibrate.weights import conspicuous
 
-        data, _, notes = read_part(observed(self.graph, WHOLE).settings)
+        data, _, notes = observed(self.graph, WHOLE).read()
         if self.start is not None:
             read_gains(self.start, "calibration.initial_gains.path")
         return [*notes, *conspicuous(Observation(data))]
@@ -269,13 +271,20 @@ class DataCalibration(DataStudy):
         }
 
 
+def calibration_file(sections: Mapping[str, Any], output: Path, overrides: Sequence[str] = ()) -> StudyFile:
+    """Return the content of a `CalibrationFile` for a folder of results; paths start at the working directory."""
+    outputs = {"store": str(output / UNFINISHED), "runs": str(output)}
+    content = {"name": "calibration", **sections, "outputs": outputs}
+    return StudyFile(Path("calibration.yaml"), content, overrides=list(overrides))
+
+
 def require_free(output: Path, overwrite: bool) -> None:
     """Raise InputError if a folder cannot be written, or has results of a calibration that may not be replaced."""
     if output.exists() and not output.is_dir():
-        raise InputError(f"--output {output}: is a file, not a folder")
+        raise InputError(f"output = {output}: is a file, not a folder")
     names = (GAINS, CALFITS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
     present = [name for name in names if (output / name).exists()]
     present += [path.name for path in sorted(output.glob(f"{TRANSFER}.*.h5"))]
     if present and not overwrite:
-        raise InputError(f"--output {output}: holds {', '.join(present)} already; use --overwrite or another folder")
-    require_writable(output.absolute(), f"--output {output}")
+        raise InputError(f"output = {output}: holds {', '.join(present)} already; use `overwrite` or another folder")
+    require_writable(output.absolute(), f"output = {output}")

@@ -14,10 +14,10 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_me
 from calstudy.calibrate.interface import Calibrator
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.instrument.size import Size
-from calstudy.products.calibration import CALIBRATE_CHUNK
-from calstudy.products.simulation import SIMULATE_CHUNK
+from calstudy.products.calibration import CalibrateChunk
+from calstudy.products.simulation import SimulateChunk
 from calstudy.run.store import Store
-from calstudy.run.task import Stage, Task
+from calstudy.run.task import Task
 from calstudy.studies.study import Budget
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
@@ -133,9 +133,9 @@ class _Work(Generic[File]):
     def missing(self) -> Sequence[Task]:
         return _missing(self.targets(self.file), self.file.outputs.store)
 
-    def largest(self, stage: Stage) -> float:
-        """Return the memory of the largest missing product of a stage; zero if none is missing."""
-        return max((task.cost.memory for task in self.missing if task.stage is stage), default=0.0)
+    def largest(self, kind: type[Task]) -> float:
+        """Return the memory of the largest missing product of a kind; zero if none is missing."""
+        return max((task.cost.memory for task in self.missing if isinstance(task, kind)), default=0.0)
 
     def changed(self, **sections: Any) -> Self:
         return replace(self, file=self.file.model_copy(update=sections))
@@ -143,13 +143,13 @@ class _Work(Generic[File]):
 
 def _cut(work: _Work[File], share: float) -> _Work[File]:
     """Double the number of simulation chunks until each needs no more than its share, or they are single channels."""
-    while isinstance(work.file, Experiment) and (largest := work.largest(SIMULATE_CHUNK)) > share:
+    while isinstance(work.file, Experiment) and (largest := work.largest(SimulateChunk)) > share:
         simulation, channels = work.file.simulation, work.file.instrument.channels.count
         if simulation.chunks >= channels:
             break
         chunks = min(2 * simulation.chunks, channels)
         finer = work.changed(simulation=simulation.model_copy(update={"chunks": chunks}))
-        if finer.largest(SIMULATE_CHUNK) > 0.95 * largest:
+        if finer.largest(SimulateChunk) > 0.95 * largest:
             break  # The sky itself takes the rest.
         work = finer
     return work
@@ -157,7 +157,7 @@ def _cut(work: _Work[File], share: float) -> _Work[File]:
 
 def _stream(work: _Work[File], share: float) -> _Work[File]:
     """Let the calibrator use less memory until a solve needs no more than its share."""
-    while work.largest(CALIBRATE_CHUNK) > share:
+    while work.largest(CalibrateChunk) > share:
         calibration = work.file.calibration
         with guarded(calibration):
             leaner = calibration.with_less_memory()

@@ -28,8 +28,12 @@ LONG_AVERAGE = 15.0
 
 
 def require_possible(experiment: Experiment) -> None:
-    """Raise InputError if a beam cannot be made, or an effect or the calibrator refuses the data."""
+    """Raise InputError if a beam or the EoR cannot be made, or an effect or the calibrator refuses the data."""
     require_beams(experiment.instrument)
+    if experiment.sky.eor.path is not None:
+        from calstudy.sky.eor import read_power_table
+
+        read_power_table(experiment.sky.eor.path)
     require_usable(experiment.corruption.effects, Size.of(experiment.instrument))
     require_calibration(experiment)
 

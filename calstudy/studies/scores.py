@@ -33,6 +33,7 @@ from calstudy.studies.export import Contents
 from calstudy.studies.folder import log_to
 from calstudy.studies.kinds.comparison import Comparison
 from calstudy.studies.study import Budget, make
+from calstudy.verdicts.standing import standing_table, standings
 
 LOG = "score.log"
 VERIFIED = "verified.txt"
@@ -171,12 +172,11 @@ def _require_label(label: str) -> None:
 
 
 def tables(scores: Scores) -> dict[str, Table]:
-    """Return a table for each world, as in the comparison of calibrators."""
+    """Return a table for each world, as in the comparison of calibrators, and one of which calibrators pass."""
     worlds = dict.fromkeys(row.world for row in scores.rows)
-    return {
-        world: score_table({row.calibrator: row.scores for row in scores.rows if row.world == world})
-        for world in worlds
-    }
+    found = {world: {row.calibrator: row.scores for row in scores.rows if row.world == world} for world in worlds}
+    trusted = standing_table(standings(found, scores.refusals))
+    return {**{world: score_table(cases) for world, cases in found.items()}, trusted.title: trusted}
 
 
 def read_scores(path: Path) -> Scores:

@@ -20,6 +20,7 @@ from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.study import Budget, Run, Study, said_of_other_code
+from calstudy.verdicts.standing import answers, standing_table
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_MARKDOWN, measured, tally
 
 NAMED = 8
@@ -71,6 +72,7 @@ def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[st
         notes.insert(0, f"--max-memory {budget.max_memory} is more than this machine has")
     return {
         "name": study.name,
+        "setup": study.setup,
         "workers": workers,
         "stages": stages,
         "seconds": sum(task.cost.seconds for task in plan.todo),
@@ -105,6 +107,8 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
             _gigabytes(row["disk"]) if made else "-",
         )
     console.print(table)
+    if plan["setup"]:
+        console.print(plan["setup"], markup=False)
     for product in plan["damaged"]:
         console.print(f"damaged, will be made again: {product}", markup=False)
     for sentence in plan["other_code"]:
@@ -123,7 +127,7 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
 
 def sites(tasks: Sequence[Task]) -> list[str]:
     """Name the sites of the arrays of simulations, once each."""
-    from calstudy.instrument.sites import describe
+    from calstudy.instrument.layouts import describe
 
     instruments = [task.settings["instrument"] for task in tasks if "instrument" in task.settings]
     return list(dict.fromkeys(describe(found.site) for found in instruments))
@@ -175,6 +179,7 @@ def _show_products(run: Run, console: Console) -> None:
     for warning in run.warnings:
         console.print(f"warning: {warning}", markup=False)
     _show_signal(run.folder, console)
+    _show_answer(run.folder, console)
     for figure in sorted((run.folder / "figures").glob("*.png")):
         console.print(f"figure: {figure}", markup=False)
     if (run.folder / "tables").is_dir():
@@ -185,14 +190,29 @@ def _show_products(run: Run, console: Console) -> None:
 
 
 def _show_signal(folder: Path, console: Console) -> None:
-    """Print T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
-    signal = read_signal(RunFolder(folder))
+    """Print what was calibrated, T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
+    run = RunFolder(folder)
+    if "setup" in run.manifest:
+        console.print(run.manifest["setup"], markup=False)
+    signal = read_signal(run)
     if signal is None:
         return
     numbers = ", ".join(f"{number.name} {number.text}" for number in signal.numbers)
     console.print(f"{PLACE}: {numbers}", markup=False)
     if signal.excess is not None:
         console.print(f"warning: {signal.excess}", markup=False)
+
+
+def _show_answer(folder: Path, console: Console) -> None:
+    """Print which calibrators of a comparison pass; nothing for other runs."""
+    found = RunFolder(folder).standings()
+    if not found:
+        return
+    table = standing_table(found)
+    table.show(console, numbers=False)
+    console.print(table.note, markup=False)
+    for sentence in answers(found):
+        console.print(sentence, markup=False)
 
 
 def _show_criteria(folder: Path, console: Console) -> None:

@@ -6,7 +6,7 @@ import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,10 +17,13 @@ from rich.console import Console
 from calstudy.base.identity import digest_json
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
+from calstudy.base.table import to_json
 from calstudy.experiment.files import StudyFile, dump
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
-from calstudy.run.execution import Lifetimes, Schedule, Workers, drop, execute, found_of, schedule
+from calstudy.results.folder import SHOWN
+from calstudy.run.execution import Lifetimes, Schedule, Workers, execute, found_of, schedule
+from calstudy.run.leases import Lease
 from calstudy.run.progress import report
 from calstudy.run.provenance import of_other_code, other_code
 from calstudy.run.store import Product, Store
@@ -210,6 +213,11 @@ class Study(ABC):
         return {}
 
     @property
+    def setup(self) -> str:
+        """What is calibrated, and how, in one line; empty if it is not the same for all parts."""
+        return ""
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes of a plan on settings that are probably a mistake, of the study and its parts, once each."""
         return tuple(dict.fromkeys(note for part in self.parts.values() for note in part.notes))
@@ -260,6 +268,8 @@ class Study(ABC):
         publish([made.products[task.key] for task in self.figures], self.folder / "figures")
         if self.tables:
             publish([made.products[task.key] for task in self.tables], self.folder / "tables")
+            shown = [table for task in self.tables for table in task.shown(made.products[task.key].path)]
+            write(self.folder / "tables" / SHOWN, to_json(shown))
         if self.claims is not None:
             publish([made.products[self.claims.key]], self.folder)
         for name, text in self.texts.items():
@@ -268,6 +278,7 @@ class Study(ABC):
         places = {name: os.path.relpath(part.folder, self.folder) for name, part in self.parts.items()}
         entries = {
             "description": self.description,
+            **({"setup": self.setup} if self.setup else {}),
             "stand_ins": list(self.stand_ins),
             "captions": {task.label: task.settings["figure"].caption for task in self.figures},
             **({"parts": places} if places else {}),
@@ -306,7 +317,18 @@ def make(
     InputError
         If the store must be written and cannot be, or a stage refuses its input.
     """
-    plan = schedule(targets, store, strict=strict)
+    lease = Lease(store)
+    if targets and not store.root.exists():
+        store.prepare()
+    # A store that cannot be written is not changed.
+    is_shared = os.access(store.root, os.W_OK)
+    with lease.holding(task.key for task in unique(targets)) if is_shared else nullcontext():
+        return _make_missing(schedule(targets, store, strict=strict), targets, lease, store, workers, console)
+
+
+def _make_missing(
+    plan: Schedule, targets: Sequence[Task], lease: Lease, store: Store, workers: Workers, console: Console
+) -> RunProducts:
     if plan.todo:
         store.prepare()
     messages = [
@@ -317,14 +339,14 @@ def make(
         logger.warning(message)
         console.print(message, markup=False)
     lifetimes = Lifetimes(targets, plan.todo)
-    drop(lifetimes.unused(), store)
+    lease.drop(lifetimes.unused())
     costs = {task.key: task.cost.seconds for task in plan.todo}
     with report(plan.todo, costs, workers.count, console) as show:
 
         def done(task: Task, product: Product) -> None:
             logger.info("%s (%s): %.1f s", task.stage.name, task.label, product.record["seconds"])
             show(task, product)
-            drop(lifetimes.after(task), store)
+            lease.drop(lifetimes.after(task))
 
         def told(text: str) -> None:
             logger.warning(text)

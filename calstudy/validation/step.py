@@ -27,11 +27,11 @@ from calstudy.experiment.model import Experiment
 from calstudy.power.drawn import input_power
 from calstudy.power.spectra import DelaySpectra
 from calstudy.products.corruption import LEVELS
-from calstudy.products.files import read_json, write_json
+from calstudy.products.files import json_number, read_json, write_json
 from calstudy.products.graph import Graph
 from calstudy.products.spectra import read_delay_spectra
 from calstudy.results.reader import Tables
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
 from calstudy.verdicts.statement import Statement, Unevaluated
 
@@ -208,47 +208,51 @@ def inputs_of(step: Step, experiment: Experiment) -> Mapping[str, Task]:
 
 def step_task(step: Step, experiments: Mapping[str, Experiment]) -> Task:
     """Return the task that measures a step; raises InputError if an experiment lacks a product."""
-    settings = {
-        "measurement": step,
-        "version": step.version,
-        "experiments": {
+    return Validate(
+        f"step {step.number}",
+        measurement=step,
+        version=step.version,
+        experiments={
             name: {section: getattr(experiment, section) for section in step.sections}
             for name, experiment in experiments.items()
         },
-    }
-    inputs = {
-        f"{name}:{product}": task
-        for name, experiment in experiments.items()
-        for product, task in inputs_of(step, experiment).items()
-    }
-    return Task(VALIDATE, f"step {step.number}", settings, inputs)
+        products={
+            f"{name}:{product}": task
+            for name, experiment in experiments.items()
+            for product, task in inputs_of(step, experiment).items()
+        },
+    )
 
 
-def measure(job: Job) -> Mapping[str, Any]:
-    """Write the numbers of a step to measurement.json, with its figures and tables.
+class Validate(Task, stage="validate", version=4):
+    """The numbers of a step, measured on the sections of its experiments and their products."""
 
-    Raises InputError if a user's own step fails, or does not return Findings.
-    """
-    step: Step = job.settings["measurement"]
-    runs = {}
-    for name, sections in job.settings["experiments"].items():
-        products = {key.partition(":")[2]: path for key, path in job.inputs.items() if key.startswith(f"{name}:")}
-        experiment = cast(Experiment, SimpleNamespace(name=name, **sections))
-        runs[name] = StepInput(tuple(products.values()), experiment, products)
-    with guarded(step):
-        found = step.measure(runs, job.output)
-    if not isinstance(found, Findings):
-        raise InputError(f"{step.label}: its measure returned a {type(found).__name__}, expected Findings")
-    findings = {
-        name: {"value": _json(finding.value), "uncertainty": _json(finding.uncertainty)}
-        for name, finding in found.values.items()
-    }
-    write_json(job.output / FINDINGS, {"findings": findings, "remarks": list(found.remarks)})
-    return {"findings": findings}
+    measurement: Step
+    version: int
+    experiments: Mapping[str, Mapping[str, Any]]
+    products: Inputs
 
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the numbers to measurement.json, with the figures and tables of the step.
 
-def _json(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+        Raises InputError if a user's own step fails, or does not return Findings.
+        """
+        step, runs = self.measurement, {}
+        for name, sections in self.experiments.items():
+            start = f"{name}:"
+            products = {key.removeprefix(start): path for key, path in self.products.items() if key.startswith(start)}
+            experiment = cast(Experiment, SimpleNamespace(name=name, **sections))
+            runs[name] = StepInput(tuple(products.values()), experiment, products)
+        with guarded(step):
+            found = step.measure(runs, output)
+        if not isinstance(found, Findings):
+            raise InputError(f"{step.label}: its measure returned a {type(found).__name__}, expected Findings")
+        findings = {
+            name: {"value": json_number(finding.value), "uncertainty": json_number(finding.uncertainty)}
+            for name, finding in found.values.items()
+        }
+        write_json(output / FINDINGS, {"findings": findings, "remarks": list(found.remarks)})
+        return {"findings": findings}
 
-
-VALIDATE = Stage(name="validate", version=4, make=measure, cost=lambda task: Cost(60, 3e9, 1e6))
+    def _cost(self) -> Cost:
+        return Cost(60, 3e9, 1e6)

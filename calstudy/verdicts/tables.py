@@ -92,6 +92,16 @@ def to_markdown(
     return "\n".join(lines)
 
 
+def verdict_table(verdicts: Sequence[Verdict], title: str, note: str) -> Table:
+    """Return verdicts as a table of a report."""
+    columns = ("section", "sentence", "measured is", "measured", "must be", "verdict")
+    rows = [
+        (item.section, marked(item, item.sentence), item.quantity, measured(item), item.threshold, item.verdict)
+        for item in verdicts
+    ]
+    return Table(columns, rows, title, note)
+
+
 def _cells(verdict: Verdict) -> tuple[str, ...]:
     runs = f"; {', '.join(verdict.runs)}" if verdict.runs else ""
     number_and_quantity = f"**{measured(verdict)}** ({verdict.quantity}{runs})"

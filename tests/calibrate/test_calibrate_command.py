@@ -13,6 +13,8 @@ import pytest
 from pyuvdata import UVCal, UVData
 from test_calamity import make_uvdata
 
+import calstudy
+from calstudy.base.errors import InputError
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
 from calstudy.power.tables import load_spectrum
@@ -223,3 +225,20 @@ def test_a_settings_file_is_stronger_than_the_defaults_for_measured_data(command
     assert found["prior"] == ("none" if "prior" in text else "gains")
     assert found["solver"]["max_steps"] == (7 if "solver" in text else usual["solver"]["max_steps"])
     assert found["solver"]["tolerance"] == 1e-4
+
+
+def test_python_calibrates_as_the_command_does(data, command, tmp_path, monkeypatch):
+    command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
+    monkeypatch.chdir(tmp_path)
+    basis = {"basis.buffer": "50 ns", "basis.min_delay": "50 ns"}
+    found = calstudy.calibrate_data(data, "again", {"select": {"times": "0..0"}}, quiet=True, **basis)
+    expected = UVCal.from_file(tmp_path / "out" / "gains.calh5")
+    # Compiled code and threads add in another order.
+    np.testing.assert_allclose(found.gains.gain_array, expected.gain_array, rtol=1e-6)
+    assert list(found.solves.status) == ["converged"]
+    assert found.model.Ntimes == found.residual.Ntimes == 1
+    assert "1 converged" in repr(found)
+    with pytest.raises(InputError, match=r"output = again: holds gains\.calh5"):
+        calstudy.calibrate_data(data, "again")
+    with pytest.raises(InputError, match=r"calibration\.bsis"):
+        calstudy.calibrate_data(data, "other", **{"bsis.buffer": "50 ns"})

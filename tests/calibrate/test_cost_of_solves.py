@@ -16,9 +16,9 @@ from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibration, Calibrator, Solve
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
+from calstudy.products.calibration import read_result
 from calstudy.products.comparison import score_table
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, write_json, write_visibilities
-from calstudy.products.observed_quality import read_result
 from calstudy.products.score import cpu_seconds_per_integration
 
 BUSY = "import time\nwhile time.process_time() < {}: pass"

@@ -19,7 +19,7 @@ from calstudy.calibrate.settings import BasisSettings, DelayStart
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
-from calstudy.instrument.array_layouts.golomb import GOLOMB_MARKS
+from calstudy.instrument.array_layouts.geometric import GOLOMB_MARKS
 
 SOLVER = GaussNewton(tolerance=1e-4, max_steps=200)
 AT_THE_MINIMUM = 1.03

@@ -24,7 +24,7 @@ from calstudy.calibrate.solvers.interface import WarmStart, solve, solve_warm
 from calstudy.calibrate.solvers.preconditioners import coupled_inverse
 from calstudy.calibrate.solvers.reduced import compiled
 from calstudy.calibrate.synthetic import Case, Simulation
-from calstudy.instrument.array_layouts.golomb import GOLOMB_MARKS
+from calstudy.instrument.array_layouts.geometric import GOLOMB_MARKS
 
 
 def in_the_span(toy):

@@ -9,7 +9,7 @@ from test_claims import ADAMAX, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_folder, v
 from calstudy.base.errors import InputError
 from calstudy.claims.evaluation import evaluate_by_solver
 from calstudy.claims.folders import evaluate_folder
-from calstudy.claims.product import evaluate
+from calstudy.claims.product import Claims
 from calstudy.figures.solver_comparison import SolverComparison
 from calstudy.plotting.save import figure_arrays
 from calstudy.run.task import Job
@@ -86,22 +86,27 @@ def test_the_folder_of_a_collection_gets_the_table_and_a_single_run_does_not(stu
 
 
 def as_collection(studies, output):
-    """The job of the claims of a collection with these members."""
+    """The claims of a collection with these members, written to a folder."""
     output.mkdir()
-    experiments = {study.name: study.experiment for study in studies.values()}
-    settings = {"papers": [PAPER], "title": "both", "notes": [], "experiments": experiments}
-    roles = {role: study.name for role, study in studies.items()}
-    inputs = {
+    tables = {
         f"{kind}:{study.name}": study.folders[0] for study in studies.values() for kind in ("spectra", "agreement")
     }
-    return Job(settings={**settings, "roles": roles}, inputs=inputs, output=output)
+    return Claims(
+        "claims",
+        papers=[PAPER],
+        title="both",
+        notes=[],
+        experiments={study.name: study.experiment for study in studies.values()},
+        roles={role: study.name for role, study in studies.items()},
+        tables=tables,
+    ).make(output)
 
 
 def test_the_product_of_a_collection_has_the_table_if_both_solvers_are_in_it(studies, tmp_path):
-    evaluate(as_collection(studies, tmp_path / "both"))
+    as_collection(studies, tmp_path / "both")
     assert {path.name for path in (tmp_path / "both").iterdir()} == set(CLAIMS_FILES)
     default = {role: studies[role] for role in ("minimally_redundant", "redundant")}
-    evaluate(as_collection(default, tmp_path / "default"))
+    as_collection(default, tmp_path / "default")
     assert {path.name for path in (tmp_path / "default").iterdir()} == {"claims.json", "claims.md"}
 
 

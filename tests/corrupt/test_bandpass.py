@@ -7,7 +7,7 @@ import pytest
 from observations import small_instrument
 
 from calstudy.base.observation import Observation
-from calstudy.corrupt.effects.bandpass import Bandpass
+from calstudy.corrupt.effects.gains import Bandpass
 from calstudy.corrupt.interface import draw_truth
 from calstudy.instrument.telescope import make_template
 

@@ -8,7 +8,7 @@ from observations import small_instrument
 from pydantic import ValidationError
 
 from calstudy.base.observation import Observation
-from calstudy.corrupt.effects.coarse_channels import CoarseChannels
+from calstudy.corrupt.effects.gains import CoarseChannels
 from calstudy.corrupt.interface import draw_truth
 from calstudy.instrument.size import Size
 from calstudy.instrument.telescope import make_template

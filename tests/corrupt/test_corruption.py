@@ -15,9 +15,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.gains import gains_for, make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices, from_cube, to_cube
-from calstudy.corrupt.effects.file_gains import FileGains
-from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
-from calstudy.corrupt.effects.reflection_gains import ReflectionGains, reflection_gain
+from calstudy.corrupt.effects.gains import FileGains, PerChannelGains, ReflectionGains, reflection_gain
 from calstudy.corrupt.interface import GainEffect, apply_effect, draw_truth
 from calstudy.corrupt.levels import rms, set_levels
 from calstudy.corrupt.noise import thermal_noise

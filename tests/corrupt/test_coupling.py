@@ -12,16 +12,14 @@ from tiny import tiny
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
 from calstudy.base.observation import Observation
-from calstudy.corrupt.effects.crosstalk import Crosstalk
-from calstudy.corrupt.effects.mutual_coupling import MutualCoupling
+from calstudy.corrupt.effects.additive import Crosstalk, MutualCoupling
 from calstudy.corrupt.interface import apply_effect, draw_truth
 from calstudy.experiment.files import dump, override, validate
 from calstudy.instrument.as_built import position_offsets
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.telescope import make_template
-from calstudy.products.corruption import draw_effect, read_truth, truths
+from calstudy.products.corruption import read_truth, truths
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job
 from calstudy.studies.load import load_study
 
 
@@ -174,7 +172,7 @@ def test_antennas_couple_over_their_true_distances(tmp_path):
     data["corruption"] = {"effects": [{"kind": "mutual-coupling", "autos": None}]}
     experiment = validate(data, tmp_path)
     [drawn] = truths(Graph(experiment))
-    draw_effect(Job(settings=drawn.settings, inputs={}, output=tmp_path))
+    drawn.make(tmp_path)
     enu = make_layout(experiment.instrument.layout).enu
     true = enu + position_offsets(experiment.instrument.as_built.positions, len(enu))
     distances, nominal = (np.linalg.norm(places[:, None] - places, axis=-1) for places in (true, enu))

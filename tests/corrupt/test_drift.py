@@ -15,8 +15,7 @@ from calstudy.base.identity import identity
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices
 from calstudy.corrupt.drift import RandomWalk
-from calstudy.corrupt.effects.file_gains import FileGains
-from calstudy.corrupt.effects.per_channel_gains import PerChannelGains
+from calstudy.corrupt.effects.gains import FileGains, PerChannelGains
 from calstudy.corrupt.interface import Effect, apply_effect, draw_truth
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.experiment.files import override, validate

@@ -17,13 +17,8 @@ from calstudy.base.errors import InputError
 from calstudy.base.mwa_files import BEAM
 from calstudy.instrument import settings as section
 from calstudy.instrument import tabulated
-from calstudy.instrument.beam_models.airy import AiryBeam
-from calstudy.instrument.beam_models.beamfits import FileBeam
-from calstudy.instrument.beam_models.gaussian import GaussianBeam
-from calstudy.instrument.beam_models.hera import FILES, HeraBeam
-from calstudy.instrument.beam_models.mwa_analytic import MwaAnalyticBeam
-from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
-from calstudy.instrument.beam_models.short_dipole import DipoleBeam
+from calstudy.instrument.beam_models.formulas import AiryBeam, DipoleBeam, GaussianBeam, MwaAnalyticBeam
+from calstudy.instrument.beam_models.tables import HERA_FILES, FileBeam, HeraBeam, MwaEmbeddedBeam
 from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, MwaTile, integrate_power, make_beam
 
 CHANNELS = 167.075e6 + 320e3 * np.arange(96)
@@ -348,7 +343,7 @@ def test_hera_beams_are_those_of_their_files(model, frequency, pixels):
     """At a tabulated frequency and the pixels of the file, which pyuvdata reads by itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # The files are old, and say little of their feeds.
-        table = UVBeam.from_file(FILES[model].path, file_type="beamfits")
+        table = UVBeam.from_file(HERA_FILES[model].path, file_type="beamfits")
     assert table.pixel_coordinate_system == pixels
     channels = section.Channels(first=f"{frequency / 1e6 - 4} MHz", width="1 MHz", count=8)
     beam = make_beam(HeraBeam(kind="hera", model=model, interpolation="linear"), channels)

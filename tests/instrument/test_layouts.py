@@ -15,14 +15,9 @@ from pyuvdata.utils import ENU_from_ECEF
 
 from calstudy.base.errors import InputError
 from calstudy.instrument.array_layouts.csv import CsvLayout
-from calstudy.instrument.array_layouts.golomb import GOLOMB_MARKS
-from calstudy.instrument.array_layouts.hera import HeraLayout
-from calstudy.instrument.array_layouts.hex import HexLayout
-from calstudy.instrument.array_layouts.linear import LinearLayout
-from calstudy.instrument.array_layouts.mwa import MwaLayout
-from calstudy.instrument.array_layouts.rectangular import RectangularLayout
-from calstudy.instrument.layouts import make_layout, redundant_groups
-from calstudy.instrument.sites import SITES, east_north_up
+from calstudy.instrument.array_layouts.geometric import GOLOMB_MARKS, HexLayout, LinearLayout, RectangularLayout
+from calstudy.instrument.array_layouts.observatories import HeraLayout, MwaLayout
+from calstudy.instrument.layouts import SITES, east_north_up, make_layout, redundant_groups
 
 
 def vectors_of(layout):

@@ -7,8 +7,8 @@ from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
 
 from calstudy.base.visibilities import baseline_vectors, to_cube
-from calstudy.instrument.array_layouts.golomb import GolombLayout
-from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.array_layouts.geometric import GolombLayout
+from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.power.average import fringe_stop_and_average
 
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calstudy.base.visibilities import baseline_vectors
-from calstudy.instrument.array_layouts.hex import HexLayout
-from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.array_layouts.geometric import HexLayout
+from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.power import cosmology as c
 from calstudy.power import delay, errors
 from calstudy.power.cylindrical import cylindrical_average

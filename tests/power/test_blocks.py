@@ -12,7 +12,7 @@ from astropy.time import Time
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
-from calstudy.instrument.array_layouts.golomb import GolombLayout
+from calstudy.instrument.array_layouts.geometric import GolombLayout
 from calstudy.power.average import average_in_blocks, divide, fringe_stop_and_average
 from calstudy.power.errors import independent_times, noise_level, sample_modes
 from calstudy.power.interface import estimate_spectra

@@ -8,9 +8,8 @@ from hera_pspec import PSpecData, UVPSpec
 from hera_pspec.pspecbeam import PSpecBeamFromArray
 
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube
-from calstudy.instrument.array_layouts.golomb import GolombLayout
-from calstudy.instrument.array_layouts.hex import HexLayout
-from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.array_layouts.geometric import GolombLayout, HexLayout
+from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.power import cosmology as c
 from calstudy.power.delay import delay_transform, delays, make_taper
 from calstudy.power.estimate import estimate_power, kelvin_per_jansky, make_pairs

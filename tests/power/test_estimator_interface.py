@@ -10,7 +10,7 @@ import pytest
 from hera_pspec import UVPSpec
 
 from calstudy.base.errors import InputError
-from calstudy.instrument.array_layouts.golomb import GolombLayout
+from calstudy.instrument.array_layouts.geometric import GolombLayout
 from calstudy.power.interface import Estimator, estimate_spectra
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra, delay_spectra

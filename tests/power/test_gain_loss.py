@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from gain_projection import projector, random
 
-from calstudy.instrument.array_layouts.hex import HexLayout
-from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.array_layouts.geometric import HexLayout
+from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.layouts import ArrayLayout, make_layout, redundant_groups
 
 

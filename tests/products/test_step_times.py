@@ -15,7 +15,7 @@ from calstudy.calibrate.settings import BasisSettings
 from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
-from calstudy.instrument.array_layouts.linear import LinearLayout
+from calstudy.instrument.array_layouts.geometric import LinearLayout
 from calstudy.instrument.settings import Channels
 from calstudy.products.paper_step import PaperStep
 from calstudy.products.step_times import Descent, Samples, descend, make_simulation, time_steps, time_steps_apart

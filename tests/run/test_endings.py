@@ -16,7 +16,7 @@ import pytest
 import yaml
 from command_line import run_command
 from filelock import FileLock
-from test_perform import NUMBER, run
+from test_perform import Number, run
 from tiny import tiny
 
 from calstudy.base.errors import InputError
@@ -25,7 +25,7 @@ from calstudy.run.execution import Workers, execute, schedule
 from calstudy.run.inventory import leftovers, products
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Store
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Task
 from calstudy.studies.folder import LOG, log_to, open_folder
 
 KEY = "0" * 32
@@ -55,7 +55,7 @@ def test_a_wait_for_a_lock_names_who_holds_it_and_ends(store, monkeypatch):
 
 def test_a_wait_of_a_worker_is_told_to_the_run(store, monkeypatch):
     monkeypatch.setattr(store_module, "SILENT_WAIT", 0.05)
-    task, told = Task(NUMBER, "wanted", {"number": 1}), []
+    task, told = Number("wanted", number=1), []
     lock = FileLock(store.root / ".locks" / f"number-{task.key}.lock", thread_local=False)
     (store.root / ".locks").mkdir()
     lock.acquire()
@@ -78,15 +78,18 @@ def test_a_file_system_without_locks_is_refused(store, monkeypatch):
 
 
 def test_a_worker_without_the_store_says_so_and_where_it_is(tmp_path):
-    order = WorkOrder.of(Task(NUMBER, "label", {"number": 1}), Store(tmp_path / "elsewhere"))
+    order = WorkOrder.of(Number("label", number=1), Store(tmp_path / "elsewhere"))
     with pytest.raises(InputError, match=f"the worker on {socket.gethostname()} has no such folder"):
         perform(order)
 
 
-def wait_long(job: Job) -> dict:
-    Path(job.settings["begun"]).touch()
-    time.sleep(60)
-    return {}
+class Wait(Task, stage="wait"):
+    begun: str
+
+    def make(self, output: Path) -> dict:
+        Path(self.begun).touch()
+        time.sleep(60)
+        return {}
 
 
 def test_a_lost_scheduler_ends_the_run_with_a_sentence(store, tmp_path):
@@ -106,7 +109,7 @@ def test_a_lost_scheduler_ends_the_run_with_a_sentence(store, tmp_path):
 
         killer = threading.Thread(target=kill, daemon=True)
         killer.start()
-        task = Task(Stage(name="wait", version=1, make=wait_long), "long", {"begun": str(begun)})
+        task = Wait("long", begun=str(begun))
         try:
             with pytest.raises(InputError, match=f"--scheduler {address}: the dask scheduler was lost before wait"):
                 execute([task], store, Workers(1, tmp_path / "log", address))
@@ -115,7 +118,7 @@ def test_a_lost_scheduler_ends_the_run_with_a_sentence(store, tmp_path):
 
 
 def test_what_killed_runs_left_is_listed_and_deleted_and_no_product(store, capsys, monkeypatch):
-    task = Task(NUMBER, "whole", {"number": 1})
+    task = Number("whole", number=1)
     run(task, store)
     [whole] = products(store)
     for name in (f".building-{KEY}-ab", f".discarded-{KEY}-cd"):

@@ -9,23 +9,28 @@ from calstudy.run import provenance
 from calstudy.run.execution import Workers
 from calstudy.run.source import Source
 from calstudy.run.store import Store
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Input, Task
 from calstudy.studies.study import make
 
 
-def make_first(job: Job) -> dict:
-    (job.output / "number").write_text("1")
-    return {}
+class First(Task, stage="first"):
+    name: str
+
+    def make(self, output: Path) -> dict:
+        (output / "number").write_text("1")
+        return {}
 
 
-def make_last(job: Job) -> dict:
-    (job.output / "number").write_text(str(len(job.inputs)))
-    return {}
+class Last(Task, stage="last"):
+    data: Input
+
+    def make(self, output: Path) -> dict:
+        (output / "number").write_text(self.data.name)
+        return {}
 
 
-FIRST, LAST = (Stage(name=made.__name__[5:], version=1, make=made) for made in (make_first, make_last))
-DATA, OTHER = (Task(FIRST, name, {"name": name}) for name in ("data", "other"))
-RESULT = Task(LAST, "result", {}, {"data": DATA})
+DATA, OTHER = (First(name, name=name) for name in ("data", "other"))
+RESULT = Last("result", data=DATA)
 TARGETS = [RESULT, OTHER]
 
 
@@ -58,7 +63,7 @@ def test_products_of_the_same_code_are_used_without_a_word(store, capsys):
 
 def test_products_of_other_code_are_used_and_announced_with_what_was_made_from_them(store, capsys, monkeypatch):
     run(store, capsys)
-    other_source(monkeypatch, make_first)
+    other_source(monkeypatch, First)
     made, told = run(store, capsys)
     assert made == set()
     assert "3 products in the store are of other code" in told
@@ -67,10 +72,10 @@ def test_products_of_other_code_are_used_and_announced_with_what_was_made_from_t
 
 def test_a_strict_run_makes_them_again_and_nothing_else(store, capsys, monkeypatch):
     run(store, capsys)
-    other_source(monkeypatch, make_last)
+    other_source(monkeypatch, Last)
     made, told = run(store, capsys, strict=True)
     assert (made, "of other code" in told) == ({"result"}, False)
-    other_source(monkeypatch, make_first)
+    other_source(monkeypatch, First)
     assert run(store, capsys, strict=True)[0] == {"data", "result", "other"}
     assert run(store, capsys, strict=True)[0] == set()
 
@@ -78,12 +83,12 @@ def test_a_strict_run_makes_them_again_and_nothing_else(store, capsys, monkeypat
 def test_what_a_dropped_product_was_made_with_is_not_forgotten(store, capsys, monkeypatch):
     run(store, capsys)
     store.discard("first", DATA.key)
-    other_source(monkeypatch, make_first)
+    other_source(monkeypatch, First)
     assert "(last 1, first 1)" in run(store, capsys)[1]
 
 
 def test_another_version_of_a_package_that_a_stage_uses_is_other_code(store, capsys, monkeypatch):
-    other_source(monkeypatch, make_first)
+    other_source(monkeypatch, First)
     run(store, capsys)
     version = provenance._version
     monkeypatch.setattr(provenance, "_version", lambda name: "0.1" if name == "numpy" else version(name))
@@ -93,7 +98,7 @@ def test_another_version_of_a_package_that_a_stage_uses_is_other_code(store, cap
 
 
 def test_a_record_says_with_what_a_product_was_made(store, capsys, monkeypatch):
-    other_source(monkeypatch, make_first, "digest")
+    other_source(monkeypatch, First, "digest")
     run(store, capsys)
     record = store.verify("first", DATA.key).record
     assert record["made_with"] == {"source": "digest", "versions": {"numpy": provenance._version("numpy")}, "files": {}}

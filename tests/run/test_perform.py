@@ -4,7 +4,7 @@ import errno
 import subprocess
 import sys
 import traceback
-from dataclasses import replace
+from dataclasses import field
 from pathlib import Path
 
 import pytest
@@ -13,31 +13,48 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import UserCodeError
 from calstudy.base.resources import Cost
 from calstudy.run import execution
-from calstudy.run.execution import Lifetimes, Workers, drop, execute, largest_disk, schedule
+from calstudy.run.execution import Lifetimes, Workers, execute, largest_disk, schedule
+from calstudy.run.leases import Lease
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Store
-from calstudy.run.task import Job, Stage, Task
+from calstudy.run.task import Inputs, Piece, Task
 
 EXIT_INPUT = 2
 
 
-def make_number(job: Job) -> dict:
-    number = job.settings["number"] + sum(int((folder / "number").read_text()) for folder in job.inputs.values())
-    (job.output / "number").write_text(str(number))
-    return {"number": number}
+class Number(Task, stage="number"):
+    """A number added to those of other products."""
+
+    number: int
+    needed: Inputs = field(default_factory=dict)
+    piece: Piece = None
+
+    def make(self, output: Path) -> dict:
+        number = self.number + sum(int((folder / "number").read_text()) for folder in self.needs.values())
+        (output / "number").write_text(str(number))
+        return {"number": number}
 
 
-NUMBER = Stage(name="number", version=1, make=make_number)
+class Newer(Number, stage="number", version=2):
+    """The same in a later version."""
 
 
-def failing(error: BaseException) -> Stage:
-    """Return a stage that raises an error after it has written a file."""
+class Sized(Number, stage="number"):
+    """A number of a known size."""
 
-    def make(job: Job) -> dict:
-        (job.output / "half").write_text("half")
-        raise error
+    def _cost(self) -> Cost:
+        return Cost(1, disk=100.0)
 
-    return Stage(name="failing", version=1, make=make)
+
+def failing(error: BaseException, label: str) -> Task:
+    """Return a task that raises an error after it has written a file."""
+
+    class Failing(Task, stage="failing"):
+        def make(self, output: Path) -> dict:
+            (output / "half").write_text("half")
+            raise error
+
+    return Failing(label)
 
 
 @pytest.fixture
@@ -53,9 +70,9 @@ def run(task: Task, store: Store) -> None:
 
 
 def test_a_product_is_made_from_its_inputs_and_pieces_and_recorded(store):
-    first = Task(NUMBER, "first", {"number": 1})
-    piece = Task(NUMBER, "piece", {"number": 20})
-    total = Task(NUMBER, "total", {"number": 300}, {"first": first}, {"piece": piece})
+    first = Number("first", number=1)
+    piece = Number("piece", number=20)
+    total = Number("total", number=300, needed={"first": first}, piece=piece)
     run(total, store)
     product = store.verify("number", total.key)
     assert (product.path / "number").read_text() == "321"
@@ -65,9 +82,9 @@ def test_a_product_is_made_from_its_inputs_and_pieces_and_recorded(store):
 
 
 def test_a_product_of_an_older_version_is_not_found_and_left_alone(store):
-    old = Task(NUMBER, "total", {"number": 1})
+    old = Number("total", number=1)
     run(old, store)
-    new = Task(replace(NUMBER, version=2), "total", {"number": 1})
+    new = Newer("total", number=1)
     plan = schedule([new], store)
     assert (plan.todo, plan.damaged) == ((new,), ())
     run(new, store)
@@ -76,8 +93,8 @@ def test_a_product_of_an_older_version_is_not_found_and_left_alone(store):
 
 
 def test_a_store_that_can_only_be_read_keeps_its_temporary_products(store, monkeypatch):
-    piece = Task(NUMBER, "piece", {"number": 20}, temporary=True)
-    total = Task(NUMBER, "total", {"number": 300}, {}, {"piece": piece})
+    piece = Number("piece", number=20, temporary=True)
+    total = Number("total", number=300, piece=piece)
     run(total, store)
 
     def refuse(*_: object) -> None:
@@ -85,18 +102,18 @@ def test_a_store_that_can_only_be_read_keeps_its_temporary_products(store, monke
 
     with monkeypatch.context() as patched:
         patched.setattr(Store, "discard", refuse)
-        drop(Lifetimes([total], ()).unused(), store)
+        Lease(store).drop(Lifetimes([total], ()).unused())
     assert store.find("number", piece.key) is not None
-    drop(Lifetimes([total], ()).unused(), store)
+    Lease(store).drop(Lifetimes([total], ()).unused())
     assert store.find("number", piece.key) is None
     assert store.find("number", total.key) is not None
 
 
 def chain(*, temporary: bool) -> tuple[Task, Task, Task, Task]:
     """Return a product, two that are made from it, and one that is made from these two."""
-    data = Task(NUMBER, "data", {"number": 1}, temporary=temporary)
-    halves = [Task(NUMBER, f"half {value}", {"number": value}, {"data": data}, temporary=temporary) for value in (2, 3)]
-    return data, halves[0], halves[1], Task(NUMBER, "total", {"number": 0}, {"a": halves[0], "b": halves[1]})
+    data = Number("data", number=1, temporary=temporary)
+    halves = [Number(f"half {value}", number=value, needed={"data": data}, temporary=temporary) for value in (2, 3)]
+    return data, halves[0], halves[1], Number("total", number=0, needed={"a": halves[0], "b": halves[1]})
 
 
 def test_a_temporary_product_is_dropped_after_the_last_task_that_needs_it_and_not_before(store):
@@ -116,7 +133,7 @@ def test_a_run_that_was_interrupted_drops_nothing_that_it_still_needs(store):
     assert todo == (second, total)
     assert Lifetimes([total], todo).unused() == []
     run(total, store)
-    drop(Lifetimes([total], schedule([total], store).todo).unused(), store)
+    Lease(store).drop(Lifetimes([total], schedule([total], store).todo).unused())
     assert all(store.find("number", task.key) is None for task in (data, first, second))
     assert schedule([total], store).todo == ()
 
@@ -132,23 +149,22 @@ def test_a_product_that_another_run_made_to_be_kept_is_not_dropped(store):
     kept, fleeting = chain(temporary=False), chain(temporary=True)
     run(kept[1], store)
     run(fleeting[-1], store)
-    drop(Lifetimes([fleeting[-1]], ()).unused(), store)
+    Lease(store).drop(Lifetimes([fleeting[-1]], ()).unused())
     found = [store.find("number", task.key) is not None for task in fleeting]
     # Data and first half were made to be kept, the second half was not; the total is not temporary.
     assert found == [True, True, False, True]
 
 
 def test_the_disk_of_a_plan_counts_what_is_there_at_one_time(store):
-    sized = replace(NUMBER, cost=lambda task: Cost(1, disk=100.0))
-    pieces = [Task(sized, f"piece {index}", {"number": index}, temporary=True) for index in range(5)]
-    reduced = [Task(sized, f"reduced {index}", {"number": 1}, {"piece": piece}) for index, piece in enumerate(pieces)]
+    pieces = [Sized(f"piece {index}", number=index, temporary=True) for index in range(5)]
+    reduced = [Sized(f"reduced {index}", number=1, needed={"piece": piece}) for index, piece in enumerate(pieces)]
     # One piece at a time, beside what was reduced before and is being reduced.
     assert largest_disk(reduced, schedule(reduced, store).todo) == 100 * 6
 
 
 @pytest.mark.parametrize("error", [ValueError("index 3 is wrong"), KeyError("gains"), TypeError("no"), LookupError()])
 def test_a_defect_of_a_stage_reaches_the_caller_as_it_is_with_its_traceback(store, error):
-    task = Task(failing(error), "defect", {})
+    task = failing(error, "defect")
     with pytest.raises(type(error)) as caught:
         run(task, store)
     assert type(caught.value) is type(error)
@@ -166,12 +182,12 @@ def test_a_defect_of_a_stage_reaches_the_caller_as_it_is_with_its_traceback(stor
 )
 def test_a_refusal_of_a_stage_passes_as_it_is(store, error):
     with pytest.raises(InputError) as caught:
-        run(Task(failing(error), "refusal", {}), store)
+        run(failing(error, "refusal"), store)
     assert (type(caught.value), str(caught.value)) == (type(error), str(error))
 
 
 def test_what_failed_leaves_no_product_and_no_lock(store):
-    task = Task(failing(ValueError("no")), "defect", {})
+    task = failing(ValueError("no"), "defect")
     for _ in range(2):
         with pytest.raises(ValueError, match="no"):
             perform(WorkOrder.of(task, store))
@@ -180,9 +196,9 @@ def test_what_failed_leaves_no_product_and_no_lock(store):
 
 
 def test_an_input_that_vanished_is_told_in_a_sentence(store):
-    first = Task(NUMBER, "first", {"number": 1})
+    first = Number("first", number=1)
     with pytest.raises(InputError, match=r"number \(second\): its input number/\w+ was removed or damaged"):
-        perform(WorkOrder.of(Task(NUMBER, "second", {"number": 2}, {"first": first}), store))
+        perform(WorkOrder.of(Number("second", number=2, needed={"first": first}), store))
 
 
 PROGRAM = """
@@ -191,18 +207,18 @@ from pathlib import Path
 from calstudy.base.errors import InputError
 from calstudy.run.execution import Workers, execute, schedule
 from calstudy.run.store import Store
-from calstudy.run.task import Stage, Task
+from calstudy.run.task import Task
 
-def leave(job):
+def leave(output):
     sys.exit(3)
 
-def write_much(job):
-    (job.output / "much").write_bytes(bytes(10**6))
+def write_much(output):
+    (output / "much").write_bytes(bytes(10**6))
     return {{}}
 
-def write_hdf5(job):
+def write_hdf5(output):
     import h5py
-    with h5py.File(job.output / "much.h5", "w") as file:
+    with h5py.File(output / "much.h5", "w") as file:
         file["much"] = list(range(10**5))
     return {{}}
 
@@ -212,9 +228,13 @@ class Held:
 
 held = []
 
-def hold(job):
+def hold(output):
     held.append(Held())
     return {{}}
+
+class Made(Task, stage="stage"):
+    def make(self, output):
+        return {make}(output)
 
 def limit():
     # Longer files cannot be written, whoever asks: EFBIG, as on a full disk.
@@ -225,7 +245,7 @@ if __name__ == "__main__":
     store = Store(Path("store"))
     store.prepare()
     {before}
-    tasks = schedule([Task(Stage(name="stage", version=1, make={make}), "label", {{}})], store).todo
+    tasks = schedule([Made("label")], store).todo
     try:
         execute(tasks, store, Workers({workers}, Path("run.log")))
     except InputError as error:
@@ -259,30 +279,33 @@ DYING = """
 import os, signal, time
 from pathlib import Path
 from calstudy.run import execution
-from calstudy.run.execution import Lifetimes, Workers, drop, execute, schedule
+from calstudy.run.execution import Lifetimes, Workers, execute, schedule
+from calstudy.run.leases import Lease
 from calstudy.run.store import Store
-from calstudy.run.task import Stage, Task
+from calstudy.run.task import Input, Task
 
-def make(job):
-    with open("made", "a") as log:
-        log.write(job.settings["name"] + " ")
-    if job.settings["name"] == "last" and not Path("died").exists():
-        Path("died").touch()
-        time.sleep(1)
-        os.kill(os.getpid(), signal.SIGKILL)
-    return {}
+class Made(Task, stage="stage"):
+    name: str
+    data: Input = None
 
-STAGE = Stage(name="stage", version=1, make=make)
+    def make(self, output):
+        with open("made", "a") as log:
+            log.write(self.name + " ")
+        if self.name == "last" and not Path("died").exists():
+            Path("died").touch()
+            time.sleep(1)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return {}
 
 if __name__ == "__main__":
     store = Store(Path("store"))
     store.prepare()
-    data = Task(STAGE, "data", {"name": "data"}, temporary=True)
-    result = Task(STAGE, "result", {"name": "result"}, {"data": data})
-    last = Task(STAGE, "last", {"name": "last"}, {"result": result})
+    data = Made("data", name="data", temporary=True)
+    result = Made("result", name="result", data=data)
+    last = Made("last", name="last", data=result)
     todo = schedule([last], store).todo
     lifetimes = Lifetimes([last], todo)
-    execute(todo, store, Workers(2, Path("run.log")), lambda task, product: drop(lifetimes.after(task), store))
+    execute(todo, store, Workers(2, Path("run.log")), lambda task, product: Lease(store).drop(lifetimes.after(task)))
     print(store.find("stage", last.key) is not None, store.find("stage", data.key) is None)
 """
 
@@ -302,16 +325,16 @@ from pathlib import Path
 from calstudy.base.errors import InputError
 from calstudy.run.execution import Workers, execute
 from calstudy.run.store import Store
-from calstudy.run.task import Stage, Task
-
-def make(job):
-    time.sleep(0.2)
-    if job.settings["name"] == "guilty":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return {}
+from calstudy.run.task import Task
 
 def task(name):
-    return Task(Stage(name=name, version=1, make=make), "label", {"name": name})
+    class Made(Task, stage=name):
+        def make(self, output):
+            time.sleep(0.2)
+            if self.stage.name == "guilty":
+                os.kill(os.getpid(), signal.SIGKILL)
+            return {}
+    return Made("label")
 
 if __name__ == "__main__":
     store = Store(Path("store"))
@@ -334,7 +357,7 @@ def test_the_product_that_kills_its_worker_is_named(tmp_path):
 def test_what_a_worker_began_last_is_known_by_its_address(store):
     with execution._local_client(1, store.root / "run.log") as client:
         for name in ("first", "last"):
-            order = WorkOrder.of(Task(NUMBER, name, {"number": len(name)}), store)
+            order = WorkOrder.of(Number(name, number=len(name)), store)
             client.submit(execution._announce_and_perform, order).result()
         (address,) = client.scheduler_info()["workers"]
         assert execution._last_begun(client, address) == "number (last)"
@@ -354,7 +377,7 @@ def test_a_product_that_cannot_be_written_is_told_in_a_sentence(tmp_path, make):
 def test_only_files_of_the_store_are_taken_for_it(store, number, tmp_path):
     inside, outside = (OSError(number, "no", str(folder / "file")) for folder in (store.root, tmp_path))
     with pytest.raises(InputError, match=r"outputs\.store"):
-        perform(WorkOrder.of(Task(failing(inside), "inside", {}), store))
+        perform(WorkOrder.of(failing(inside, "inside"), store))
     with pytest.raises(OSError, match="no") as caught:
-        perform(WorkOrder.of(Task(failing(outside), "outside", {}), store))
+        perform(WorkOrder.of(failing(outside, "outside"), store))
     assert caught.value is outside

@@ -15,7 +15,7 @@ from calstudy.run.source import reached, source_of
 from calstudy.run.store import Store
 from calstudy.studies.kinds.experiment import ExperimentStudy
 
-RUNNER = ("calstudy.run.perform", "calstudy.base.resources")
+RUNNER = ("calstudy.run.perform", "calstudy.run.task", "calstudy.base.resources")
 CODE = '''
 """A module."""
 import numpy as np
@@ -78,7 +78,7 @@ def test_a_source_changes_with_all_that_is_used(tmp_path, old, new):
 def test_a_source_names_packages_and_their_data_files():
     study = ExperimentStudy(validate({"name": "paper"}, Path()))
     task = next(task for task in study.tasks if task.stage.name == "simulate")
-    found = source_of(task.stage.make, task.settings)
+    found = source_of(type(task), task.settings)
     assert {"numpy", "astropy", "pyuvdata", "finufft"} <= found.packages
     assert "tensorflow" not in found.packages
     assert ("mwa_pb", "data/mwa_full_embedded_element_pattern.h5") in found.files
@@ -90,7 +90,7 @@ def test_all_that_runs_while_products_are_made_is_in_their_source(tmp_path, monk
     store = Store(tmp_path / "store")
     store.prepare()
     tasks = ExperimentStudy(validate(of_the_paper(tmp_path), tmp_path)).tasks
-    sources = {task.key: set(reached(task.stage.make, task.settings)) for task in tasks}
+    sources = {task.key: set(reached(type(task), task.settings)) for task in tasks}
     for module in {module for found in sources.values() for module, _ in found}:
         import_module(module)
     ran: set[tuple[str, str]] = set()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from calstudy.instrument.beam_models.gaussian import GaussianBeam
-from calstudy.instrument.beam_models.mwa_analytic import MwaAnalyticBeam
-from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
-from calstudy.instrument.beam_models.short_dipole import DipoleBeam
+from calstudy.instrument.beam_models.formulas import DipoleBeam, GaussianBeam, MwaAnalyticBeam
+from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
 from calstudy.instrument.beams import make_beam
 
 

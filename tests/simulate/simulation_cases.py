@@ -10,7 +10,7 @@ from astropy.time import Time
 from pyradiosky import SkyModel
 
 from calstudy.instrument import settings as instrument
-from calstudy.instrument.array_layouts.mwa import MwaLayout
+from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.fftvis import FftvisEngine

@@ -18,7 +18,6 @@ from calstudy.papers.calamity2022.substitutions import substitutions
 from calstudy.products import corruption, simulation
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.fftvis import FftvisEngine
 from calstudy.simulate.engines.matvis import MatvisEngine
@@ -118,8 +117,8 @@ def test_an_experiment_simulates_them(tmp_path: Path):
     chunk, whole = tmp_path / "chunk", tmp_path / "whole"
     chunk.mkdir()
     whole.mkdir()
-    simulation.simulate_chunk(Job(settings=piece.settings, inputs={}, output=chunk))
-    simulation.assemble(Job(settings=task.settings, inputs={"chunk000": chunk}, output=whole))
+    piece.make(chunk)
+    task.given({"chunk000": chunk}).make(whole)
     template = make_template(experiment.instrument)
     made = make_beams(experiment.instrument, 7)
     assert made.index.tolist() == [0, 0, 1, 0, 0, 1, 0]

@@ -14,16 +14,14 @@ from calstudy.base.errors import ExperimentError
 from calstudy.base.visibilities import antenna_indices, baseline_vectors, to_cube
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import dump, override, validate
-from calstudy.instrument.antenna_beams import AntennaBeams
+from calstudy.instrument.antenna_beams import AntennaBeams, MisalignedBeam
 from calstudy.instrument.as_built import Misalignment, position_offsets
 from calstudy.instrument.beams import ExactBeam
 from calstudy.instrument.layouts import make_layout
-from calstudy.instrument.misaligned import MisalignedBeam
 from calstudy.papers.calamity2022 import Calamity2022
 from calstudy.products import corruption, simulation, sky_model
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
-from calstudy.run.task import Job
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
 
@@ -52,8 +50,8 @@ def simulated(experiment, folder: Path):
     chunk, whole = folder / "chunk", folder / "whole"
     chunk.mkdir(parents=True)
     whole.mkdir()
-    simulation.simulate_chunk(Job(settings=piece.settings, inputs={}, output=chunk))
-    notes = simulation.assemble(Job(settings=task.settings, inputs={"chunk000": chunk}, output=whole))
+    piece.make(chunk)
+    notes = task.given({"chunk000": chunk}).make(whole)
     return read_visibilities(whole / "visibilities.uvh5"), notes
 
 

@@ -11,7 +11,7 @@ from simulation_cases import observe, random_sky, relative_error
 
 from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.array_layouts.csv import CsvLayout
-from calstudy.instrument.beam_models.gaussian import GaussianBeam
+from calstudy.instrument.beam_models.formulas import GaussianBeam
 from calstudy.instrument.settings import Channels, InstrumentSettings, Site, Times
 from calstudy.simulate.chunks import Component, simulate_visibilities
 from calstudy.simulate.engines.dense import DenseEngine

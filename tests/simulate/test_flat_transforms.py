@@ -9,8 +9,8 @@ from simulation_cases import healpix_sky, random_sky
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.instrument import settings as instrument
 from calstudy.instrument.array_layouts.csv import CsvLayout
-from calstudy.instrument.array_layouts.hera import HeraLayout
-from calstudy.instrument.array_layouts.hex import HexLayout
+from calstudy.instrument.array_layouts.geometric import HexLayout
+from calstudy.instrument.array_layouts.observatories import HeraLayout
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate import patches

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import make_interp_spline
 
-from calstudy.instrument.splines import bspline_coefficients
+from calstudy.instrument.beam_grid import bspline_coefficients
 from calstudy.simulate.patterns import power_pattern
 
 FREQUENCIES = np.array([171e6, 180.3e6, 195e6])

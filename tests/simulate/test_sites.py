@@ -15,8 +15,8 @@ from simulation_cases import point_sky
 from calstudy.base.errors import ExperimentError
 from calstudy.experiment.files import dump, validate
 from calstudy.instrument.beams import make_beam
+from calstudy.instrument.layouts import place_of
 from calstudy.instrument.settings import Coordinates, InstrumentSettings
-from calstudy.instrument.sites import place_of
 from calstudy.instrument.telescope import make_template
 from calstudy.products import simulation
 from calstudy.products.graph import Graph

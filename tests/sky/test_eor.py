@@ -11,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+from calstudy.base.errors import InputError
+from calstudy.power import drawn
 from calstudy.sky.eor import HYDROGEN_LINE, EorField, comoving_geometry
 from calstudy.sky.settings import Eor
 
@@ -157,3 +159,56 @@ def test_paper_scale_power_law_stays_below_three_gigabytes():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     EorField(Eor(spectrum="power-law", index=-2.0), CHANNELS).sky(slice(0, 8))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 3e6
+
+
+@pytest.fixture
+def table(tmp_path):
+    """P = 1e4 (k / 0.2)^-1.5 mK^2 h^-3 Mpc^3, coarsely sampled: a power law between two k is exact."""
+    k = np.geomspace(1e-6, 20, 9)
+    path = tmp_path / "power.txt"
+    np.savetxt(path, np.column_stack([k, 1e4 * (k / 0.2) ** -1.5]), header="k [h/Mpc]  P [mK^2 h^-3 Mpc^3]")
+    return path
+
+
+def test_a_table_of_a_power_law_is_the_power_law(table):
+    h = Planck15.h
+    amplitude = 1e-6 * 1e4 / h**3
+    law = EorField(Eor(spectrum="power-law", index=-1.5, amplitude=f"{amplitude} K2 Mpc3", pivot_k=0.2 * h), FEW)
+    field = EorField(Eor(spectrum="table", path=table, nside=16), FEW)
+    for ell in (3, 60, 500):
+        np.testing.assert_allclose(field.channel_covariance(ell), law.channel_covariance(ell), rtol=1e-6)
+    assert np.isfinite(field.maps(slice(0, 2))).all()
+
+
+def test_the_input_power_of_a_table_is_the_table_in_its_own_units(table):
+    k, power = np.loadtxt(table, unpack=True)
+    settings = Eor(spectrum="table", path=table)
+    np.testing.assert_allclose(drawn.input_power(settings, k, "Planck15"), power, rtol=1e-9)
+    # Constant beyond its ends.
+    np.testing.assert_allclose(drawn.input_power(settings, [1e-8, 100.0], "Planck15"), power[[0, -1]], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("0.1 1 2\n0.2 1 2\n", "needs two columns and two rows, has 3 and 2"),
+        ("0.1, 1\n", "has 2 and 1"),
+        ("k, P\n0.1, 1\n", "cannot be read as a table of numbers"),
+        ("0.1 1\n0.1 2\n", "k must increase"),
+        ("0.1 1\n0.2 -2\n", "must be positive"),
+        ("0.1 1\n0.2 nan\n", "must be positive"),
+    ],
+)
+def test_a_table_that_is_no_power_spectrum_is_refused(text, problem, tmp_path):
+    path = tmp_path / "power.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=problem):
+        EorField(Eor(spectrum="table", path=path, nside=16), FEW).maps(slice(0, 1))
+
+
+@pytest.mark.parametrize(
+    "fields", [{"spectrum": "table"}, {"path": "p.txt"}, {"spectrum": "power-law", "path": "p.txt"}]
+)
+def test_a_table_and_its_path_belong_together(fields):
+    with pytest.raises(ValueError, match="is needed with spectrum: table"):
+        Eor.model_validate(fields)

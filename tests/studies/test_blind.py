@@ -89,7 +89,7 @@ def test_data_with_the_eor_and_without_have_noise_of_their_own(blind_worlds, ope
         experiment = worlds.cases[0].experiment
         graph = Graph(experiment)
         variants = [experiment.variants[name] for name in ("residual", "residual_without_eor")]
-        return [data(graph, variant, parity).settings["noise_seed"] for variant in variants for parity in PARITIES]
+        return [data(graph, variant, parity).noise_seed for variant in variants for parity in PARITIES]
 
     assert len(set(noise(blind_worlds))) == 4
     assert noise(open_worlds) == [103, 104, 103, 104]

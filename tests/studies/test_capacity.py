@@ -10,7 +10,7 @@ from calstudy.base.resources import parse_memory
 from calstudy.experiment.files import load, override, validate
 from calstudy.experiment.model import Experiment
 from calstudy.products import corruption, simulation
-from calstudy.products.calibration import CALIBRATE_CHUNK
+from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.studies import capacity
@@ -126,7 +126,7 @@ def many(tmp_path) -> Experiment:
 
 
 def solve_estimate(experiment: Experiment) -> float:
-    return max(task.cost.memory for task in tasks_of(experiment) if task.stage is CALIBRATE_CHUNK)
+    return max(task.cost.memory for task in tasks_of(experiment) if isinstance(task, CalibrateChunk))
 
 
 def test_solves_work_on_fewer_models_where_memory_is_short(many):
@@ -137,7 +137,7 @@ def test_solves_work_on_fewer_models_where_memory_is_short(many):
     assert little.calibration.models_at_once < many.calibration.models_at_once
     assert solve_estimate(little) <= share + 1e6
     assert [task.key for task in targets_of(many)] == [task.key for task in targets_of(little)]
-    told = [task.settings["calibration"] for task in tasks_of(little) if task.stage is CALIBRATE_CHUNK]
+    told = [task.calibration for task in tasks_of(little) if isinstance(task, CalibrateChunk)]
     assert {settings.models_at_once for settings in told} == {little.calibration.models_at_once}
 
 

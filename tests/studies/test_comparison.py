@@ -8,6 +8,7 @@ import pytest
 import yaml
 from test_signal_loss import small
 
+import calstudy
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.files import load
 from calstudy.power.score import BANDS, Score
@@ -141,6 +142,19 @@ def test_tables_and_figures_hold_every_case(compared):
     assert "flux errors: 20 %" in (folder / "report.html").read_text()
 
 
+def test_the_answer_is_on_the_report_and_in_python(compared, summaries):
+    found = calstudy.open_run(compared.folder).standings().loc[(0.2, 0.5)]
+    # It has more than a hundred times the EoR with fluxes that are wrong.
+    assert found.standing["sky-based"] == "fails"
+    assert found.worlds["sky-based"] == ["flux errors: 20 %"]
+    lowest = min(summaries[world]["CALAMITY"]["bands"][1]["transfer"] for world in WORLDS)
+    assert found.transfer["CALAMITY"] == lowest
+    assert calstudy.open_run(compared.folder).standings(limit=1e9).loc[(0.2, 0.5)].standing["sky-based"] == "passes"
+    page = (compared.folder / "report.html").read_text()
+    assert page.index("Which calibrator to trust") < page.index("Calibrators compared")
+    assert "k 0.2 to 0.5 h/Mpc: " in page
+
+
 def test_faults_name_the_case_and_the_field(tmp_path):
     path = comparison_file(tmp_path, worlds={"a": {"sky.foregrounds.flux_limit": "8 parsec"}})
     with pytest.raises(ExperimentError, match=r"flux_limit: '8 parsec'.*in 'sky-based in a' and 3 other"):
@@ -235,3 +249,10 @@ def test_differences_are_from_the_best_of_each_band_and_better_known_than_scores
     assert less["bias_error"] < np.hypot(*(own[name]["bands"][1]["bias_error"] for name in (less["best"], "trusting")))
     text = (compared.folder / "tables" / "comparison.md").read_text()
     assert text.count("Less the best of each band:") == len(WORLDS)
+
+
+def test_a_world_that_changes_nothing_is_refused(tmp_path):
+    count = small(tmp_path)["instrument"]["channels"]["count"]
+    path = comparison_file(tmp_path, worlds={"ideal": {}, "as it is": {"instrument.channels.count": count}})
+    with pytest.raises(ExperimentError, match="worlds: 'as it is' is the same as 'ideal'; change a field"):
+        load_study(path)

@@ -24,12 +24,10 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction
-from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA
-from calstudy.products.observed import observe
 from calstudy.products.observed import observed as observed_task
 from calstudy.products.selection import read_gains
-from calstudy.run.task import Job
+from calstudy.realdata.halves import PARITIES
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
@@ -243,7 +241,7 @@ def halves(folder: Path, name: str, observed: dict) -> dict[str, UVData]:
     for parity in PARITIES:
         output = folder / f"{name}-{parity}"
         output.mkdir(exist_ok=True)
-        observe(Job(settings=observed_task(graph, parity).settings, inputs={}, output=output))
+        observed_task(graph, parity).make(output)
         found[parity] = UVData.from_file(output / DATA, run_check=False)
     return found
 

@@ -13,11 +13,10 @@ from pyuvdata import UVData
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
 from calstudy.instrument.telescope import make_template
-from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA
-from calstudy.products.observed import observe, observed
+from calstudy.products.observed import observed
 from calstudy.realdata import reading
-from calstudy.run.task import Job
+from calstudy.realdata.halves import PARITIES
 from calstudy.studies.kinds.observed import ObservedStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget
@@ -56,7 +55,7 @@ def halves(folder: Path, name: str) -> dict[str, UVData]:
     for parity in PARITIES:
         output = folder / f"{name}-{parity}"
         output.mkdir()
-        observe(Job(settings=observed(graph, parity).settings, inputs={}, output=output))
+        observed(graph, parity).make(output)
         found[parity] = UVData.from_file(output / DATA, run_check=False)
     return found
 

@@ -344,7 +344,7 @@ def test_the_shipped_file_draws_what_the_docs_say(scale):
     assert len(study.parts) == 3
     assert [task.label for task in study.figures] == ["realizations-comparison"]
     # The minimally redundant array and the redundant one are compared with the paper.
-    assert study.claims.settings["roles"] == study.roles
+    assert study.claims.roles == study.roles
     for part in study.parts.values():
         assert isinstance(part, Realizations)
         draws = {part_: block.count for block in part.experiment.realizations for part_ in block.draw}

@@ -1,1 +1,1 @@
-"""The effects on the data, one in each module."""
+"""The effects on the data, in families: gains, flags, added signals."""

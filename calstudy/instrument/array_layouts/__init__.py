@@ -1,1 +1,1 @@
-"""The built-in layouts of arrays, a file each, or a file for the layouts of one observatory."""
+"""The built-in layouts of arrays, by shape, of observatories, and from files."""

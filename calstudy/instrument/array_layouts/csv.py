@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.errors import InputError
-from calstudy.instrument.layouts import ArrayLayout, Layout
-from calstudy.instrument.sites import SITES
+from calstudy.instrument.layouts import SITES, ArrayLayout, Layout
 
 
 class CsvLayout(ArrayLayout):
@@ -22,6 +21,7 @@ class CsvLayout(ArrayLayout):
 
     site: ClassVar[str | None] = None
 
+    kind: str = "csv"
     path: Path = Field(strict=False, description="CSV file, relative to the experiment file or absolute.")
 
     @property

@@ -1,1 +1,1 @@
-"""The beams of antennas, one in each module."""
+"""The beams of antennas: formulas and tables."""

@@ -9,7 +9,7 @@ from calstudy.base.paths import differences
 from calstudy.base.schema import Section
 from calstudy.calibrate.settings import AdamaxSettings, FlagWeights, GainFit, Solver
 from calstudy.claims.paper import Paper
-from calstudy.corrupt.settings import NoNoise, RadiometerNoise
+from calstudy.corrupt.noise import NoNoise, RadiometerNoise
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.papers.calamity2022.substitutions import PAPER_TIMES, substitutions
 

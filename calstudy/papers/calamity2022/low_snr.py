@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calstudy.claims.bins import SIGMAS_95, bins_at_delays, fraction_within, used_bins
-from calstudy.corrupt.effects.reflection_gains import ReflectionGains
+from calstudy.corrupt.effects.gains import ReflectionGains
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.results.reader import Results

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.beam_models.mwa_embedded_element import MwaEmbeddedBeam
+from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
 
 PAPER_CHANNELS, PAPER_TIMES, PAPER_ANTENNAS, PAPER_NSIDE = 384, 56, 36, 256
 

@@ -14,7 +14,7 @@ import yaml
 from pydantic import BeforeValidator, Field, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.identity import identity
+from calstudy.base.identity import digest_json, identity
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.interface import CALIBRATORS
@@ -26,7 +26,7 @@ from calstudy.figures import StudyFigure, figures_for
 from calstudy.products import tolerances
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import score
+from calstudy.products.score import MeasureScore, score
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
 from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
@@ -259,9 +259,9 @@ class Comparison(Family):
         }
 
     @cached_property
-    def scores(self) -> dict[str, Task]:
+    def scores(self) -> dict[str, MeasureScore]:
         """The scores of every case that is not refused."""
-        return {label: study.targets[0] for label, study in self.studies.items()}
+        return {label: required(score(study.graph)) for label, study in self.studies.items()}
 
     @cached_property
     def tables(self) -> list[Task]:
@@ -413,7 +413,17 @@ def _make_cases(
                 refusals[label] = refusal
     if faults:
         raise ExperimentError([f"{sentence} (in {_listed(found)})" for sentence, found in faults.items()])
+    _require_different_worlds(members, list(worlds))
     return members, refusals
+
+
+def _require_different_worlds(members: Mapping[str, Experiment], worlds: Sequence[str]) -> None:
+    """Raise ExperimentError if two worlds are the same experiment, whose cases would be the same twice."""
+    seen: dict[str, str] = {}
+    for row, world in enumerate(worlds):
+        same = seen.setdefault(digest_json(identity(_what_is_made(members[case_name(row, 0)]))), world)
+        if same != world:
+            raise ExperimentError([f"worlds: {world!r} is the same as {same!r}; change a field in it, or remove it"])
 
 
 def _listed(cases: Sequence[str]) -> str:

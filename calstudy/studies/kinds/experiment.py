@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,6 +10,7 @@ from typing import Any, Self
 
 from calstudy.base.errors import InputError
 from calstudy.base.identity import identity
+from calstudy.base.table import Table
 from calstudy.claims.paper import stand_ins, unique_notes
 from calstudy.claims.product import claims
 from calstudy.experiment.files import StudyFile
@@ -29,6 +28,7 @@ from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit, require_data_fit
 from calstudy.studies.preflight import notes_of, require_possible
+from calstudy.studies.setup import describe_data, describe_setup
 from calstudy.studies.study import Budget, Study, built_in_kinds
 
 SKY_MODEL_TABLE = "sky-model.csv"
@@ -80,6 +80,11 @@ class ExperimentStudy(Study):
     def notes(self) -> tuple[str, ...]:
         """Notes of a plan on settings that are allowed, but probably a mistake."""
         return notes_of(self.experiment)
+
+    @property
+    def setup(self) -> str:
+        """The array, band, times, gains, noise and calibrator."""
+        return describe_setup(self.experiment)
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
@@ -135,20 +140,14 @@ class ExperimentStudy(Study):
         """Return as CSV the deviations of each antenna from the nominal instrument."""
         instrument = self.experiment.instrument
         numbers = make_layout(instrument.layout).numbers
-        table = io.StringIO()
-        rows = csv.writer(table, lineterminator="\n")
-        rows.writerow(("number", *COLUMNS))
         found = as_built_rows(instrument.as_built, len(numbers))
-        rows.writerows((number, *row) for number, row in zip(numbers, found, strict=True))
-        return table.getvalue()
+        rows = [(number, *row) for number, row in zip(numbers, found, strict=True)]
+        return Table(("number", *COLUMNS), rows).csv()
 
     def _sky_model_table(self) -> str:
         """Return as CSV the false assumptions of the calibrator, after a line that describes its sky model."""
-        table = io.StringIO()
-        table.write(f"# sky model: {sky_model.described(self.graph)}\n")
-        rows = csv.writer(table, lineterminator="\n")
-        rows.writerows([("field", "true", "assumed"), *sky_model.differences(self.graph)])
-        return table.getvalue()
+        table = Table(("field", "true", "assumed"), sky_model.differences(self.graph))
+        return f"# sky model: {sky_model.described(self.graph)}\n{table.csv()}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +199,12 @@ class Family(Study):
             "file": {name: identity(getattr(self.file, name)) for name in names},
             "members": {name: study.folder.name for name, study in self.studies.items()},
         }
+
+    @property
+    def setup(self) -> str:
+        """The data of all members, if they are the same."""
+        found = {describe_data(experiment) for experiment in self.members.values()}
+        return found.pop() if len(found) == 1 else ""
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:

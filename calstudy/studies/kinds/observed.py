@@ -15,10 +15,10 @@ from calstudy.experiment.model import FIGURES
 from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.power.settings import PowerSettings
-from calstudy.products.observed import ObservedGraph
-from calstudy.products.observed_injection import injection_tables
-from calstudy.products.observed_quality import quality
-from calstudy.products.observed_spectra import observed_spectra
+from calstudy.products.expected_loss import expected_loss
+from calstudy.products.graph import MeasuredGraph
+from calstudy.products.observed_injection import transfer
+from calstudy.products.observed_results import observed_spectra, quality
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.task import Task
@@ -53,7 +53,7 @@ class ObservedStudy(DataStudy):
 
     def __init__(self, file: ObservedFile, data: Parts) -> None:
         super().__init__(file, data)
-        self.graph = ObservedGraph(file.observed, file.calibration, file.power, file.injection, data)
+        self.graph = MeasuredGraph(file, data)
 
     @classmethod
     def load(cls, file: StudyFile) -> ObservedStudy:
@@ -92,14 +92,16 @@ class ObservedStudy(DataStudy):
         if asked is None:
             names = DEFAULT_FIGURES + (INJECTION_FIGURES if self.file.injection else ())
             asked = tuple(FIGURES.make(name) for name in names)
-        settings = {"wedge_buffer": self.graph.power.wedge_buffer}
+        settings = {"wedge_buffer": self.file.power.wedge_buffer}
         shown = figures_for("observed", asked, "outputs.figures")
         return [figure_task(figure, {"": self.graph}, self.stand_ins, settings) for figure in shown]
 
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        return [observed_spectra(self.graph), quality(self.graph), *injection_tables(self.graph)]
+        graph = self.graph
+        loss = [transfer(graph), expected_loss(graph)] if self.file.injection else []
+        return [observed_spectra(graph), quality(graph), *filter(None, loss)]
 
 
 def _halves(file: ObservedFile) -> Parts:

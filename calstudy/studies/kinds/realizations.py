@@ -11,7 +11,6 @@ from calstudy.experiment.model import FIGURES, Experiment
 from calstudy.experiment.realizations import expand_realizations
 from calstudy.figures import figure_task
 from calstudy.products.pooled_realizations import pooled
-from calstudy.products.realizations import realization_graphs
 from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
@@ -59,7 +58,7 @@ class Realizations(ExperimentStudy):
     @property
     def entries(self) -> dict[str, Any]:
         """The seeds of every realization."""
-        drawn = (item.realization for item in realization_graphs(self.graph))
+        drawn = expand_realizations(self.experiment)
         return {
             self.key: [{"label": item.label, **seeds(item.experiment.model_dump(mode="json"))} for item in drawn],
         }

@@ -20,10 +20,9 @@ from calstudy.claims.product import run_time_claims
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Folders, Papers, StudyName
 from calstudy.figures import draw_task
-from calstudy.instrument.array_layouts.linear import LinearLayout
-from calstudy.instrument.array_layouts.rectangular import RectangularLayout
+from calstudy.instrument.array_layouts.geometric import LinearLayout, RectangularLayout
 from calstudy.instrument.settings import Channels
-from calstudy.products.run_times import COUNT_STEPS, SUMMARIZE, TIME_STEPS, TimedArray
+from calstudy.products.run_times import CountSteps, RunTimes, TimedArray, TimeSteps
 from calstudy.run.provenance import machine, package_versions
 from calstudy.run.task import Task
 from calstudy.studies.study import Budget, Study
@@ -215,40 +214,40 @@ class RuntimeStudy(Study):
         return rows | line
 
     @cached_property
-    def timings(self) -> dict[str, Task]:
+    def timings(self) -> dict[str, TimeSteps]:
         """The measurements, by name of the array and device."""
         devices = self.file.runtime.devices
         return {f"{name}-{device}": self._timing(name, device) for name in self.arrays for device in devices}
 
-    def _timing(self, name: str, device: str) -> Task:
+    def _timing(self, name: str, device: str) -> TimeSteps:
         panel, size, array = self.arrays[name]
         label = f"{size:g} antennas" if panel == "rows" else f"line of {size:g} m"
-        settings = {
-            "machine": self.timed_on,
-            "panel": panel,
-            "size": size,
-            "longest": self.file.runtime.rows.max_baseline if panel == "rows" else size,
-            "array": array,
-            "samples": self.file.runtime.samples.model_dump(mode="json"),
-            "device": device,
-        }
-        return Task(TIME_STEPS, f"{label}, {device}", settings)
+        return TimeSteps(
+            f"{label}, {device}",
+            machine=self.timed_on,
+            panel=panel,
+            size=size,
+            longest=self.file.runtime.rows.max_baseline if panel == "rows" else size,
+            array=array,
+            samples=self.file.runtime.samples.model_dump(mode="json"),
+            device=device,
+        )
 
     @cached_property
     def descent(self) -> Task:
         """The task of the descent of the paper's solver to the minimum."""
         descent = self.file.runtime.descent
-        settings = {
-            "array": self._rows(descent.antennas),
-            "longest": self.file.runtime.rows.max_baseline,
-            "max_steps": descent.max_steps,
-        }
-        return Task(COUNT_STEPS, f"Adamax, {descent.antennas} antennas", settings)
+        return CountSteps(
+            f"Adamax, {descent.antennas} antennas",
+            array=self._rows(descent.antennas),
+            longest=self.file.runtime.rows.max_baseline,
+            max_steps=descent.max_steps,
+        )
 
     @cached_property
     def summary(self) -> Task:
         """The table of all measurements."""
-        return Task(SUMMARIZE, "run times", {"machine": self.timed_on}, {**self.timings, "descent": self.descent})
+        return RunTimes("run times", machine=self.timed_on, cases=self.timings, descent=self.descent)
 
     @cached_property
     def figures(self) -> list[Task]:
@@ -257,7 +256,7 @@ class RuntimeStudy(Study):
 
     def _figure(self, panel: str) -> Task:
         figure = FIGURES.make({"kind": "runtime", "panel": panel})
-        shown = {name: task for name, task in self.timings.items() if task.settings["panel"] == panel}
+        shown = {name: task for name, task in self.timings.items() if task.panel == panel}
         return draw_task(figure, shown, self.stand_ins, {})
 
     @cached_property

@@ -16,10 +16,10 @@ from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import StudyFile, override, short_names, validate
 from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment
-from calstudy.figures.sweep import SUMMARY
+from calstudy.products.graph import required
+from calstudy.products.signal_loss import SweepSummary, transfer
 from calstudy.run.task import Task
 from calstudy.studies.kinds.experiment import ExperimentStudy, Family, content_of
-from calstudy.studies.study import RunProducts
 
 SWEPT = ("instrument", "sky", "simulation", "corruption", "calibration", "power", "variants")
 """Sections whose fields can be varied."""
@@ -91,9 +91,16 @@ class Sweep(Family):
 
     @cached_property
     def figures(self) -> list[Task]:
-        """The signal loss of all points: a figure, and a table beside it."""
+        """The signal loss of all points."""
         blocks = [[{"label": point.label, "changes": dict(point.changes)} for point in block] for block in self.blocks]
         return [self.draw(FIGURES.make("sweep"), {"blocks": blocks})]
+
+    @cached_property
+    def tables(self) -> list[Task]:
+        """The signal loss of all points."""
+        points = [{"label": point.label, "changes": dict(point.changes)} for point in self.points]
+        transfers = {label: required(transfer(study.graph)) for label, study in self.studies.items()}
+        return [SweepSummary("signal loss of all points", points=points, transfers=transfers)]
 
     @property
     def entries(self) -> Mapping[str, Any]:
@@ -101,12 +108,6 @@ class Sweep(Family):
         return {
             POINTS: [{"folder": f"{POINTS}/{point.label}", "changes": dict(point.changes)} for point in self.points]
         }
-
-    def write_results(self, made: RunProducts) -> None:
-        """Write the comparison of all points, with its table in the folder of tables."""
-        super().write_results(made)
-        (self.folder / "tables").mkdir(exist_ok=True)
-        (self.folder / "figures" / SUMMARY).replace(self.folder / "tables" / SUMMARY)
 
 
 def expand(experiment: Experiment) -> Sweep:

@@ -20,8 +20,8 @@ from scipy.constants import speed_of_light
 
 from calstudy.base.visibilities import baseline_vectors
 from calstudy.corrupt.levels import rms
-from calstudy.instrument.array_layouts.mwa import MwaLayout
-from calstudy.instrument.beam_models.gaussian import GaussianBeam
+from calstudy.instrument.array_layouts.observatories import MwaLayout
+from calstudy.instrument.beam_models.formulas import GaussianBeam
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template, subset_template

@@ -10,7 +10,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.claims.bins import bins_at_delays
-from calstudy.corrupt.effects.reflection_gains import ReflectionGains
+from calstudy.corrupt.effects.gains import ReflectionGains
 from calstudy.products import spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task

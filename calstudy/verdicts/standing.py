@@ -1,0 +1,198 @@
+"""Which calibrators can be trusted: the bias of each in all worlds of a comparison, against a limit.
+
+In a band of k, a calibrator
+
+- *passes* in a world if its bias is below the limit by two standard deviations: |bias| + 2 sigma < limit,
+- *fails* if it is above by two standard deviations, if T is not that of a solution (below -0.1 or above 1.2 by more
+  than two standard deviations), or if the calibrator cannot work there,
+- is *open* otherwise: the errors of this run are too large to tell. Without a bias, the measured one is about sigma,
+  so that 3 sigma must be below the limit to show it.
+
+It passes the comparison if it passes in all worlds, and fails if it fails in one. The bias and its error are those of
+the scores, in units of the EoR.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from calstudy.base.table import Table
+
+Standing = Literal["passes", "open", "fails"]
+WORST = ("fails", "open", "passes")
+LIMIT = 0.1
+"""Largest tolerated bias, over the EoR."""
+SIGMAS = 2.0
+TRANSFER_OF_A_SOLUTION = (-0.1, 1.2)
+AT_LIMIT = 1.05
+NAMED = 3
+"""Number of worlds that are named; others are counted."""
+
+
+@dataclass(frozen=True)
+class InWorld:
+    """A calibrator in a band of k and a world: T and bias are NaN where they are not known, or it cannot work."""
+
+    world: str
+    transfer: float = math.nan
+    transfer_error: float = math.nan
+    bias: float = math.nan
+    bias_error: float = math.nan
+    refused: bool = False
+
+    def standing(self, limit: float) -> Standing:
+        """Return whether the bias is below the limit."""
+        low, high = TRANSFER_OF_A_SOLUTION
+        margin = SIGMAS * self.transfer_error
+        if self.refused or self.transfer + margin < low or self.transfer - margin > high:
+            return "fails"
+        size, margin = abs(self.bias), SIGMAS * self.bias_error
+        # With NaN, no comparison is true.
+        return "passes" if size + margin < limit else "fails" if size - margin > limit else "open"
+
+    @property
+    def upper_limit(self) -> float:
+        """Size of the bias that is excluded with 95 %."""
+        return abs(self.bias) + SIGMAS * self.bias_error
+
+    @property
+    def reason(self) -> str:
+        """The world with the number for which a calibrator fails there."""
+        if self.refused:
+            return f"{self.world} (cannot work)"
+        low, high = TRANSFER_OF_A_SOLUTION
+        is_solution = low <= self.transfer <= high
+        return f"{self.world} ({f'bias {_short(self.bias)}' if is_solution else f'T {_short(self.transfer)}'})"
+
+
+@dataclass(frozen=True)
+class InBand:
+    """A calibrator in a band of k, h/Mpc, and all worlds."""
+
+    calibrator: str
+    band: tuple[float, float]
+    worlds: Sequence[InWorld]
+    limit: float = LIMIT
+
+    @property
+    def standing(self) -> Standing:
+        """The worst of all worlds."""
+        found = [world.standing(self.limit) for world in self.worlds]
+        return min(found, key=WORST.index)
+
+    @property
+    def transfer(self) -> float:
+        """The smallest T of all worlds where it is known."""
+        return min((world.transfer for world in self.worlds if math.isfinite(world.transfer)), default=math.nan)
+
+    @property
+    def decisive(self) -> list[InWorld]:
+        """The worlds with the worst standing, those with the largest bias first."""
+        found = [world for world in self.worlds if world.standing(self.limit) == self.standing]
+        return sorted(found, key=lambda world: (not world.refused, -abs(world.bias)))
+
+    @property
+    def upper_limit(self) -> float:
+        """The largest upper limit of the bias of all worlds, NaN if it is not known in one."""
+        limits = [world.upper_limit for world in self.worlds]
+        return max(limits) if all(map(math.isfinite, limits)) else math.nan
+
+    @property
+    def numbers(self) -> str:
+        """The upper limit of the bias in all worlds, and the smallest T."""
+        return f"bias < {_short(self.upper_limit)}, T ≥ {self.transfer:.2f}"
+
+    def __str__(self) -> str:
+        decisive = self.decisive
+        if self.standing == "passes":
+            return f"passes: {self.numbers}"
+        if self.standing == "fails":
+            more = f" and {len(decisive) - NAMED} more" if len(decisive) > NAMED else ""
+            return f"fails in {', '.join(world.reason for world in decisive[:NAMED])}{more}"
+        smaller = (SIGMAS + 1) * max(world.bias_error for world in decisive) / self.limit
+        told = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
+        return f"open in {len(decisive)} of {len(self.worlds)} worlds: {self.numbers}; {told}"
+
+
+def standings(
+    scores: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    refusals: Sequence[tuple[str, str, str]] = (),
+    limit: float = LIMIT,
+) -> list[InBand]:
+    """Return how every calibrator stands in every band of k, band by band.
+
+    Parameters
+    ----------
+    scores
+        The content of comparison.json: scores by world and calibrator.
+    refusals
+        World, calibrator and reason of those that cannot work.
+    limit
+        Largest tolerated bias, over the EoR.
+    """
+    found: dict[tuple[tuple[float, float], str], list[InWorld]] = {}
+    calibrators = dict.fromkeys(name for cases in scores.values() for name in cases)
+    bands = dict.fromkeys(
+        tuple(band["k"]) for cases in scores.values() for summary in cases.values() for band in summary["bands"]
+    )
+    refused = {(world, calibrator) for world, calibrator, _ in refusals}
+    for low, high in bands:
+        for name in calibrators:
+            rows = found.setdefault(((low, high), name), [])
+            for world, cases in scores.items():
+                if name in cases:
+                    bands_there = cases[name]["bands"]
+                    rows += [_in_world(world, entry) for entry in bands_there if tuple(entry["k"]) == (low, high)]
+                elif (world, name) in refused:
+                    rows.append(InWorld(world, refused=True))
+    return [InBand(name, band, worlds, limit) for (band, name), worlds in found.items() if worlds]
+
+
+def _in_world(world: str, band: Mapping[str, Any]) -> InWorld:
+    names = ("transfer", "transfer_error", "bias", "bias_error")
+    transfer, transfer_error, bias, bias_error = (math.nan if band[name] is None else band[name] for name in names)
+    return InWorld(world, transfer, transfer_error, bias, bias_error)
+
+
+def answers(found: Sequence[InBand]) -> list[str]:
+    """Return the question, and for each band of k which calibrators pass or are open."""
+    n_worlds = len({world.world for entry in found for world in entry.worlds})
+    sentences = [f"Bias below {found[0].limit:g} of the EoR in all {n_worlds} worlds?"] if found else []
+    for low, high in dict.fromkeys(entry.band for entry in found):
+        entries = [entry for entry in found if entry.band == (low, high)]
+        passed, undecided = (_listed(entries, standing) for standing in ("passes", "open"))
+        failed = sum(entry.standing == "fails" for entry in entries)
+        parts = [f"{passed} pass" if passed else "no calibrator passes"]
+        parts += [f"open: {undecided}"] if undecided else []
+        parts += [f"{failed} of {len(entries)} fail"] if failed else []
+        sentences.append(f"k {low:g} to {high:g} h/Mpc: {'; '.join(parts)}")
+    return sentences
+
+
+def _listed(entries: Sequence[InBand], standing: Standing) -> str:
+    """Name the calibrators with a standing, those with the largest T first."""
+    found = sorted((entry for entry in entries if entry.standing == standing), key=lambda entry: -entry.transfer)
+    return ", ".join(f"{entry.calibrator} ({entry.numbers})" for entry in found)
+
+
+def standing_table(found: Sequence[InBand]) -> Table:
+    """Return a row for each calibrator, with a column for each band of k."""
+    bands = list(dict.fromkeys(entry.band for entry in found))
+    cells = {(entry.calibrator, entry.band): str(entry) for entry in found}
+    names = dict.fromkeys(entry.calibrator for entry in found)
+    limit = found[0].limit if found else LIMIT
+    note = (
+        f"A calibrator passes if |bias| + {SIGMAS:g}σ is below {limit:g} of the EoR in all worlds, and fails if "
+        f"|bias| - {SIGMAS:g}σ is above it in one; otherwise this run cannot tell. Errors fall with the number of "
+        "integrations within power.coherent_time, and with the square of the noise."
+    )
+    columns = ("calibrator", *(f"k {low:g} to {high:g} h/Mpc" for low, high in bands))
+    rows = [(name, *(cells.get((name, band), "-") for band in bands)) for name in names]
+    return Table(columns, rows, "Which calibrator to trust", note)
+
+
+def _short(value: float) -> str:
+    return f"{float(f'{value:.2g}'):,.10g}"

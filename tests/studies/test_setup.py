@@ -1,0 +1,33 @@
+"""The line that says what a study calibrates has the numbers of the experiment."""
+
+from pathlib import Path
+
+import pytest
+
+from calstudy.studies.load import load_study
+
+
+def test_the_line_of_the_paper_is_that_of_the_paper():
+    # Ewall-Wice et al. 2022: 36 tiles, 384 channels of 80 kHz, 56 integrations of 2 s, noise of ten times the EoR.
+    line = load_study(Path("minredundant")).setup
+    for words in ("36 antennas", "384 channels of 80 kHz", "56 integrations of 2 s", "noise 10 times the EoR"):
+        assert words in line
+    assert line.endswith("; calamity")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("corruption.noise={kind: radiometer, nights: 3}", "thermal noise of 3 nights"),
+        ("corruption.effects=[]", "no gains"),
+        ("instrument.layout={kind: hex, side: 3, spacing: 10 m}", "19 antennas (hex), baselines to 40 m"),
+        ("calibration.calibrator=redcal", "redcal"),
+    ],
+)
+def test_a_change_is_in_the_line(change, words):
+    assert words in load_study(Path("quickstart"), overrides=[change]).setup
+
+
+def test_a_comparison_has_the_data_of_all_worlds_only_if_they_are_the_same():
+    assert "antennas" in load_study(Path("prior")).setup.split(";")[0]
+    assert load_study(Path("calibrators")).setup == ""

@@ -1,0 +1,94 @@
+"""Which calibrators of a comparison can be trusted, from scores that are made up."""
+
+import math
+
+import pytest
+
+from calstudy.verdicts.standing import answers, standing_table, standings
+
+WORLDS = ("ideal", "sources missing")
+
+
+def case(bias, error, transfer=0.8, transfer_error=0.01):
+    names = ("transfer", "transfer_error", "bias", "bias_error")
+    return {"bands": [{"k": [0.1, 0.2], **dict(zip(names, (transfer, transfer_error, bias, error), strict=True))}]}
+
+
+def standing_of(*cases, limit=0.1, refusals=()):
+    scores = {world: {} if found is None else {"name": found} for world, found in zip(WORLDS, cases, strict=False)}
+    (found,) = standings(scores, refusals, limit)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("bias", "error", "expected"),
+    [
+        (0.0, 0.01, "passes"),
+        (0.07, 0.01, "passes"),
+        # |bias| + 2 sigma is the limit and a little more.
+        (0.08, 0.0101, "open"),
+        (0.0, 0.06, "open"),
+        (0.5, 0.21, "open"),
+        (0.5, 0.19, "fails"),
+        # Power that is missing is as wrong as power that is too much.
+        (-0.5, 0.1, "fails"),
+        (None, None, "open"),
+    ],
+)
+def test_a_bias_is_below_the_limit_above_it_or_cannot_be_told(bias, error, expected):
+    assert standing_of(case(bias, error)).standing == expected
+
+
+def test_the_worst_world_decides_and_is_named():
+    good, bad = case(0.0, 0.01), case(44.0, 9.0)
+    assert standing_of(good, good).standing == "passes"
+    assert str(standing_of(good, bad)) == "fails in sources missing (bias 44)"
+    found = standing_of(case(0.0, 0.05), good)
+    assert str(found) == "open in 1 of 2 worlds: bias < 0.1, T ≥ 0.80; errors 1.5 times smaller would tell"
+
+
+def test_errors_that_are_smaller_by_the_stated_factor_tell():
+    found = standing_of(case(0.05, 0.05))
+    assert found.standing == "open"
+    # The bias of a calibrator without one is about its error.
+    assert standing_of(case(0.05 / 1.5001, 0.05 / 1.5001)).standing == "passes"
+
+
+def test_what_is_no_solution_fails_though_its_bias_is_small():
+    assert standing_of(case(0.0, 0.01, transfer=-155.0, transfer_error=10.0)).standing == "fails"
+    assert standing_of(case(0.0, 0.01, transfer=1.3, transfer_error=0.2)).standing == "passes"
+    assert str(standing_of(case(0.0, 0.01), case(0.0, 0.01, transfer=3.0))) == "fails in sources missing (T 3)"
+
+
+def test_a_calibrator_that_cannot_work_in_a_world_fails_there():
+    found = standing_of(case(0.0, 0.01), None, refusals=[("sources missing", "name", "no redundant baselines")])
+    assert str(found) == "fails in sources missing (cannot work)"
+
+
+def test_a_limit_of_ones_own_changes_the_answer():
+    cases = case(0.2, 0.02), case(0.1, 0.02)
+    assert standing_of(*cases, limit=0.3).standing == "passes"
+    assert standing_of(*cases, limit=0.1).standing == "fails"
+
+
+def test_the_answer_ranks_those_that_pass_by_t():
+    scores = {
+        "ideal": {
+            "low": case(0.0, 0.01, 0.4),
+            "high": case(0.0, 0.01, 0.9),
+            "noisy": case(0.0, 0.1, 0.95),
+            "biased": case(5.0, 0.1),
+        }
+    }
+    found = standings(scores)
+    assert answers(found) == [
+        "Bias below 0.1 of the EoR in all 1 worlds?",
+        "k 0.1 to 0.2 h/Mpc: high (bias < 0.02, T ≥ 0.90), low (bias < 0.02, T ≥ 0.40) pass; "
+        "open: noisy (bias < 0.2, T ≥ 0.95); 1 of 4 fail",
+    ]
+    assert answers([entry for entry in found if entry.calibrator == "biased"])[1:] == [
+        "k 0.1 to 0.2 h/Mpc: no calibrator passes; 1 of 1 fail"
+    ]
+    rows = {row[0]: row[1] for row in standing_table(found).rows}
+    assert rows["biased"] == "fails in ideal (bias 5)"
+    assert math.isclose(found[0].upper_limit, 0.02)
