@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.products.realization_results import RegionResults
+    from calstudy.products.realizations import RegionResults
 
 OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"
 CORRELATION_COLOURS = "RdBu_r"
@@ -190,7 +190,7 @@ class Realizations(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Pool all realizations, and draw them."""
-        from calstudy.products.realization_results import read_results
+        from calstudy.products.realizations import read_results
 
         results = read_results(job.settings, job.inputs)
         blocks = job.settings["blocks"]
