@@ -19,34 +19,23 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, TypeVar
 
-from pydantic import (
-    GetJsonSchemaHandler,
-    ValidationError,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-    model_validator,
-)
+from pydantic import model_validator
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticCustomError
 
 from calstudy.base.errors import InputError, nearest
 from calstudy.base.files import sha256
-from calstudy.base.schema import Section, fault
+from calstudy.base.schema import Kinds, Section
 
 FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
 FILE_MODULE = "calstudy_plugin_"
 """What the names of modules that were read from a file start with."""
-NESTED = "nested"
-"""Type of the validation error that contains the faults of a plug-in's own settings."""
 
 
 class Plugin(Section):
@@ -106,31 +95,7 @@ def _revive(base_path: str, block: Mapping[str, Any]) -> Plugin:
 P = TypeVar("P", bound=Plugin)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PluginField(WrapValidator):
-    """The validator of a field for one kind of plug-in, from `Registry.field`."""
-
-    registry: Registry[Any]
-    default: str | None = None
-
-    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the JSON schema of the names, of the blocks of built-in plug-ins, and of references to files."""
-        del core
-        tag, file = self.registry.tag, {"type": "string", "pattern": r"\.py(:\w+)?$"}
-        allowed: list[JsonSchemaValue] = [{"enum": self.registry.names()}, file]
-        for name in self.registry.built_in():
-            block = handler.resolve_ref_schema(handler(self.registry.find(name).__pydantic_core_schema__))
-            required = [field for field in block.get("required", []) if field != tag]
-            properties = {**block.get("properties", {}), tag: {"const": name}}
-            tagged = required if name == self.default else [*required, tag]
-            allowed.append({**block, "properties": properties, "required": tagged})
-        installed = {"enum": sorted(set(self.registry.installed()) - set(self.registry.built_in()))}
-        others = {"anyOf": [file, installed]} if installed["enum"] else file
-        allowed.append({"type": "object", "properties": {tag: others}, "required": [tag]})
-        return {"anyOf": allowed}
-
-
-class Registry(Generic[P]):
+class Registry(Kinds[P]):
     """All plug-ins of one kind: the built-in ones, those of installed packages, and those in files.
 
     Parameters
@@ -150,11 +115,18 @@ class Registry(Generic[P]):
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:
-        self.noun, self.package, self.base_path, self.tag, self.families = noun, package, base_path, tag, families
+        super().__init__(tag)
+        self.noun, self.package, self.base_path, self.families = noun, package, base_path, families
         self.group = f"calstudy.{noun}s"
-        # Classes of built-in plug-ins, because plans of comparisons look them up ten thousand times.
-        self._found: dict[str, type[P]] = {}
         self.a_noun = f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
+
+    def read(self, annotation: Any) -> None:
+        """Take no kinds from types: the plug-ins are those of the package, and others."""
+
+    @property
+    def wanted(self) -> str:
+        """The names, or a file."""
+        return f"the name of {self.a_noun} ({', '.join(self.names())}) or a file.py"
 
     @property
     def base(self) -> type[P]:
@@ -243,65 +215,25 @@ class Registry(Generic[P]):
             raise InputError(f"{reference!r} is not a subclass of {self.base.__module__}.{self.base.__name__}")
         return found
 
-    def make(self, block: Any, default: str | None = None, **context: Any) -> P:
-        """Return the plug-in that a block of settings describes.
-
-        Parameters
-        ----------
-        block
-            A name or path, a block of settings with the tag, or a plug-in, which is returned unchanged.
-        default
-            Name for a block without the tag.
-        context
-            Of the validation: `folder` is where relative paths of files start; the working directory without it.
-
-        Raises
-        ------
-        pydantic.ValidationError
-            If the settings are invalid.
-        InputError
-            If there is no such plug-in.
-        """
-        if isinstance(block, self.base):
-            return block
-        block = {self.tag: block} if isinstance(block, str) else dict(block)
-        found, reference = self.class_of(block, default, context.get("folder"))
-        return found.model_validate({**block, self.tag: reference}, context=context)
-
     def class_of(self, block: Mapping[str, Any], default: str | None, folder: Path | None) -> tuple[type[P], str]:
-        """Return the class for a block of settings, and its name or absolute path; raises as `make`."""
+        """Return the class for a block of settings, and its name or the absolute path of its file; raises as `make`."""
         reference = block.get(self.tag, default)
-        if not isinstance(reference, str):
-            raise InputError(f"needs {self.tag!r}, the name of {self.a_noun} ({', '.join(self.names())}) or a file.py")
-        file = FILE_REFERENCE.fullmatch(reference)
-        if file is not None:
-            try:
-                path = ((folder or Path()) / Path(file["path"]).expanduser()).resolve()
-            except (RuntimeError, ValueError) as error:
-                raise InputError(f"{file['path']!r} cannot be the path of a file ({error})") from None
-            reference = str(path) if file["name"] is None else f"{path}:{file['name']}"
+        file = FILE_REFERENCE.fullmatch(reference) if isinstance(reference, str) else None
+        if file is None:
+            return super().class_of(block, default, folder)
+        try:
+            path = ((folder or Path()) / Path(file["path"]).expanduser()).resolve()
+        except (RuntimeError, ValueError) as error:
+            raise InputError(f"{file['path']!r} cannot be the path of a file ({error})") from None
+        reference = str(path) if file["name"] is None else f"{path}:{file['name']}"
         return self.find(reference), reference
 
-    def field(self, default: str | None = None) -> PluginField:
-        """Return the validator of a field of an experiment file for a plug-in of this kind."""
-
-        def validate(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> P:
-            del handler
-            if not isinstance(value, str | Mapping | self.base):
-                raise fault("", f"must be the name of {self.a_noun}, a file.py, or a block with {self.tag!r}")
-            context = info.context or {}
-            try:
-                return self.make(value, default, **context)
-            except ValidationError as error:
-                content = dict(value) if isinstance(value, Mapping) else {self.tag: value}
-                model = self.class_of(content, default, context.get("folder"))[0]
-                nested = {"error": error, "content": content, "model": model}
-                raise PydanticCustomError(NESTED, "nested", nested) from None
-            except InputError as error:
-                path = self.tag if isinstance(value, Mapping) else ""
-                raise fault(path, str(error)) from None
-
-        return PluginField(validate, registry=self, default=default)
+    def others(self) -> list[JsonSchemaValue]:
+        """Return the JSON schemas of references to files, and of blocks of plug-ins that are not built in."""
+        file: JsonSchemaValue = {"type": "string", "pattern": r"\.py(:\w+)?$"}
+        installed = {"enum": sorted(set(self.installed()) - set(self.built_in()))}
+        named = {"anyOf": [file, installed]} if installed["enum"] else file
+        return [file, {"type": "object", "properties": {self.tag: named}, "required": [self.tag]}]
 
     def identity(self, reference: str) -> str:
         """Return the identity of a plug-in's code: its name or package with a version, or the digest of its file."""

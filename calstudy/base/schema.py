@@ -1,4 +1,4 @@
-"""The base class of every section of an experiment file."""
+"""Sections of an experiment file, and fields with a section of one of several kinds."""
 
 from __future__ import annotations
 
@@ -6,17 +6,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic_core.core_schema import with_info_wrap_validator_function
+
+from calstudy.base.errors import InputError, nearest
 
 UNKEYED: JsonDict = {"keyed": False}
 """`json_schema_extra` of a field that affects how results are computed, but not their values (except for rounding)."""
 FOLDER: JsonDict = {"folder": True}
 """`json_schema_extra` of a path that is a folder of input files."""
+NESTED = "nested"
+"""Type of the validation error that contains the faults of a block's own settings."""
 
 
 class Section(BaseModel):
@@ -24,21 +38,31 @@ class Section(BaseModel):
 
     Unknown keys are errors, values are never coerced between kinds (``"3"`` is not ``3``), and every physical
     quantity carries its unit in the file and is a plain SI float once validated (see `calstudy.base.units`).
+    Paths are those of input files, which must exist, unless `holds_input_files` is false.
     """
+
+    holds_input_files: ClassVar[bool] = True
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     @field_validator("*")
     @classmethod
-    def _input_files_exist(cls, value: Any, info: ValidationInfo) -> Any:
+    def _paths_can_be_used(cls, value: Any, info: ValidationInfo) -> Any:
         """Make the path of an input file absolute, which starts at the folder of the experiment file."""
-        folder = folder_of_files(info)
-        if folder is None or not isinstance(value, Path):
+        if not isinstance(value, Path):
             return value
-        wanted = "folder" if cls.model_fields[str(info.field_name)].json_schema_extra == FOLDER else "file"
-        path = folder / expand_user(value)
+        if "\0" in str(value):
+            raise unusable("no file can have this name")
+        folder = folder_of_files(info)
         try:
+            path = value.expanduser()
+            if folder is None or not cls.holds_input_files:
+                return value
+            path = folder / path
+            wanted = "folder" if cls.model_fields[str(info.field_name)].json_schema_extra == FOLDER else "file"
             found = path.is_dir() if wanted == "folder" else path.is_file()
+        except RuntimeError:
+            raise unusable("there is no such home folder") from None
         except OSError as error:
             raise unusable(f"cannot be read ({error.strerror}; looked for {path})") from None
         if not found:
@@ -71,57 +95,146 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChoiceValidator(BeforeValidator):
-    """The validator of a choice between blocks, from `choice`."""
-
-    key: str
-    default: str | None
-
-    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the JSON schema of the blocks, of their names, and of the default block without its name."""
-        found = dict(handler(core))
-        tags = found.pop("discriminator", {"mapping": {}})["mapping"]
-        blocks = found.pop("oneOf", None) or [handler(core)]
-        names: JsonSchemaValue = {"enum": list(tags)} if tags else {"type": "string"}
-        allowed = [names, *blocks]
-        if self.default in tags:
-            block = handler.resolve_ref_schema({"$ref": tags[self.default]})
-            allowed.append({**block, "required": [name for name in block.get("required", []) if name != self.key]})
-        return {"anyOf": allowed}
+S = TypeVar("S", bound=Section)
 
 
-def choice(key: str, default: str | None = None) -> BeforeValidator:
-    """Allow short forms of a choice between blocks with the tag `key`.
+class Kinds(Generic[S]):
+    """The kinds of block that a field may hold, of which the field `tag` of the block names one.
 
-    A bare string means the block with its defaults (``beam: airy`` for ``beam: {kind: airy}``), and a block
-    without the tag is the `default` one.
+    A name alone stands for the block with its defaults: ``beam: airy`` for ``beam: {kind: airy}``. The kinds are those
+    in the type of the field: sections with a literal as tag, and words, which stand for no block.
     """
 
-    def expand(value: Any) -> Any:
-        if isinstance(value, str):
-            return {key: value}
-        if isinstance(value, dict) and key not in value and default is not None:
-            return {key: default, **value}
-        return value
+    def __init__(self, tag: str) -> None:
+        self.tag = tag
+        self.words: tuple[str, ...] = ()
+        self._found: dict[str, type[S]] = {}
 
-    return ChoiceValidator(expand, key=key, default=default)
+    def read(self, annotation: Any) -> None:
+        """Take the kinds from a union of types."""
+        for kind in get_args(annotation):
+            if get_origin(kind) is Literal:
+                self.words = get_args(kind)
+            else:
+                self._found |= dict.fromkeys(get_args(kind.model_fields[self.tag].annotation), kind)
+
+    @property
+    def base(self) -> Any:
+        """The class, or the classes, of the blocks."""
+        return tuple(self._found.values())
+
+    @property
+    def wanted(self) -> str:
+        """What is allowed, in words."""
+        return f"one of {', '.join(self.names())}"
+
+    def built_in(self) -> list[str]:
+        """Return the names of the built-in kinds of block."""
+        return list(self._found)
+
+    def names(self) -> list[str]:
+        """Return all names and words."""
+        return [*self.words, *self.built_in()]
+
+    def others(self) -> list[JsonSchemaValue]:
+        """Return the JSON schemas of what is allowed besides the names and the built-in blocks."""
+        return []
+
+    def find(self, reference: str) -> type[S]:
+        """Return the class of a kind; raises InputError, without the field, if there is none of this name."""
+        if reference not in self._found:
+            names = self.names()
+            raise InputError(f"{reference!r} is not a choice{nearest(reference, names)} (allowed: {', '.join(names)})")
+        return self._found[reference]
+
+    def class_of(self, block: Mapping[str, Any], default: str | None, folder: Path | None) -> tuple[type[S], str]:
+        """Return the class for a block of settings, and its name or absolute path; raises as `make`."""
+        del folder
+        reference = block.get(self.tag, default)
+        if not isinstance(reference, str):
+            raise InputError(f"needs {self.tag!r}, {self.wanted}")
+        return self.find(reference), reference
+
+    def make(self, block: Any, default: str | None = None, **context: Any) -> S:
+        """Return the section that a block of settings describes.
+
+        Parameters
+        ----------
+        block
+            A name or path, a block of settings with the tag, or a section or word, which is returned unchanged.
+        default
+            Name for a block without the tag.
+        context
+            Of the validation: `folder` is where relative paths of files start; the working directory without it.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If the settings are invalid.
+        InputError
+            If there is no such kind.
+        """
+        if isinstance(block, self.base) or block in self.words:
+            return block
+        block = {self.tag: block} if isinstance(block, str) else dict(block)
+        found, reference = self.class_of(block, default, context.get("folder"))
+        return found.model_validate({**block, self.tag: reference}, context=context)
+
+    def field(self, default: str | None = None) -> KindField:
+        """Return the annotation of a field of an experiment file with one of the kinds."""
+        return KindField(self, default)
+
+
+def choice(tag: str, default: str | None = None) -> KindField:
+    """Return the annotation of a field whose type is a union of sections; a block without the tag is the default."""
+    return KindField(Kinds(tag), default)
+
+
+@dataclass(frozen=True, eq=False)
+class KindField:
+    """The annotation of a field with one of several kinds of block, from `Kinds.field` or `choice`."""
+
+    kinds: Kinds[Any]
+    default: str | None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Validate blocks by their kind; the type of the field alone decides how they are written."""
+        self.kinds.read(source)
+        return with_info_wrap_validator_function(self._validate, handler(source))
+
+    def _validate(self, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        del handler
+        kinds, context = self.kinds, info.context or {}
+        if not isinstance(value, (str, Mapping, kinds.base)):
+            raise unusable(f"must be {kinds.wanted}, or a block with {kinds.tag!r}")
+        try:
+            return kinds.make(value, self.default, **context)
+        except ValidationError as error:
+            content = dict(value) if isinstance(value, Mapping) else {kinds.tag: value}
+            model, _ = kinds.class_of(content, self.default, context.get("folder"))
+            nested = {"error": error, "content": content, "model": model}
+            raise PydanticCustomError(NESTED, "nested", nested) from None
+        except InputError as error:
+            raise fault(kinds.tag if isinstance(value, Mapping) else "", str(error)) from None
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON schema of the names, of the blocks of built-in kinds, and of references to files."""
+        tag, union = self.kinds.tag, handler(core).get("anyOf", [])
+        allowed = [{"enum": self.kinds.names()}, *self.kinds.others(), *union]
+        # The type of a field with plug-ins has no blocks; a union has those with a tag.
+        for name in filter(None, [self.default]) if union else self.kinds.built_in():
+            block = handler.resolve_ref_schema(handler(self.kinds.find(name).__pydantic_core_schema__))
+            required = [field for field in block.get("required", []) if field != tag]
+            properties = {**block.get("properties", {}), tag: {"const": name}}
+            tagged = required if name == self.default else [*required, tag]
+            allowed.append({**block, "properties": properties, "required": tagged})
+        return {"anyOf": allowed}
 
 
 def folder_of_files(info: ValidationInfo) -> Path | None:
     """Return the folder at which paths of input files start, which must exist; None if they are not looked for."""
     context = info.context or {}
     return context.get("folder") if context.get("files", True) else None
-
-
-def expand_user(path: Path) -> Path:
-    """Replace a leading ~ by the home folder; for validators of paths."""
-    if "\0" in str(path):
-        raise unusable("no file can have this name")
-    try:
-        return path.expanduser()
-    except RuntimeError:
-        raise unusable("there is no such home folder") from None
 
 
 def unusable(sentence: str) -> PydanticCustomError:

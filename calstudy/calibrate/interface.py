@@ -176,9 +176,7 @@ class SmoothCal(Smoothing):
         return True
 
 
-SmoothGains = Annotated[
-    DpssSmoothing | PolynomialSmoothing | SmoothCal, Field(discriminator="kind"), choice("kind", "dpss")
-]
+SmoothGains = Annotated[DpssSmoothing | PolynomialSmoothing | SmoothCal, choice("kind", "dpss")]
 
 
 class Calibrator(Plugin):

@@ -78,7 +78,6 @@ class AdamaxSettings(Section):
 
 Solver = Annotated[
     GaussNewtonSettings | AdamaxSettings,
-    Field(discriminator="name"),
     choice("name", "gauss-newton"),
 ]
 
@@ -150,7 +149,6 @@ class FileWeights(Section):
 
 Weights = Annotated[
     GainWeights | FlagWeights | SampleWeights | AutoWeights | FileWeights,
-    Field(discriminator="kind"),
     choice("kind", "gains"),
 ]
 
@@ -208,9 +206,7 @@ class DelayStart(Section):
     )
 
 
-InitialGains = Annotated[
-    UnityStart | FileStart | RedundantStart | DelayStart, Field(discriminator="kind"), choice("kind", "unity")
-]
+InitialGains = Annotated[UnityStart | FileStart | RedundantStart | DelayStart, choice("kind", "unity")]
 
 
 def _deviation(value: Any) -> Any:

@@ -230,7 +230,7 @@ def fetch(
     names = ["gleam", *MWA_FILES]
     if name not in names:
         raise InputError(f"calstudy data fetch {name}: nothing that can be fetched (allowed: {', '.join(names)})")
-    from calstudy.sky.gleam import fetch_gleam
+    from calstudy.sky.catalogue import fetch_gleam
 
     path = fetch_gleam(directory) if name == "gleam" else MWA_FILES[name].fetch(directory)
     typer.echo(f"{path}")

@@ -7,11 +7,10 @@ that is, the relative change of the amplitude while it is small, and v that of t
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field
 
 from calstudy.base.schema import Section, choice
 from calstudy.base.units import Delay, Phase, Time
@@ -54,31 +53,13 @@ class Delays(_Shape):
         return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
 
 
-Shape = Annotated[Polynomial | Delays, Field(discriminator="kind"), choice("kind", "polynomial")]
-KINDS = ("polynomial", "delays")
+Shape = Annotated[Polynomial | Delays, choice("kind", "polynomial")]
 
 
 SECONDS_PER_DAY = 86400
 
 
-def _word_or_shape(value: Any) -> str | None:
-    if value in ("common", "independent"):
-        return "word"
-    return "shape" if isinstance(value, Mapping | Section) or value in KINDS else None
-
-
-Channels = Annotated[
-    Annotated[Literal["common", "independent"], Tag("word")] | Annotated[Shape, Tag("shape")],
-    Discriminator(
-        _word_or_shape,
-        custom_error_type="fault",
-        custom_error_message="{sentence}",
-        custom_error_context={
-            "path": "",
-            "sentence": f"must be common, independent, or a shape ({', '.join(KINDS)})",
-        },
-    ),
-]
+Channels = Annotated[Literal["common", "independent"] | Polynomial | Delays, choice("kind", "polynomial")]
 
 
 class _Drift(Section, ABC):
@@ -183,4 +164,4 @@ class Jumps(_Drift):
         return np.cumsum(np.sqrt(counts) * random.standard_normal((*shape, len(seconds))), axis=-1)
 
 
-Drift = Annotated[RandomWalk | Sinusoid | Jumps, Field(discriminator="kind"), choice("kind")]
+Drift = Annotated[RandomWalk | Sinusoid | Jumps, choice("kind")]

@@ -131,7 +131,6 @@ class NoNoise(Section):
 
 Noise = Annotated[
     NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise,
-    Field(discriminator="kind"),
     choice("kind", "times-eor"),
 ]
 

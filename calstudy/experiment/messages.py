@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import nearest
 from calstudy.base.paths import value_at
-from calstudy.base.plugins import NESTED
+from calstudy.base.schema import NESTED
 
 KINDS = {
     "int_type": "a whole number",
@@ -53,28 +53,13 @@ def _items(annotation: Any) -> list[Any]:
     return [] if position is None else _members(get_args(annotation)[position])
 
 
-def _tags(model: type[BaseModel]) -> list[str]:
-    """Return the values by which a block of a choice is selected: those of its `kind` or `name` literal."""
-    for key in ("kind", "name"):
-        if key in model.model_fields:
-            return [str(tag) for tag in get_args(model.model_fields[key].annotation)]
-    return []
-
-
 def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
-    """Follow a pydantic location; return the dotted path as written in the file, and the block of its last step.
-
-    Pydantic puts the tag of a chosen block into the location, where the file has no key for it.
-    """
+    """Follow a pydantic location; return the dotted path, and the block of its last step."""
     path: list[str] = []
     members: list[Any] = [root]
     holder: type[BaseModel] | None = None
     for step in location:
         models = [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
-        if len(models) > 1:
-            # A tag may also be that of a choice between choices.
-            members = [model for model in models if step in _tags(model)] or members
-            continue
         holder = models[0] if models else None
         path.append(str(step))
         if holder is not None:
@@ -123,9 +108,6 @@ def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:
         return f"{path}: unknown key{nearest(str(error['loc'][-1]), keys)} (allowed: {', '.join(keys)})"
     if kind == "missing":
         return f"{path}: missing, and it has no default"
-    if kind == "union_tag_invalid":
-        tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
-        return f"{path}: {context['tag']!r} is not a choice{nearest(context['tag'], tags)} (allowed: {', '.join(tags)})"
     if kind == "value_error":
         field, colon, text = str(context["error"]).partition(": ")
         return f"{path}.{field}: {text}" if colon and field.isidentifier() else f"{path}: {context['error']}"

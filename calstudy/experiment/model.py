@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, cast
+from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    SerializeAsAny,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
-from calstudy.base.schema import Section, expand_user, fault
+from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import AdamaxSettings, GaussNewtonSettings, Solver
@@ -135,16 +127,10 @@ class Convergence(Section):
 class Folders(Section):
     """Folders of products and runs."""
 
+    holds_input_files: ClassVar[bool] = False
+
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
-
-    @field_validator("*")
-    @classmethod
-    def _input_files_exist(cls, value: Any, info: ValidationInfo) -> Any:
-        """Accept folders that do not exist."""
-        if isinstance(value, Path):
-            expand_user(value)
-        return value
 
 
 class Outputs(Folders):

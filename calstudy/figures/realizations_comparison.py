@@ -22,8 +22,7 @@ from calstudy.verdicts.tolerances import Measured
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from calstudy.power.blocks import Pooled
-    from calstudy.power.realizations import PooledRegion
+    from calstudy.power.realizations import Pooled, PooledRegion
 
 REGION = "outside-wedge"
 SERIES = (("o", style.BLUE), ("s", style.ORANGE))
@@ -103,7 +102,7 @@ class RealizationsComparison(StudyFigure):
 
 def _differences(first: PooledRegion, second: PooledRegion) -> dict[str, Pooled]:
     """Return the difference of every quantity, realization by realization, pooled over all blocks."""
-    from calstudy.power.blocks import together
+    from calstudy.power.realizations import together
 
     found = {}
     for name in first.values:

@@ -18,9 +18,9 @@ from calstudy.figures.spherical import SIGMAS_95
 from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, draw_horizon, label_axes
-from calstudy.power.cylindrical import cylindrical_average
+from calstudy.power.binned import cylindrical_average
+from calstudy.power.cosmology import input_power
 from calstudy.power.delay import delay_transform, delays, horizon_delay
-from calstudy.power.drawn import input_power
 from calstudy.power.interface import estimate_spectra
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.products import simulation
@@ -89,8 +89,8 @@ def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment)
 
     The beam, power section and levels are those of the experiment.
     """
+    from calstudy.power.binned import spherical_average
     from calstudy.power.errors import with_errors
-    from calstudy.power.spherical import spherical_average
 
     settings = experiment.power
     levels = set_levels(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption)

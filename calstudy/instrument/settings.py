@@ -30,7 +30,7 @@ class Coordinates(Section):
     height: Length = Field(0.0, gt=-1e4, lt=1e5, description="Above the ellipsoid.")
 
 
-Location = Annotated[Site | Coordinates, Field(discriminator="kind"), choice("kind", "coordinates")]
+Location = Annotated[Site | Coordinates, choice("kind", "coordinates")]
 
 
 LAYOUTS: Registry[Any] = Registry(

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from astropy.cosmology import FLRW
     from hera_pspec.conversions import Cosmo_Conversions
 
+    from calstudy.sky.settings import Eor
+
+
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 
@@ -92,3 +95,17 @@ def _effective_densities(cosmology: FLRW, z: float) -> tuple[float, float]:
 
     dark_energy = brentq(excess, 0.3, 1.2, xtol=1e-13)
     return dark_energy, matter(dark_energy)
+
+
+MILLIKELVIN2 = 1e6
+
+
+def input_power(settings: Eor, k: np.ndarray, cosmology: str) -> np.ndarray:
+    """Return the input P(k), mK^2 h^-3 Mpc^3, at wavenumbers `k` (h/Mpc, any shape).
+
+    Amplitude and shape in the settings of the EoR sky are in units without h.
+    """
+    from calstudy.sky.eor import input_power as in_kelvin
+
+    h = float(make_cosmology(cosmology).h)
+    return MILLIKELVIN2 * h**3 * in_kelvin(settings, np.asarray(k) * h, h)

@@ -315,8 +315,8 @@ def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSe
 
 def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power: PowerSettings) -> ExpectedBins:
     """Return an expected T of baselines (lengths in m, band centre in Hz) in bins of k and of length and delay."""
+    from calstudy.power.binned import make_bin_edges
     from calstudy.power.expected import bin_expected
-    from calstudy.power.spherical import make_bin_edges
 
     modes = _modes(expected.delay, lengths, centre, power)
     edges = make_bin_edges(power.bins)

@@ -232,9 +232,9 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T, spectra of the injected EoR, and the power of the residual corrected by T."""
+        from calstudy.power.binned import spherical_average
         from calstudy.power.errors import with_errors
         from calstudy.power.spectra import SphericalSpectrum
-        from calstudy.power.spherical import spherical_average
         from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 
         found = self.read()

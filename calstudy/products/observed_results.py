@@ -78,7 +78,7 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
         """Write the spectra as HDF5 and CSV, and the level of the noise to noise.json."""
         import numpy as np
 
-        from calstudy.power.cylindrical import cylindrical_average
+        from calstudy.power.binned import cylindrical_average
         from calstudy.power.tables import save_spectrum, write_csv
 
         delays = {name: read_delay_spectra(folder) for name, folder in self.delays.items()}
@@ -121,8 +121,8 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
         """Return the spherical spectra by their modes, with errors by the noise of each baseline."""
         from dataclasses import replace
 
+        from calstudy.power.binned import modes_in_bins, spherical_average
         from calstudy.power.errors import noise_error, with_errors
-        from calstudy.power.spherical import modes_in_bins, spherical_average
         from calstudy.realdata.noise import noise_of_units
 
         of_units, found = noise_of_units(spectra, noise, level), {}

@@ -158,9 +158,9 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the spectra, and the input power at the same k."""
-        from calstudy.power.drawn import input_power
+        from calstudy.power.binned import make_bin_edges, spherical_average
+        from calstudy.power.cosmology import input_power
         from calstudy.power.errors import noise_level, with_errors
-        from calstudy.power.spherical import make_bin_edges, spherical_average
         from calstudy.power.tables import save_spectrum
 
         power = self.power

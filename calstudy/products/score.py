@@ -77,11 +77,11 @@ class MeasureScore(Task, stage="score", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scores, and all numbers to score.json."""
+        from calstudy.power.binned import make_bin_edges
         from calstudy.power.score import BANDS as EDGES
         from calstudy.power.score import CalibratedSpectra
         from calstudy.power.score import score as measure
         from calstudy.power.spectra import of_common_units
-        from calstudy.power.spherical import make_bin_edges
         from calstudy.power.tables import save_spectrum
 
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SPECTRA}

@@ -166,7 +166,7 @@ def write_transfer(
     The flux scale of the calibration is NaN if it is not known. Per k, a T with an error above `largest_error` is NaN.
     Return T in bands, as plain JSON types, by part of Fourier space; errors are kept.
     """
-    from calstudy.power.spherical import make_bin_edges
+    from calstudy.power.binned import make_bin_edges
     from calstudy.power.tables import save_spectrum, write_transfer_csv
     from calstudy.power.transfer import BANDS, cylindrical_transfer, known_within, spherical_transfer
 

@@ -189,9 +189,8 @@ class Spectra(Task, stage="spectra", version=3, cost=Cost(2, disk=5e6)):
         """Write, for every variant, wedge.h5 and the two spherical spectra, as HDF5 and CSV."""
         import numpy as np
 
-        from calstudy.power.cylindrical import cylindrical_average
+        from calstudy.power.binned import cylindrical_average, spherical_average
         from calstudy.power.errors import noise_level, with_errors
-        from calstudy.power.spherical import spherical_average
         from calstudy.power.tables import save_spectrum, write_csv
 
         reference = {name: read_delay_spectra(folder) for name, folder in self.reference.items()}

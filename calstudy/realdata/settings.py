@@ -6,7 +6,7 @@ import importlib.util
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -138,7 +138,7 @@ class FromAutocorrelations(SystemTemperature):
     kind: Literal["system-temperature"]
 
 
-FluxScale = Annotated[Factor | FromAutocorrelations, Field(discriminator="kind"), choice("kind")]
+FluxScale = Annotated[Factor | FromAutocorrelations, choice("kind")]
 
 
 class Interference(Section):
@@ -157,6 +157,8 @@ def _as_block(value: Any) -> Any:
 
 class DataSettings(Section):
     """Measured visibilities in any format that pyuvdata reads, and what is known of them."""
+
+    holds_input_files: ClassVar[bool] = False  # `find_data` finds files and folders.
 
     data: DataFiles = Field(min_length=1, description="A file or folder, or several that belong together.")
     select: Select = Select()
@@ -178,12 +180,6 @@ class DataSettings(Section):
     sky_model: DataFile | None = Field(
         None, description="Visibilities of the sky as far as it is known, in Jy, with the times and channels of `data`."
     )
-
-    @field_validator("*")
-    @classmethod
-    def _input_files_exist(cls, value: Any, info: ValidationInfo) -> Any:
-        """Accept folders as well, which `find_data` found."""
-        return value
 
 
 class ObservedSettings(DataSettings):

@@ -20,9 +20,9 @@ from calstudy.instrument.antenna_beams import make_beams
 from calstudy.instrument.interface import model_of
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.power.cosmology import make_cosmology
-from calstudy.simulate.directions import sky_cells
 from calstudy.simulate.interface import BeamSource, Engine, simulate_with
 from calstudy.simulate.nodes import Accuracy, Axis, frequency_axis, frequency_blocks, integration_times, time_axis
+from calstudy.simulate.sources import sky_cells
 from calstudy.sky.eor import EorField
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import Eor

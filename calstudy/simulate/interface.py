@@ -66,10 +66,15 @@ class Engine(Plugin, ABC):
     """
 
     registry: ClassVar[Registry[Engine]] = Registry(
-        "engine", "calstudy.simulate.engines", "calstudy.simulate.interface:Engine"
+        "engine", "calstudy.simulate.engines", "calstudy.simulate.interface:Engine", families=True
     )
 
     kind: str = Field("", description="Name of an engine, or a file.py.")
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the name of a built-in engine."""
+        return (cls.model_fields["kind"].default,)
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does.
@@ -109,7 +114,7 @@ class Engine(Plugin, ABC):
         or set are discontinuous in time, and are simulated at every integration.
         """
         from calstudy.instrument.telescope import subset_template
-        from calstudy.simulate.directions import SourceTracks, split_by_horizon
+        from calstudy.simulate.sources import SourceTracks, split_by_horizon
 
         axis, integrations = time_axis(template, accuracy), integration_times(template)
         if axis.at_samples:

@@ -33,11 +33,7 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_indices, baseline_vectors, require_rectangular
 from calstudy.instrument.antenna_beams import AntennaBeams, split_beams
-from calstudy.simulate.brightness import stokes_i
-from calstudy.simulate.directions import SourceTracks, sky_cells, split_by_horizon
-from calstudy.simulate.flat_transforms import FlatArray, FlatSums, flat_array
 from calstudy.simulate.interface import BeamSource
-from calstudy.simulate.matrix_products import PairSums, angles, product_seconds
 from calstudy.simulate.nodes import (
     SINGLE_PRECISION,
     Accuracy,
@@ -52,6 +48,8 @@ from calstudy.simulate.nodes import (
     turning_length,
 )
 from calstudy.simulate.patterns import InterpolatedPattern, Pattern, power_pattern
+from calstudy.simulate.source_sums import FlatArray, FlatSums, PairSums, angles, flat_array, product_seconds
+from calstudy.simulate.sources import SourceTracks, sky_cells, split_by_horizon, stokes_i
 
 MARGIN = 2
 """Factor by which transforms must be faster than products to be used, because the estimates are not exact."""

@@ -1,4 +1,4 @@
-"""Catalogues of point sources: reading, selection, and conversion to sky models."""
+"""Catalogues of point sources: reading of GLEAM and CSV files, its download, selection, conversion to sky models."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from pyradiosky import SkyModel
 
+from calstudy.base.downloads import default_directory, download
 from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
 from calstudy.sky.counts import FREQUENCY, SPECTRAL_INDEX
-from calstudy.sky.settings import CatalogueErrors, PointSources
+from calstudy.sky.settings import GLEAM_FILE, CatalogueErrors, CsvColumns, PointSources
 
 LOG = logging.getLogger(__name__)
 
@@ -163,3 +165,92 @@ def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:
         history="calstudy foregrounds",
         **spectrum,
     )
+
+
+def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
+    """Read point sources from a CSV file with a header line; rows without a position or flux density are left out.
+
+    The columns are right ascension and declination (ICRS, degrees), flux density (Jy) and spectral index. Raises
+    ValueError if a column is missing or not numeric, or a selected source has no spectral index.
+    """
+    table = Table.read(path, format="ascii.csv")
+    wanted = {key: getattr(columns, key) for key in ("right_ascension", "declination", "flux", "spectral_index")}
+    named = {key: name for key, name in wanted.items() if name is not None}
+    missing = [name for name in named.values() if name not in table.colnames]
+    if missing:
+        raise ValueError(f"there is no column {missing[0]}, only {', '.join(table.colnames)}")
+    values: dict[str, np.ndarray] = {
+        key: np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan) for key, name in named.items()
+    }
+    usable = np.isfinite([values[key] for key in ("right_ascension", "declination", "flux")]).all(axis=0)
+    values = {key: column[usable] for key, column in values.items()}
+    stokes = np.zeros((4, 1, int(usable.sum()))) * units.Jy
+    stokes[0, 0] = values["flux"] * units.Jy
+    spectrum: dict[str, Any] = {"spectral_type": "flat"}
+    if "spectral_index" in values:
+        spectrum = {"spectral_type": "spectral_index", "spectral_index": values["spectral_index"]}
+    return SkyModel(
+        name=np.flatnonzero(usable).astype(str),
+        skycoord=SkyCoord(values["right_ascension"], values["declination"], unit="deg", frame="icrs"),
+        stokes=stokes,
+        reference_frequency=np.full(stokes.shape[2], columns.frequency) * units.Hz,
+        component_type="point",
+        history="calstudy foregrounds",
+        **spectrum,
+    )
+
+
+LOG = logging.getLogger(__name__)
+
+# Hurley-Walker et al. (2017), second release.
+GLEAM_URL = (
+    "https://vizier.cds.unistra.fr/viz-bin/votable?-source=VIII/100/gleamegc&-out.max=unlimited"
+    "&-out=GLEAM&-out=RAJ2000&-out=DEJ2000&-out=Fintwide&-out=alpha"
+)
+GLEAM_SOURCES = 307_455
+
+
+def gleam_path() -> Path:
+    """Return the default path of the catalogue that `fetch_gleam` downloads."""
+    return default_directory() / GLEAM_FILE
+
+
+def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
+    """Download the GLEAM extragalactic catalogue from VizieR, or verify an existing copy, and return its path.
+
+    VizieR generates the table for every request and publishes no hash of it. The first download is accepted if it has
+    the required columns and the published number of sources, 307,455. Its SHA-256 is then saved next to it, and
+    checked at every later use. The directory is by default `default_directory`, and is created if necessary. Raises
+    InputError if the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
+    """
+    directory = default_directory() if directory is None else directory
+    path = directory / GLEAM_FILE
+    if path.is_file() and hash_file(path).is_file():
+        verify_gleam(path)
+        return path
+    instead = "set sky.foregrounds.path to your own copy, or use 'g4jy-and-counts', which needs no download"
+    download(GLEAM_URL, path, instead, progress=progress)
+    try:
+        found = len(read_gleam_table(path))
+    except InputError:
+        path.unlink()
+        raise
+    if found != GLEAM_SOURCES:
+        path.unlink()
+        raise InputError(f"the download from VizieR holds {found} sources, GLEAM has {GLEAM_SOURCES}: try again")
+    hash_file(path).write_text(f"{sha256(path)}  {GLEAM_FILE}\n")
+    return path
+
+
+def verify_gleam(path: Path) -> None:
+    """Raise InputError if a downloaded catalogue has changed; a user's own file has no hash and is not checked."""
+    if hash_file(path).is_file() and hash_file(path).read_text().split()[:1] != [sha256(path)]:
+        raise InputError(
+            f"{path} has changed since it was downloaded: remove it and {hash_file(path).name}, "
+            "and run `calstudy data fetch gleam`"
+        )
+
+
+def hash_file(path: Path) -> Path:
+    """Return the path of the file next to a downloaded catalogue that holds its SHA-256."""
+    return path.with_name(path.name + ".sha256")

@@ -17,11 +17,20 @@ from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.mwa_files import G4JY
 from calstudy.base.plugins import load_function, user_code
-from calstudy.sky import gleam
 from calstudy.sky import settings as section
-from calstudy.sky.catalogue import Catalogue, brightest, concatenate, read_gleam_table, to_sky_model, with_errors
+from calstudy.sky.catalogue import (
+    GLEAM_SOURCES,
+    Catalogue,
+    brightest,
+    concatenate,
+    gleam_path,
+    read_csv_catalogue,
+    read_gleam_table,
+    to_sky_model,
+    verify_gleam,
+    with_errors,
+)
 from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL_INDEX, draw_population
-from calstudy.sky.csv_catalogue import read_csv_catalogue
 from calstudy.sky.diffuse import add_skies, describe, make_diffuse
 
 LOG = logging.getLogger(__name__)
@@ -89,17 +98,17 @@ def _make(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds
 
 
 def _gleam(settings: section.GleamSources) -> Foregrounds:
-    path = gleam.default_path() if settings.path is None else settings.path
+    path = gleam_path() if settings.path is None else settings.path
     if not path.is_file():
         raise InputError(
             f"sky.foregrounds: the GLEAM catalogue is not at {path}: download it with `calstudy data fetch gleam`, "
             "set its path, or use kind: g4jy-and-counts"
         )
-    gleam.verify(path)
+    verify_gleam(path)
     catalogue = read_gleam_table(path)
     stand_in = None
-    if len(catalogue) < gleam.SOURCES:
-        stand_in = f"foregrounds: {len(catalogue)} of GLEAM's {gleam.SOURCES} sources, from {path.name}"
+    if len(catalogue) < GLEAM_SOURCES:
+        stand_in = f"foregrounds: {len(catalogue)} of GLEAM's {GLEAM_SOURCES} sources, from {path.name}"
     return Foregrounds(to_sky_model(catalogue.select(brightest(catalogue.flux, settings)), settings), stand_in)
 
 

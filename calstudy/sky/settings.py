@@ -176,7 +176,6 @@ class NoSources(Section):
 
 Foregrounds = Annotated[
     GleamSources | SyntheticSources | FileSources | CodeSources | NoSources,
-    Field(discriminator="kind"),
     choice("kind", "g4jy-and-counts"),
 ]
 
@@ -221,7 +220,7 @@ class NoDiffuse(Section):
     kind: Literal["none"] = "none"
 
 
-Diffuse = Annotated[HaslamMap | SyntheticDiffuse | NoDiffuse, Field(discriminator="kind"), choice("kind")]
+Diffuse = Annotated[HaslamMap | SyntheticDiffuse | NoDiffuse, choice("kind")]
 
 
 class Eor(Section):

@@ -14,7 +14,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from calstudy.base.errors import InputError, nearest
-from calstudy.base.plugins import Plugin, PluginField, Registry, load_file
+from calstudy.base.plugins import Plugin, Registry, load_file
+from calstudy.base.schema import KindField, Kinds
 from calstudy.experiment.model import Experiment
 from calstudy.studies.study import KINDS, Study, built_in_kinds
 
@@ -31,10 +32,10 @@ def _blocks(annotation: Any) -> list[type[BaseModel]]:
     return [item for item in _alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
 
 
-def _registry(info: FieldInfo) -> Registry[Any] | None:
-    """Return the registry of the plug-ins in a field, one or a list of them; None for other fields."""
+def _kinds(info: FieldInfo) -> Kinds[Any] | None:
+    """Return the kinds of block in a field, one or a list of them; None for other fields."""
     items = [data for item in get_args(info.annotation) for data in getattr(item, "__metadata__", ())]
-    return next((data.registry for data in [*info.metadata, *items] if isinstance(data, PluginField)), None)
+    return next((data.kinds for data in [*info.metadata, *items] if isinstance(data, KindField)), None)
 
 
 def _unit(info: FieldInfo) -> str | None:
@@ -104,21 +105,14 @@ def _section(model: type[BaseModel], path: str, listed: dict[str, str]) -> Itera
 def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[str]:
     """Write the blocks that a field accepts; nothing for other fields."""
     blocks = _blocks(info.annotation)
-    if (registry := _registry(info)) is not None:
-        yield from (f"## `{path}`: {'one' if blocks else 'a list, each'} of", "")
-        yield from _plugins(registry, path, listed)
+    if (kinds := _kinds(info)) is not None:
+        if path not in listed:
+            listed[path] = path
+            yield from (f"## `{path}`: {'one' if blocks else 'a list, each'} of", "")
+            yield from _any_of(kinds, path, listed)
     elif len(blocks) == 1:
         yield from (f"## `{path}`", "")
         yield from _section(blocks[0], path, listed)
-    # Several blocks of a choice may have the field.
-    elif blocks and path not in listed:
-        listed[path] = path
-        yield from (f"## `{path}`: one of", "")
-        for block in blocks:
-            tag = next(key for key in ("kind", "name") if key in block.model_fields)
-            tags = get_args(block.model_fields[tag].annotation)
-            yield from (f"### `{path}: {' | '.join(map(str, tags))}`", "")
-            yield from _section(block, path, listed)
     elif len(items := _items(info.annotation)) == 1:
         yield from (f"## `{path}`: each", "", *_section(items[0], path, listed))
 
@@ -131,24 +125,24 @@ def _items(annotation: Any) -> list[type[BaseModel]]:
     ]
 
 
-def _plugins(registry: Registry[Any], path: str, listed: dict[str, str]) -> Iterator[str]:
-    """Write all plug-ins of a kind, with those of installed packages; blocks that several share are written once."""
-    if registry.noun in listed:
-        yield from (f"See `{listed[registry.noun]}`.", "")
-        return
-    listed[registry.noun] = path
-    yield from (f"`{registry.tag}` is the name of {registry.a_noun}, or the path of a Python file that holds one.", "")
-    shared: dict[str, FieldInfo] = {}
-    for name in registry.names():
+def _any_of(kinds: Kinds[Any], path: str, listed: dict[str, str]) -> Iterator[str]:
+    """Write all kinds of block, with those of installed packages; blocks that several share are written once."""
+    names = kinds.built_in()
+    if isinstance(kinds, Registry):
+        if path != (first := listed.setdefault(kinds.noun, path)):
+            yield from (f"See `{first}`.", "")
+            return
+        yield from (f"`{kinds.tag}` is the name of {kinds.a_noun}, or the path of a Python file that holds one.", "")
+        names = kinds.names()
+    by_class: dict[type[BaseModel], list[str]] = {}
+    for name in names:
         try:
-            found = registry.find(name)
+            by_class.setdefault(kinds.find(name), []).append(name)
         except InputError as error:
-            yield from (f"### `{path}: {{{registry.tag}: {name}}}`", "", f"Cannot be used here: {error}", "")
-            continue
-        names = found.names() if name in registry.built_in() else ()
-        if names and name != names[0]:
-            continue
-        yield from (f"### `{path}: {{{registry.tag}: {' | '.join(names or (name,))}}}`", "")
+            yield from (f"### `{path}: {{{kinds.tag}: {name}}}`", "", f"Cannot be used here: {error}", "")
+    shared: dict[str, FieldInfo] = {}
+    for found, own in by_class.items():
+        yield from (f"### `{path}: {{{kinds.tag}: {' | '.join(own)}}}`", "")
         yield from _plain_section(found)
         blocks = {key: info for key, info in found.model_fields.items() if _blocks(info.annotation)}
         if blocks:

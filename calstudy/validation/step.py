@@ -24,7 +24,7 @@ from calstudy.base.schema import UNKEYED
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.levels import Levels
 from calstudy.experiment.model import Experiment
-from calstudy.power.drawn import input_power
+from calstudy.power.cosmology import input_power
 from calstudy.power.spectra import DelaySpectra
 from calstudy.products.corruption import LEVELS
 from calstudy.products.files import json_number, read_json, write_json

@@ -13,7 +13,7 @@ from calstudy.experiment.files import validate
 from calstudy.figures.simulated_components import draw_components, measure_components
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.telescope import make_template
-from calstudy.power.drawn import input_power
+from calstudy.power.cosmology import input_power
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.sky.eor import EorField
 from calstudy.sky.settings import Eor

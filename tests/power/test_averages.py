@@ -14,11 +14,10 @@ from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.power import cosmology as c
 from calstudy.power import delay, errors
-from calstudy.power.cylindrical import cylindrical_average
+from calstudy.power.binned import cylindrical_average, make_bin_edges, spherical_average
 from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, delay_spectra, outside_wedge
-from calstudy.power.spherical import make_bin_edges, spherical_average
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 
 SETTINGS = PowerSettings(bins=KBins(max="2.0 h/Mpc", width="0.1 h/Mpc"))

@@ -11,12 +11,11 @@ from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cub
 from calstudy.instrument.array_layouts.geometric import GolombLayout, HexLayout
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.power import cosmology as c
+from calstudy.power.binned import spherical_average
 from calstudy.power.delay import delay_transform, delays, make_taper
-from calstudy.power.estimate import estimate_power, kelvin_per_jansky, make_pairs
-from calstudy.power.optimal import DiagonalPSpecData
+from calstudy.power.estimate import DiagonalPSpecData, estimate_power, kelvin_per_jansky, make_pairs
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import delay_spectra
-from calstudy.power.spherical import spherical_average
 
 GOLOMB = GolombLayout(kind="golomb", count=5, spacing="14 m")
 

@@ -8,11 +8,11 @@ import pytest
 from calstudy.base.visibilities import from_cube
 from calstudy.experiment.files import load
 from calstudy.power.average import fringe_stop_and_average
-from calstudy.power.drawn import input_power
+from calstudy.power.binned import spherical_average
+from calstudy.power.cosmology import input_power
 from calstudy.power.interface import estimate_spectra
 from calstudy.power.realizations import inside_bars
 from calstudy.power.spectra import SphericalSpectrum
-from calstudy.power.spherical import spherical_average
 from calstudy.simulate.chunks import Component, simulate_chunk
 
 EXPERIMENT = Path(__file__).parents[2] / "experiments" / "redundant.yaml"

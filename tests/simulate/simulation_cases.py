@@ -13,9 +13,7 @@ from calstudy.instrument import settings as instrument
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.fftvis import FftvisEngine
-from calstudy.simulate.engines.matvis import MatvisEngine, missing_package
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine, missing_package
 
 needs_engines = pytest.mark.skipif(any(map(missing_package, ("matvis", "fftvis"))), reason="needs the extra [engines]")
 FAST_ENGINES = [

@@ -19,9 +19,7 @@ from calstudy.products import corruption, simulation
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.fftvis import FftvisEngine
-from calstudy.simulate.engines.matvis import MatvisEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.foregrounds import make_foregrounds
 

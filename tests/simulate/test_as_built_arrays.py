@@ -23,7 +23,7 @@ from calstudy.products import corruption, simulation, sky_model
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.other_packages import PyuvsimEngine
 
 SMALL = {
     "name": "built",

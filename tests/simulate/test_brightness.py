@@ -9,7 +9,7 @@ from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 from simulation_cases import healpix_sky
 
-from calstudy.simulate.brightness import is_polarized, stokes_i
+from calstudy.simulate.sources import is_polarized, stokes_i
 
 FREQUENCIES = np.array([172e6, 180e6, 195e6])
 

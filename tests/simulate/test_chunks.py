@@ -20,10 +20,10 @@ from calstudy.simulate.chunks import (
     simulate_chunk,
     simulate_visibilities,
 )
-from calstudy.simulate.directions import SourceTracks, split_by_horizon
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.other_packages import PyuvsimEngine
 from calstudy.simulate.nodes import EXACT, Accuracy, frequency_axis, integration_times, time_axis
+from calstudy.simulate.sources import SourceTracks, split_by_horizon
 
 ENGINE = DenseEngine()
 

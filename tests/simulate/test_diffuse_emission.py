@@ -15,7 +15,7 @@ from calstudy.instrument.beam_models.formulas import GaussianBeam
 from calstudy.instrument.settings import Channels, InstrumentSettings, Site, Times
 from calstudy.simulate.chunks import Component, simulate_visibilities
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.other_packages import PyuvsimEngine
 from calstudy.simulate.nodes import Accuracy
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky import diffuse

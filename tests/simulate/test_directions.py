@@ -7,8 +7,8 @@ import pytest
 from astropy.time import Time
 from simulation_cases import healpix_sky, observe, random_sky
 
-from calstudy.simulate.directions import SourceTracks, split_by_horizon
 from calstudy.simulate.nodes import integration_times
+from calstudy.simulate.sources import SourceTracks, split_by_horizon
 
 # Radians: 1e-10 rad of phase on a 176 m baseline.
 TOLERANCE = 1e-13

@@ -27,11 +27,8 @@ from simulation_cases import (
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.beams import ExactBeam
-from calstudy.simulate.engines.auto import FastestEngine
-from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.fftvis import FftvisEngine
-from calstudy.simulate.engines.matvis import MatvisEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.dense import DenseEngine, FastestEngine
+from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine
 from calstudy.simulate.interface import simulate_with
 from calstudy.simulate.settings import SimulationSettings
 

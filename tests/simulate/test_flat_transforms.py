@@ -15,12 +15,11 @@ from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.telescope import make_template, subset_template
 from calstudy.simulate import patches
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
-from calstudy.simulate.flat_transforms import FlatSums, flat_array, lattice_basis
+from calstudy.simulate.engines.other_packages import PyuvsimEngine
 from calstudy.simulate.interface import SimulationSize
-from calstudy.simulate.matrix_products import PairSums
 from calstudy.simulate.nodes import EXACT, Accuracy, integration_times, time_axis
 from calstudy.simulate.patterns import power_pattern
+from calstudy.simulate.source_sums import FlatSums, PairSums, flat_array, lattice_basis
 
 FREQUENCIES = np.array([170e6, 190e6])
 EOR = Accuracy(1e-4, beam_extent=20.0, smooth_sky=False)

@@ -8,7 +8,7 @@ from simulation_cases import observe, relative_error
 
 from calstudy.instrument.telescope import subset_template
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.pyuvsim import PyuvsimEngine
+from calstudy.simulate.engines.other_packages import PyuvsimEngine
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import SyntheticSources
 

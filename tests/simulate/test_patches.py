@@ -7,11 +7,11 @@ import pytest
 from simulation_cases import healpix_sky, local_coordinates, observe, point_sky, relative_error
 
 from calstudy.instrument.antenna_beams import AntennaBeams
-from calstudy.simulate.directions import SourceTracks
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.matrix_products import PairSums
 from calstudy.simulate.nodes import Accuracy, integration_times, patch_nside, time_axis
 from calstudy.simulate.patches import Patches
+from calstudy.simulate.source_sums import PairSums
+from calstudy.simulate.sources import SourceTracks
 
 ENGINE = DenseEngine()
 CHANNELS = Accuracy(1e-4, beam_extent=20.0, smooth_sky=False)

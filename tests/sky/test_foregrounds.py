@@ -16,7 +16,7 @@ from pyradiosky import SkyModel
 from scipy.integrate import quad
 
 from calstudy.base.errors import InputError
-from calstudy.sky import gleam
+from calstudy.sky import catalogue
 from calstudy.sky import settings as section
 from calstudy.sky.counts import differential_counts
 from calstudy.sky.foregrounds import make_foregrounds
@@ -119,7 +119,7 @@ def test_gleam_file_without_a_column(tmp_path):
 
 
 def test_missing_gleam_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(gleam, "default_directory", lambda: tmp_path)
+    monkeypatch.setattr(catalogue, "default_directory", lambda: tmp_path)
     with pytest.raises(InputError, match="calstudy data fetch gleam"):
         make_foregrounds(section.GleamSources(kind="gleam"), FREQUENCIES)
 
@@ -243,14 +243,14 @@ def test_fetched_gleam_is_proved_and_then_held_to_its_hash(tmp_path, monkeypatch
 
     monkeypatch.setattr("pooch.retrieve", download)
     with pytest.raises(InputError, match="6 sources, GLEAM has 307455"):
-        gleam.fetch_gleam(tmp_path, progress=False)
-    assert not (tmp_path / gleam.GLEAM_FILE).exists()
-    monkeypatch.setattr(gleam, "SOURCES", 6)
-    path = gleam.fetch_gleam(tmp_path, progress=False)
-    assert gleam.fetch_gleam(tmp_path, progress=False) == path
+        catalogue.fetch_gleam(tmp_path, progress=False)
+    assert not (tmp_path / catalogue.GLEAM_FILE).exists()
+    monkeypatch.setattr(catalogue, "GLEAM_SOURCES", 6)
+    path = catalogue.fetch_gleam(tmp_path, progress=False)
+    assert catalogue.fetch_gleam(tmp_path, progress=False) == path
     path.write_text(path.read_text().replace("J3", "J9"))
     with pytest.raises(InputError, match="has changed"):
-        gleam.fetch_gleam(tmp_path, progress=False)
+        catalogue.fetch_gleam(tmp_path, progress=False)
     with pytest.raises(InputError, match="has changed"):
         make_foregrounds(section.GleamSources(kind="gleam", path=path), FREQUENCIES)
 
@@ -261,7 +261,7 @@ def test_failed_download_is_one_sentence(tmp_path, monkeypatch):
 
     monkeypatch.setattr("pooch.retrieve", download)
     with pytest.raises(InputError, match=r"no connection to vizier.*sky\.foregrounds\.path"):
-        gleam.fetch_gleam(tmp_path)
+        catalogue.fetch_gleam(tmp_path)
 
 
 @pytest.mark.parametrize("limit", ["3.5 Jy", "10 Jy"])

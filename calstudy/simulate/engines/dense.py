@@ -1,7 +1,8 @@
-"""The dense engine: sums over patches of sources (`calstudy.simulate.patches`)."""
+"""The dense engine, sums over patches of sources (`calstudy.simulate.patches`), and the choice of an engine."""
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -9,6 +10,7 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
+from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine
 from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
 from calstudy.simulate.nodes import EXACT, SINGLE_PRECISION, Accuracy
 
@@ -26,6 +28,7 @@ class DenseEngine(Engine):
     without heights, single precision is computed by Fourier transforms.
     """
 
+    kind: str = "dense"
     precision: Literal["auto", "single", "double"] = Field(
         "auto",
         description="Of the products. double agrees with pyuvsim to rounding, single to 3e-6 of the rms; auto: single "
@@ -36,8 +39,8 @@ class DenseEngine(Engine):
         """Return the reason why this engine does not support a simulation, or None if it does."""
         from calstudy.instrument.antenna_beams import split_beams
         from calstudy.simulate import patterns
-        from calstudy.simulate.brightness import is_polarized
         from calstudy.simulate.patches import polarization_feeds
+        from calstudy.simulate.sources import is_polarized
 
         if is_polarized(sky):
             return "the dense engine does not handle a polarized sky"
@@ -74,3 +77,54 @@ class DenseEngine(Engine):
             # Fourier transforms use larger patches.
             seconds = min(seconds, 1.5e-7 * size.sources * size.slots)
         return Cost(seconds + 1.5e-6 * size.sources)
+
+
+logger = logging.getLogger(__name__)
+
+
+class FastestEngine(Engine):
+    """The first of dense, matvis, fftvis and pyuvsim that supports a simulation: the fastest."""
+
+    kind: str = "auto"
+    precision: Literal["auto", "single", "double"] = Field(
+        "auto", description="Of the engine that is chosen; pyuvsim's is always double. auto: its default."
+    )
+
+    def engines(self) -> list[Engine]:
+        """Return the engines in the order in which they are tried, fastest first."""
+        precise = {} if self.precision == "auto" else {"precision": self.precision}
+        return [DenseEngine(**precise), MatvisEngine(**precise), FftvisEngine(**precise), PyuvsimEngine()]
+
+    def choose(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> Engine:
+        """Return the fastest engine that supports a simulation, or raise InputError with the reasons of all engines."""
+        reasons = []
+        for engine in self.engines():
+            reason = engine.refusal(sky, beam, template)
+            if reason is None:
+                logger.info("simulating with %s", engine.label)
+                return engine
+            logger.info("not simulating with %s: %s", engine.label, reason)
+            reasons.append(f"{engine.label}: {reason}")
+        raise InputError("no engine handles this simulation; " + "; ".join(reasons))
+
+    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+        """Return the reasons why no engine supports a simulation, or None if one does."""
+        try:
+            self.choose(sky, beam, template)
+        except InputError as error:
+            return str(error)
+        return None
+
+    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+        """Return the visibilities of the fastest engine that supports the simulation; see `Engine.simulate`."""
+        return self.choose(sky, beam, template).simulate(sky, beam, template)
+
+    def interpolate(
+        self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
+    ) -> np.ndarray:
+        """Return the visibilities of the fastest engine to a tolerance; see `Engine.interpolate`."""
+        return self.choose(sky, beam, template).interpolate(sky, beam, template, accuracy)
+
+    def cost(self, size: SimulationSize) -> Cost:
+        """Return the cost of the first engine, which supports all skies and beams of experiment files."""
+        return self.engines()[0].cost(size)

@@ -10,11 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
-from calstudy.base.schema import Section, choice, fault
+from calstudy.base.schema import Section, fault
 from calstudy.claims.evaluation import members_by_role, refusal_of_role
 from calstudy.claims.paper import distinct_papers, unique_notes
 from calstudy.claims.product import combined_claims
@@ -35,12 +35,19 @@ class Member(Section):
     overrides: dict[str, Any] = Field(default_factory=dict, description="Fields to change (dotted path: value).")
 
 
+def _block(member: Any) -> Any:
+    return {"file": member} if isinstance(member, str) else member
+
+
+MemberOrFile = Annotated[Member, BeforeValidator(_block, json_schema_input_type=str | Member)]
+
+
 class CollectionFile(Section):
     """Several experiments that are run together, share products, and are compared."""
 
     name: StudyName = Field(description="Names the folder of the combined figures and claims.")
     description: str = ""
-    experiments: Annotated[tuple[Annotated[Member, choice("file")], ...], Field(strict=False, min_length=1)] = Field(
+    experiments: Annotated[tuple[MemberOrFile, ...], Field(strict=False, min_length=1)] = Field(
         description="Experiment files, each with its own run folder."
     )
     figures: Figures = Field((), description="Figures that compare members, such as layouts and spherical-comparison.")

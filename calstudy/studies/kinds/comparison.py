@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import digest_json, identity
 from calstudy.base.plugins import guarded
-from calstudy.base.schema import Section, choice, fault
+from calstudy.base.schema import Section, fault
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import StudyFile, apply_scale, checked, dump, override, parse_override, validate
@@ -42,7 +42,12 @@ VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
 )
 
-Block = Annotated[dict[str, Any], choice("calibrator")]
+
+def _block(block: Any) -> Any:
+    return {CALIBRATORS.tag: block} if isinstance(block, str) else block
+
+
+Block = Annotated[dict[str, Any], BeforeValidator(_block, json_schema_input_type=str | dict[str, Any])]
 
 
 class ComparisonFile(Section):
@@ -335,10 +340,6 @@ def load_worlds(
         "worlds": {experiment.name[:LONGEST_LABEL]: {}},
     }
     return Comparison.load(StudyFile(file.path, content))
-
-
-def _block(block: Any) -> dict[str, Any]:
-    return {"calibrator": block} if isinstance(block, str) else dict(block)
 
 
 def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
