@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -75,6 +76,10 @@ class Table:
         text = io.StringIO()
         csv.writer(text).writerows([self.columns, *self.rows])
         return text.getvalue()
+
+    def write_csv(self, path: Path) -> None:
+        """Write it as CSV."""
+        path.write_text(self.csv(), encoding="utf-8", newline="")
 
 
 def to_json(tables: Sequence[Table]) -> str:

@@ -91,7 +91,7 @@ def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Tas
     return RunTimeClaims("claims", papers=list(papers), title=title, runtime=run_times) if papers else None
 
 
-class Claims(Task, stage="claims", version=12):
+class Claims(Task, stage="claims", version=12, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on one run, or on the members of a collection in the roles that they play."""
 
     papers: Sequence[Any]
@@ -123,11 +123,8 @@ class Claims(Task, stage="claims", version=12):
         tables = (self.tables.get(f"{table}:{name}") for table in TABLES)
         return Results(tuple(folder for folder in tables if folder is not None), experiment)
 
-    def _cost(self) -> Cost:
-        return Cost(1, disk=1e5)
 
-
-class RunTimeClaims(Task, stage="runtime-claims", version=4):
+class RunTimeClaims(Task, stage="runtime-claims", version=4, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on a run-time study."""
 
     papers: Sequence[Paper]
@@ -142,9 +139,6 @@ class RunTimeClaims(Task, stage="runtime-claims", version=4):
 
         times = RunTimes.of(self.title, Tables((self.runtime,)))
         return _write(output, evaluation.evaluate_run_times(self.papers, times), self.title)
-
-    def _cost(self) -> Cost:
-        return Cost(1, disk=1e5)
 
 
 def _write(output: Path, found: Evaluation, title: str, notes: Sequence[str] = ()) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.table import Table
 from calstudy.calibrate.agreement import ratio_over_antennas
 from calstudy.calibrate.settings import GainFit, GainWeights
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
@@ -162,12 +162,11 @@ class Convergence(StudyFigure):
     def draw(self, job: Job) -> Drawing:
         """Combine the integrations of every solver, write convergence.csv, and draw them."""
         paths = [_path(job, label) for label in job.settings["solvers"]]
-        with (job.output / "convergence.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(COLUMNS)
-            for path in paths:
-                columns = (path.steps, path.bias, path.bias_error, path.with_eor, path.with_eor_error, path.predicted)
-                writer.writerows([path.solver, *row] for row in zip(*(part.tolist() for part in columns), strict=True))
+        rows: list[list[Any]] = []
+        for path in paths:
+            columns = (path.steps, path.bias, path.bias_error, path.with_eor, path.with_eor_error, path.predicted)
+            rows += [[path.solver, *row] for row in zip(*(part.tolist() for part in columns), strict=True)]
+        Table(COLUMNS, rows).write_csv(job.output / "convergence.csv")
         figure = draw_convergence(paths, job.settings["integrations"], stand_ins=job.settings["notes"])
         notes = {path.solver: {"steps": int(path.steps[-1]), "bias": round(float(path.bias[-1]), 4)} for path in paths}
         return Drawing(figure, {"paths": paths}, notes)

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calstudy.power.realizations import Pooled, PooledRegion
-    from calstudy.products.realization_results import RegionResults
-
+    from calstudy.products.realizations import RegionResults
 
 OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"
 CORRELATION_COLOURS = "RdBu_r"
@@ -196,7 +195,7 @@ class Realizations(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Pool all realizations, and draw them."""
-        from calstudy.products.realization_results import read_results
+        from calstudy.products.realizations import read_results
 
         results = read_results(job.settings, job.inputs)
         blocks = job.settings["blocks"]

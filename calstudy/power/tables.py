@@ -89,4 +89,4 @@ def write_transfer_csv(path: Path, transfer: TransferFunction) -> None:
 def write_columns(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Write arrays of equal length as CSV, by the names of their columns."""
     rows = list(zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True))
-    path.write_text(Table(list(columns), rows).csv(), encoding="utf-8", newline="")
+    Table(list(columns), rows).write_csv(path)

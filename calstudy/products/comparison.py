@@ -133,7 +133,7 @@ class Comparison(Task, stage="comparison", version=3):
 
         cases = read_cases(self.calibrators, self.worlds, self.cases)
         less = {world: self.differences(world, found) for world, found in cases.items()}
-        (output / CSV).write_text(Table.of_records(list(_csv_rows(cases))).csv(), encoding="utf-8", newline="")
+        Table.of_records(list(_csv_rows(cases))).write_csv(output / CSV)
         summaries = {
             world: {name: {**case.summary, "differences": less[world][name]} for name, case in found.items()}
             for world, found in cases.items()

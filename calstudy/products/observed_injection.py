@@ -227,7 +227,7 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
         return _cost_of_average(self)
 
 
-class ObservedTransfer(Injected, stage="observed-transfer", version=3):
+class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost(4, disk=1e6)):
     """T of measured data."""
 
     def make(self, output: Path) -> Mapping[str, Any]:
@@ -249,9 +249,6 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=3):
         residual = load_spectrum(self.spectra / spectrum_file("residual", "outside-wedge"), SphericalSpectrum)
         write_corrected(output, residual, signals["outside-wedge"])
         return {"transfer": summary, "warnings": _not_measured(summary)}
-
-    def _cost(self) -> Cost:
-        return Cost(4, disk=1e6)
 
 
 def _not_measured(summary: Mapping[str, Any]) -> list[str]:

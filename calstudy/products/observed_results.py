@@ -68,7 +68,7 @@ def quality(graph: MeasuredGraph) -> Task:
     )
 
 
-class ObservedSpectra(Task, stage="observed-spectra", version=1):
+class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, disk=5e6)):
     """Wedge and spherical spectra; errors are those of the noise, from the difference of halves on each baseline."""
 
     power: PowerSettings
@@ -131,9 +131,6 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1):
             bins = modes_in_bins(spectra, self.power, excise)
             found[modes] = replace(spectrum, noise_error=noise_error(spectra, bins, spectrum.k.size, of_units))
         return found
-
-    def _cost(self) -> Cost:
-        return Cost(10, disk=5e6)
 
 
 def _levels(delays: Mapping[str, DelaySpectra], what: str, source: str, buffer: float) -> np.ndarray | None:

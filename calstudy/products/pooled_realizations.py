@@ -15,7 +15,7 @@ from calstudy.power.corrected import Corrected
 from calstudy.power.realizations import QUANTITIES, TRANSFER_QUANTITIES, PooledRegion, error_ratio, mean_over_bins
 from calstudy.products import realizations
 from calstudy.products.graph import Graph, memoize
-from calstudy.products.realization_results import JUDGED_K, JUDGED_REGION, RegionResults, judge, read_results
+from calstudy.products.realizations import JUDGED_K, JUDGED_REGION, RegionResults, judge, read_results
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.criterion import Finding, Verdict
 from calstudy.verdicts.tables import from_json, tally, to_json, to_markdown, verdict_table
@@ -33,7 +33,7 @@ def pooled(graph: Graph) -> Task:
     return Pooled("realizations", title=graph.experiment.name, **settings, realizations=realizations.inputs(graph))
 
 
-class Pooled(Task, stage="pooled-realizations", version=4):
+class Pooled(Task, stage="pooled-realizations", version=4, cost=Cost(5, disk=1e6)):
     """All realizations of an experiment."""
 
     title: str
@@ -46,7 +46,7 @@ class Pooled(Task, stage="pooled-realizations", version=4):
         results = read_results(self.settings, self.realizations)
         verdicts = judge(results[JUDGED_REGION])
         rows = [row for region, found in results.items() for row in _csv_rows(region, found, self.blocks)]
-        (output / CSV).write_text(Table.of_records(rows).csv(), encoding="utf-8", newline="")
+        Table.of_records(rows).write_csv(output / CSV)
         (output / MARKDOWN).write_text(_markdown(results, verdicts, self.title, self.blocks), encoding="utf-8")
         (output / VERDICTS).write_text(to_json(verdicts) + "\n", encoding="utf-8")
         return {"verdicts": tally(verdicts), "failed": [item.name for item in verdicts if item.verdict == "FAIL"]}
@@ -55,9 +55,6 @@ class Pooled(Task, stage="pooled-realizations", version=4):
         """Return the verdicts."""
         verdicts = from_json((folder / VERDICTS).read_text(encoding="utf-8"))
         return [verdict_table(verdicts, "Realizations", "All numbers are in realizations.md and realizations.csv.")]
-
-    def _cost(self) -> Cost:
-        return Cost(5, disk=1e6)
 
 
 def _csv_rows(

@@ -120,7 +120,7 @@ class CountSteps(Timed, stage="descent", version=2):
         return Cost(20 + ADAMAX_STEP * self.work * self.max_steps, solve_memory(self.dimensions, Calamity()), 1e6)
 
 
-class RunTimes(Task, stage="runtime", version=2):
+class RunTimes(Task, stage="runtime", version=2, cost=Cost(1, disk=1e5)):
     """Medians and central 95 % intervals of all times."""
 
     machine: Mapping[str, Any]
@@ -144,11 +144,8 @@ class RunTimes(Task, stage="runtime", version=2):
             for name, found in case["seconds"].items()
         ]
         columns = (*COLUMNS, "median [s]", "2.5 % [s]", "97.5 % [s]", "samples")
-        (output / "runtime.csv").write_text(Table(columns, rows).csv(), encoding="utf-8", newline="")
+        Table(columns, rows).write_csv(output / "runtime.csv")
         return {}
-
-    def _cost(self) -> Cost:
-        return Cost(1, disk=1e5)
 
 
 def _quantiles(samples: Sequence[float]) -> dict[str, float]:

@@ -137,7 +137,7 @@ class Injected(Task):
         return [Table(columns, rows, "Signal loss", NOTE)]
 
 
-class Transfer(Injected, stage="transfer", version=4):
+class Transfer(Injected, stage="transfer", version=4, cost=Cost(1, disk=1e6)):
     """T per k outside and inside the wedge and per (|b|, tau)."""
 
     scale: Input
@@ -156,9 +156,6 @@ class Transfer(Injected, stage="transfer", version=4):
         )
         write_corrected(output, residual, signal)
         return {"transfer": summary, "flux_scale": _json(scale)}
-
-    def _cost(self) -> Cost:
-        return Cost(1, disk=1e6)
 
 
 def write_transfer(
@@ -191,7 +188,7 @@ def write_transfer(
     return summary
 
 
-class SweepSummary(Task, stage="sweep-summary", version=1):
+class SweepSummary(Task, stage="sweep-summary", version=1, cost=Cost(1, disk=1e5)):
     """T of all points of a sweep, which have their label and what was changed as text."""
 
     points: Sequence[Mapping[str, Any]]
@@ -210,8 +207,7 @@ class SweepSummary(Task, stage="sweep-summary", version=1):
                 found = load_spectrum(path, TransferFunction)
                 columns = (values(found).tolist() for values in TRANSFER_COLUMNS.values())
                 rows += [[point["label"], changes, region, *row] for row in zip(*columns, strict=True)]
-        text = Table(["point", "changes", "region", *TRANSFER_COLUMNS], rows).csv()
-        (output / SUMMARY).write_text(text, encoding="utf-8", newline="")
+        Table(("point", "changes", "region", *TRANSFER_COLUMNS), rows).write_csv(output / SUMMARY)
         return {}
 
     def shown(self, folder: Path) -> Sequence[Table]:
@@ -227,9 +223,6 @@ class SweepSummary(Task, stage="sweep-summary", version=1):
         rows = [(point, *(found[band] for band in bands)) for point, found in points.items()]
         note = "T = P^R / P^S outside the wedge, one standard deviation."
         return [Table(("point", *bands), rows, "Signal loss of every point", note)]
-
-    def _cost(self) -> Cost:
-        return Cost(1, disk=1e5)
 
 
 class FluxScale(Task, stage="flux-scale", version=1):

@@ -173,7 +173,7 @@ def read_delay_spectra(folder: Path) -> DelaySpectra:
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
 
 
-class Spectra(Task, stage="spectra", version=3):
+class Spectra(Task, stage="spectra", version=3, cost=Cost(2, disk=5e6)):
     """Wedge and spherical spectra of all variants, with errors.
 
     The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
@@ -210,9 +210,6 @@ class Spectra(Task, stage="spectra", version=3):
                 save_spectrum(output / spectrum_file(name, modes), spectrum)
                 write_csv(output / f"{name}.{modes}.csv", spectrum)
         return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
-
-    def _cost(self) -> Cost:
-        return Cost(2, disk=5e6)
 
 
 def blocks_in(averages: Iterable[Task]) -> int:

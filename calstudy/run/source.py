@@ -37,7 +37,7 @@ FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 UNREAD = {"ctx", "kind", "returns", "type_comment", "type_params"}
 """Fields of syntax trees that have no effect on a definition."""
-PLANNED = ("_cost", "task", "shown")
+PLANNED = ("_cost", "shown")
 """Methods of a kind of product that have no effect on it."""
 EFFECTS = ""
 """Name of the statements of a module that define nothing, such as a call; each definition of the module needs them."""
@@ -179,6 +179,7 @@ def _module(name: str) -> _Module | None:
     for statement in tree.body:
         if isinstance(statement, ast.ClassDef) and any(item.arg == "stage" for item in statement.keywords):
             statement.body = [item for item in statement.body if getattr(item, "name", "") not in PLANNED]
+            statement.keywords = [item for item in statement.keywords if item.arg != "cost"]
         for defined in _defined(statement):
             module.statements.setdefault(defined, []).append(statement)
     for imported, target in _imports(tree):

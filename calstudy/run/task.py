@@ -72,12 +72,14 @@ class Task(Declared, ABC):
     """
 
     stage: ClassVar[Stage]
+    typical: ClassVar[Cost]
 
     label: str = field(kw_only=False)
     temporary: bool = False
 
-    def __init_subclass__(cls, stage: str | None = None, version: int = 1) -> None:
+    def __init_subclass__(cls, stage: str | None = None, version: int = 1, cost: Cost | None = None) -> None:
         super().__init_subclass__()
+        cls.typical = cost or Cost(3, disk=1e6)
         if stage is not None:
             cls.stage = Stage(stage, version)
 
@@ -95,7 +97,7 @@ class Task(Declared, ABC):
 
     def _cost(self) -> Cost:
         """Estimate the cost of making the product."""
-        return Cost(3, disk=1e6)
+        return self.typical
 
     @cached_property
     def cost(self) -> Cost:

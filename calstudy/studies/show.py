@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory, total_memory
+from calstudy.base.table import Table
 from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
 from calstudy.report.headline import PLACE, read_signal
 from calstudy.report.page import REPORT
@@ -92,21 +92,12 @@ def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[st
 
 def show_plan(plan: Mapping[str, Any], console: Console) -> None:
     """Print a plan, from `describe_plan`."""
-    table = Table(title=f"{plan['name']}: plan for {plan['workers']} worker(s)", title_justify="left")
-    table.add_column("stage")
-    for heading in ("products", "to make", "cpu time", "memory each", "disk"):
-        table.add_column(heading, justify="right")
+    columns = ("stage", "products", "to make", "cpu time", "memory each", "disk")
+    rows = []
     for row in plan["stages"]:
-        made = row["to_make"] > 0
-        table.add_row(
-            row["stage"],
-            str(row["products"]),
-            str(row["to_make"]),
-            duration(row["seconds"]) if made else "-",
-            _gigabytes(row["memory_each"]) if made else "-",
-            _gigabytes(row["disk"]) if made else "-",
-        )
-    console.print(table)
+        costs = (duration(row["seconds"]), _gigabytes(row["memory_each"]), _gigabytes(row["disk"]))
+        rows.append((row["stage"], str(row["products"]), str(row["to_make"]), *(costs if row["to_make"] else "---")))
+    Table(columns, rows, f"{plan['name']}: plan for {plan['workers']} worker(s)").show(console)
     if plan["setup"]:
         console.print(plan["setup"], markup=False)
     for product in plan["damaged"]:
@@ -161,21 +152,15 @@ def _show_products(run: Run, console: Console) -> None:
     made = {task.key for task in run.made.tasks}
     if not made:
         console.print("everything was in the store: nothing was computed")
-    table = Table(title="products", title_justify="left")
-    table.add_column("stage")
-    for heading in ("made", "from store", "cpu time", "peak memory"):
-        table.add_column(heading, justify="right")
+    rows = []
     for stage, tasks in _by_stage(run.tasks).items():
         records = [run.made.products[task.key].record for task in tasks if task.key in made]
         stored = sum(task.key in run.made.products and task.key not in made for task in tasks)
-        table.add_row(
-            stage,
-            str(len(records)),
-            str(stored),
-            duration(sum(record["cpu_seconds"] for record in records)) if records else "-",
-            _gigabytes(max(record["peak_memory_bytes"] for record in records)) if records else "-",
-        )
-    console.print(table)
+        seconds = sum(record["cpu_seconds"] for record in records)
+        memory = max((record["peak_memory_bytes"] for record in records), default=0)
+        cost = (duration(seconds), _gigabytes(memory)) if records else "--"
+        rows.append((stage, str(len(records)), str(stored), *cost))
+    Table(("stage", "made", "from store", "cpu time", "peak memory"), rows, "products").show(console)
     for warning in run.warnings:
         console.print(f"warning: {warning}", markup=False)
     _show_signal(run.folder, console)

@@ -224,7 +224,7 @@ def step_task(step: Step, experiments: Mapping[str, Experiment]) -> Task:
     )
 
 
-class Validate(Task, stage="validate", version=4):
+class Validate(Task, stage="validate", version=4, cost=Cost(60, 3e9, 1e6)):
     """The numbers of a step, measured on the sections of its experiments and their products."""
 
     measurement: Step
@@ -253,6 +253,3 @@ class Validate(Task, stage="validate", version=4):
         }
         write_json(output / FINDINGS, {"findings": findings, "remarks": list(found.remarks)})
         return {"findings": findings}
-
-    def _cost(self) -> Cost:
-        return Cost(60, 3e9, 1e6)

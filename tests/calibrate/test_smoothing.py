@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from test_calamity import make_uvdata
 from tiny import tiny
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.calibrators.least_squares import SkyBased
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import DpssSmoothing, PolynomialSmoothing, SmoothCal
 from calstudy.calibrate.smoothing import smooth
-from calstudy.experiment.files import validate
+from calstudy.experiment.files import checked, validate
 from calstudy.products.calibration import calibration
 from calstudy.products.graph import Graph
 
@@ -176,8 +178,8 @@ def test_gains_that_are_smoothed_in_time_are_not_cut_in_pieces(tmp_path):
     ],
 )
 def test_what_smooths_nothing_is_refused(given, told):
-    with pytest.raises(ValueError, match=told):
-        SkyBased.model_validate({"smooth_gains": given})
+    with pytest.raises(ExperimentError, match=told):
+        checked(SkyBased, {"smooth_gains": given}, Path())
 
 
 def test_a_single_integration_has_no_time_to_smooth():

@@ -419,7 +419,7 @@ def changed(experiment: dict, changes: dict) -> dict:
         ),
         ({"corruption.eor_level": "-30 dB"}, "corruption.eor_level is not -40 dB"),
         ({"sky.diffuse": "haslam"}, "sky.diffuse is 'haslam'"),
-        ({"calibration.assumed": {"sky.foregrounds.count": 3}}, "calibration.assumed is"),
+        ({"calibration.assumed": {"sky.foregrounds.count": 3}}, "calibration.assumed.sky.foregrounds.count is 3"),
         (
             {"variants": {"residual": {"components": ["eor"], "calibrate": True}}},
             "variants.residual is not the paper's",

@@ -5,7 +5,7 @@ import pytest
 from realization_samples import BINS, LOSS, design_of, draw
 
 from calstudy.figures.realizations import _differences, draw_comparison, draw_realizations
-from calstudy.products.realization_results import JUDGED_REGION, RegionResults, judge, results_of
+from calstudy.products.realizations import JUDGED_REGION, RegionResults, judge, results_of
 
 DESIGN = design_of((("gains", "noise"), 10), (("eor",), 4))
 

@@ -17,8 +17,15 @@ from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.array_layouts.geometric import LinearLayout
 from calstudy.instrument.settings import Channels
-from calstudy.products.paper_step import PaperStep
-from calstudy.products.step_times import Descent, Samples, descend, make_simulation, time_steps, time_steps_apart
+from calstudy.products.step_times import (
+    Descent,
+    PaperStep,
+    Samples,
+    descend,
+    make_simulation,
+    time_steps,
+    time_steps_apart,
+)
 
 CHANNELS = Channels(first="120.3 MHz", width="600 kHz", count=100)
 LINE = LinearLayout(kind="linear", count=6, spacing="20 m")

@@ -1,5 +1,6 @@
 """Runs are fitted to the memory there is, without changing what they make."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ def targets_of(experiment: Experiment) -> list[Task]:
     return ExperimentStudy(experiment).targets
 
 
-def fit(experiment: Experiment, *budget: int | str | None, targets: capacity.Targets = targets_of):
+def fit(experiment: Experiment, *budget: int | str | None, targets: Callable = targets_of):
     return capacity.fit(experiment, Budget(*budget), targets)
 
 

@@ -8,7 +8,6 @@ at the true gains.
 
 from __future__ import annotations
 
-import csv
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from matplotlib.lines import Line2D
 from pydantic import Field
 
 from calstudy.base.schema import Section
+from calstudy.base.table import Table
 from calstudy.base.units import Delay
 from calstudy.calibrate.settings import InitialGains, UnityStart
 from calstudy.corrupt.levels import rms
@@ -148,12 +148,9 @@ class BasinOfConvergence(SingleIntegrationStep):
             converged=np.reshape([fits[cell][0].status == "converged" for cell in cells], shape),
             arrived=ARRIVED,
         )
-        with (output / "basin.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(COLUMNS)
-            for cell in cells:
-                record, misfit = fits[cell]
-                writer.writerow([*cell, record.status, record.steps, misfit, record.message])
+        found = ((cell, *fits[cell]) for cell in cells)
+        rows = [(*cell, record.status, record.steps, misfit, record.message) for cell, record, misfit in found]
+        Table(COLUMNS, rows).write_csv(output / "basin.csv")
         save_figure(draw_basin(basin), figure_arrays(basin), output, "basin")
         return Findings(_findings(basin), _remarks(basin))
 

@@ -19,7 +19,6 @@ error comes from leaving out antennas (`calstudy.power.clusters`).
 
 from __future__ import annotations
 
-import csv
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from calstudy.base.table import Table
 from calstudy.base.visibilities import to_cube
 from calstudy.experiment.model import Variant
 from calstudy.instrument.beams import make_beam
@@ -102,17 +102,15 @@ class SignalLossBudget(Step):
         values, remarks, rows = {}, [], []
         for name, run in runs.items():
             bands = budget(run)
-            rows += [(name, band) for band in bands]
+            rows += [
+                (name, band.low, band.high, *band.losses, band.total, band.measured.value, band.measured.uncertainty)
+                for band in bands
+            ]
             worst = max(bands, key=lambda band: abs(band.pull))
             values[f"{name}_worst_pull"] = Finding(abs(worst.pull), 1.0)
             remarks += [f"{name}: {_sentence(band)}" for band in bands]
-        with (output / "signal_loss_budget.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["experiment", "k from [h/Mpc]", "k to [h/Mpc]", *STAGES, "sum", "end to end", "error"])
-            writer.writerows(
-                [name, band.low, band.high, *band.losses, band.total, band.measured.value, band.measured.uncertainty]
-                for name, band in rows
-            )
+        columns = ("experiment", "k from [h/Mpc]", "k to [h/Mpc]", *STAGES, "sum", "end to end", "error")
+        Table(columns, rows).write_csv(output / "signal_loss_budget.csv")
         return Findings(values, tuple(remarks))
 
 
