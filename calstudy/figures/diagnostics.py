@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
-from scipy.signal.windows import blackmanharris
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -86,6 +85,8 @@ def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.nd
     `cube` holds visibilities, zero where flagged, (Ntimes, Nbls, Nfreqs); `positions` are channel numbers on an even
     grid of `n_channels`, (Nfreqs,). A tone at a delay of the transform keeps its amplitude.
     """
+    from scipy.signal.windows import blackmanharris
+
     taper = blackmanharris(n_channels)
     power = np.zeros((cube.shape[1], n_channels))
     for integration in cube:
