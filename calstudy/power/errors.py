@@ -25,7 +25,6 @@ import dataclasses
 
 import numpy as np
 from astropy import constants
-from scipy.spatial import cKDTree
 
 from calstudy.power.delay import mode_correlation
 from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
@@ -117,6 +116,8 @@ def with_errors(
 
 def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
+    from scipy.spatial import cKDTree
+
     rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / constants.c.value) ** 2
     reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
     tree = cKDTree(spectra.vectors)
