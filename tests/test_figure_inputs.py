@@ -11,7 +11,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal
 from calstudy.base.visibilities import antenna_indices, antenna_pairs, baseline_vectors, from_cube
 from calstudy.experiment.model import FIGURES
-from calstudy.figures import draw
+from calstudy.figures import Draw
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
@@ -203,7 +203,9 @@ def test_an_integration_without_solution_is_refused(made, tmp_path):
 
 @pytest.mark.parametrize("name", ["layout", "gains", "model", "data", "baselines", "reflections"])
 def test_every_figure_leaves_picture_and_arrays(made, tmp_path, name):
-    draw(made.job(*made.folders, output=tmp_path, figure=FIGURES.make(name), baselines=None))
+    job = made.job(*made.folders, baselines=None)
+    own = {key: value for key, value in job.settings.items() if key != "notes"}
+    Draw(name, figure=FIGURES.make(name), notes=[], own=own, products=job.inputs).make(tmp_path)
     assert {path.suffix for path in tmp_path.iterdir()} == {".png", ".pdf", ".npz"}
     if name == "reflections":
         with np.load(tmp_path / "reflections.npz") as arrays:

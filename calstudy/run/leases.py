@@ -53,17 +53,20 @@ class Lease:
         Products that a run made to be kept stay, and so does everything in a read-only store.
         """
         given_up = list(tasks)
-        if not given_up or not self._store.root.is_dir():
+        found = {task.key: self._store.find(task.stage.name, task.key) for task in given_up}
+        temporary = {
+            key: product for key, product in found.items() if product is not None and product.record.get("temporary")
+        }
+        if not temporary and self._keys.isdisjoint(found):
             return
         with suppress(OSError), self._store.lock(*LOCK):
             if self._keys:
-                self._keys.difference_update(task.key for task in given_up)
+                self._keys.difference_update(found)
                 self._write()
             needed = needed_by_runs(self._store, self._path)
-            for task in given_up:
-                product = self._store.find(task.stage.name, task.key)
-                if product is not None and product.record.get("temporary") and task.key not in needed:
-                    self._store.discard(task.stage.name, task.key)
+            for key, product in temporary.items():
+                if key not in needed:
+                    self._store.discard(product.record["stage"], key)
 
     def _write(self) -> None:
         new = self._path.with_suffix(".new")

@@ -318,11 +318,11 @@ def make(
         If the store must be written and cannot be, or a stage refuses its input.
     """
     lease = Lease(store)
-    if targets and not store.root.exists():
+    is_complete = len(found_of(targets, store)) == len({task.key for task in targets})
+    if not is_complete and not strict:
         store.prepare()
-    # A store that cannot be written is not changed.
-    is_shared = os.access(store.root, os.W_OK)
-    with lease.holding(task.key for task in unique(targets)) if is_shared else nullcontext():
+    # A complete store is only read, unless a product turns out to be damaged, which no other run removes.
+    with nullcontext() if is_complete and not strict else lease.holding(task.key for task in unique(targets)):
         return _make_missing(schedule(targets, store, strict=strict), targets, lease, store, workers, console)
 
 

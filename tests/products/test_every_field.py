@@ -75,6 +75,7 @@ SAME: dict[str, str] = {
     "Folders.runs": "where products go",
     "GainFit.models_at_once": "how much is worked on at a time",
     "PyuvsimEngine.precision": "has one value",
+    "Eor.path": "a file, which counts by its content",
     "MwaEmbeddedBeam.path": "a file, which counts by its content",
     "ForegroundPrior.mean": "follows from the deviations",
 }

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from calstudy.base.errors import InputError
-from calstudy.power import drawn
+from calstudy.power.cosmology import input_power
 from calstudy.sky.eor import HYDROGEN_LINE, EorField, comoving_geometry
 from calstudy.sky.settings import Eor
 
@@ -183,9 +183,9 @@ def test_a_table_of_a_power_law_is_the_power_law(table):
 def test_the_input_power_of_a_table_is_the_table_in_its_own_units(table):
     k, power = np.loadtxt(table, unpack=True)
     settings = Eor(spectrum="table", path=table)
-    np.testing.assert_allclose(drawn.input_power(settings, k, "Planck15"), power, rtol=1e-9)
+    np.testing.assert_allclose(input_power(settings, k, "Planck15"), power, rtol=1e-9)
     # Constant beyond its ends.
-    np.testing.assert_allclose(drawn.input_power(settings, [1e-8, 100.0], "Planck15"), power[[0, -1]], rtol=1e-9)
+    np.testing.assert_allclose(input_power(settings, [1e-8, 100.0], "Planck15"), power[[0, -1]], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

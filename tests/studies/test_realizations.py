@@ -191,6 +191,7 @@ def test_a_run_leaves_tables_a_figure_and_verdicts(finished):
         "realizations.csv",
         "realizations.md",
         "realizations.json",
+        "tables.json",
     }
     with (finished.folder / "tables" / "realizations.csv").open() as file:
         rows = list(csv.DictReader(file))

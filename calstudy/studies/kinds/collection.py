@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -29,6 +29,9 @@ from calstudy.studies.study import KINDS, kind_of
 
 class Member(Section):
     """One experiment of the collection; a file name alone is allowed in place of the block."""
+
+    # The file is read as that of a study, and named in messages as it is written.
+    holds_input_files: ClassVar[bool] = False
 
     file: Path = Field(strict=False, description="The experiment file; a relative path starts at the collection file.")
     name: StudyName | None = Field(None, description="Replaces the experiment's own name.")
