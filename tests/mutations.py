@@ -193,8 +193,13 @@ MUTATIONS = (
     ),
     Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, told):", "if True:", STORE),
     Mutation("verify reads no file", 'sha256(product.path / name) == entry["sha256"]', "True", STORE),
-    Mutation("a kept product is dropped", 'product.record.get("temporary") and ', "", STORE),
-    Mutation("what other runs need is dropped", " and task.key not in needed", "", STORE),
+    Mutation("a kept product is dropped", ' and product.record.get("temporary")', "", STORE),
+    Mutation(
+        "what other runs need is dropped",
+        "if key not in needed:\n                    self",
+        "if True:\n                    self",
+        STORE,
+    ),
     Mutation(
         "a reference holds whatever moved",
         "return largest > rule.largest or",
