@@ -42,7 +42,12 @@ class Mutation:
 SIMULATION = ("tests/simulate/test_patches.py", "tests/simulate/test_engines.py", "tests/simulate/test_chunks.py")
 CORRUPTION = ("tests/corrupt",)
 AVERAGES = ("tests/power/test_average.py", "tests/power/test_averages.py")
-SPECTRA = ("tests/power/test_estimate.py", "tests/power/test_sample_variance.py", "tests/power/test_transfer.py")
+SPECTRA = (
+    "tests/power/test_averages.py",
+    "tests/power/test_estimate.py",
+    "tests/power/test_sample_variance.py",
+    "tests/power/test_transfer.py",
+)
 SCORES = ("tests/power/test_score.py", "tests/power/test_clusters.py")
 FITS = ("tests/calibrate/test_solvers.py", "tests/calibrate/test_calamity.py")
 STORE = ("tests/run/test_store.py", "tests/run/test_perform.py", "tests/run/test_leases.py")
@@ -193,8 +198,13 @@ MUTATIONS = (
     ),
     Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, told):", "if True:", STORE),
     Mutation("verify reads no file", 'sha256(product.path / name) == entry["sha256"]', "True", STORE),
-    Mutation("a kept product is dropped", 'product.record.get("temporary") and ', "", STORE),
-    Mutation("what other runs need is dropped", " and task.key not in needed", "", STORE),
+    Mutation("a kept product is dropped", ' and product.record.get("temporary")', "", STORE),
+    Mutation(
+        "what other runs need is dropped",
+        "if key not in needed:\n                    self",
+        "if True:\n                    self",
+        STORE,
+    ),
     Mutation(
         "a reference holds whatever moved",
         "return largest > rule.largest or",
@@ -214,7 +224,7 @@ def copied(folder: Path) -> None:
     """Copy the files of the repository that git knows, as they are now."""
     names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in filter(None, names.split("\0")):
-        if (ROOT / name).is_file():
+        if (ROOT / name).is_file() or (ROOT / name).is_symlink():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name, follow_symlinks=False)
 

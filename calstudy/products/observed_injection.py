@@ -28,6 +28,7 @@ from calstudy.products.spectra import EXCISION, InBlocks, cross_power
 from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Task
 from calstudy.simulate.interface import SimulationSize
+from calstudy.verdicts.measured import HIGHEST, LARGEST_ERROR, LOWEST
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,8 +40,6 @@ if TYPE_CHECKING:
     from calstudy.sky.settings import Eor
 
 FACTOR = "factor.json"
-LARGEST_ERROR = 0.5
-"""Standard deviation of a T that is measured: T is a fraction, and 95 % intervals of larger ones hold all of 0 to 1."""
 
 
 @memoize
@@ -227,7 +226,7 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
         return _cost_of_average(self)
 
 
-class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost(4, disk=1e6)):
+class ObservedTransfer(Injected, stage="observed-transfer", version=4, cost=Cost(4, disk=1e6)):
     """T of measured data."""
 
     def make(self, output: Path) -> Mapping[str, Any]:
@@ -239,7 +238,7 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost
 
         found = self.read()
         # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
-        summary = write_transfer(output, found, self.power, 1.0, LARGEST_ERROR)
+        summary = write_transfer(output, found, self.power, 1.0, only_measured=True)
         signals = {}
         for modes, excise in EXCISION.items():
             spectrum = spherical_average(found.signal, self.power, excise)
@@ -253,16 +252,15 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost
 
 def _not_measured(summary: Mapping[str, Any]) -> list[str]:
     """Return a sentence that names the bands outside the wedge in which T is not measured; none without any."""
-    unknown = [band for band in summary["outside-wedge"] if band["transfer"] is None and band["error"] is not None]
+    unknown = [band for band in summary["outside-wedge"] if band["error"] is not None and band["not_measured"]]
     if not unknown:
         return []
-    named = ", ".join(
-        f"{low:g} to {high:g} (error {band['error']:.2g})" for band in unknown for low, high in [band["k"]]
-    )
+    named = ", ".join(f"{low:g} to {high:g} ({band['not_measured']})" for band in unknown for low, high in [band["k"]])
     return [
-        f"T is not measured at k of {named} h/Mpc: an error above {LARGEST_ERROR:g} leaves open all that T can be; "
-        "interference that is not flagged (observed.flag_interference: true), few integrations or a weak "
-        "injection.level are the usual reasons"
+        f"T is not measured at k of {named} h/Mpc: T is the part of the EoR that is left, so that a T below {LOWEST:g} "
+        f"or above {HIGHEST:g} is none, and an error above {LARGEST_ERROR:g} leaves open what it is; interference that "
+        "is not flagged (observed.flag_interference: true), few integrations or a weak injection.level are the usual "
+        "reasons"
     ]
 
 
