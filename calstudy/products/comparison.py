@@ -223,7 +223,7 @@ def _markdown(
     less: Mapping[str, Mapping[str, Sequence[Mapping[str, Any]]]],
     summaries: Mapping[str, Mapping[str, Mapping[str, Any]]],
 ) -> str:
-    standing = standings(summaries, [tuple(refusal) for refusal in task.refusals])
+    standing = standings(summaries, [(world, name, why) for world, name, why in task.refusals])
     answer = standing_table(standing)
     lines = [
         f"# Calibrators compared: {task.title}",
