@@ -20,7 +20,6 @@ from calstudy.base.observation import Frame
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.given_gains import ByFile
-from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
 from calstudy.calibrate.settings import GainFit
@@ -59,7 +58,7 @@ class DataFile(Section):
     description: str = ""
     observed: DataSettings
     calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Field(
-        default_factory=Calamity,
+        default_factory=lambda: CALIBRATORS.make("calamity"),
         description="As in an experiment. Without `solver`, Gauss-Newton steps go on longer, for data of few baselines "
         "converge slowly; without `prior` and sky model, the size of the gains fixes the scale.",
     )
