@@ -13,10 +13,10 @@ from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
 from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
 from calstudy.figures.wedge import draw_panels
 from calstudy.plotting import style
-from calstudy.products.expected_loss import EXPECTED, expected_loss
+from calstudy.products.expected_loss import EXPECTED
 from calstudy.products.files import spectrum_file
 from calstudy.products.graph import required
-from calstudy.products.observed_injection import transfer
+from calstudy.products.observed_injection import expected_loss, transfer
 from calstudy.products.observed_results import observed_spectra
 from calstudy.products.signal_loss import TRANSFER as FILE
 from calstudy.run.task import Job, Task

@@ -264,7 +264,7 @@ class ExpectedLossFigure(StudyFigure):
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return expectation and measurement."""
         return {
-            "expected": required(expected_loss.expected_loss(graph)),
+            "expected": expected_loss.expected_loss(graph),
             "transfer": required(signal_loss.transfer(graph)),
         }
 

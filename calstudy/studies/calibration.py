@@ -26,10 +26,10 @@ from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
-from calstudy.products.expected_loss import TRANSFER, expected_transfer
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, read_json
 from calstudy.products.graph import MeasuredGraph
 from calstudy.products.observed import calibrated, observed
+from calstudy.products.observed_injection import EXPECTED_TRANSFER, expected_transfer
 from calstudy.products.observed_results import QUALITY, quality
 from calstudy.realdata.halves import WHOLE, Facts, Parts, modelled, read_facts
 from calstudy.realdata.interference import require_surroundings
@@ -283,7 +283,7 @@ def require_free(output: Path, overwrite: bool) -> None:
         raise InputError(f"output = {output}: is a file, not a folder")
     names = (GAINS, CALFITS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
     present = [name for name in names if (output / name).exists()]
-    present += [path.name for path in sorted(output.glob(f"{TRANSFER}.*.h5"))]
+    present += [path.name for path in sorted(output.glob(f"{EXPECTED_TRANSFER}.*.h5"))]
     if present and not overwrite:
         raise InputError(f"output = {output}: holds {', '.join(present)} already; use `overwrite` or another folder")
     require_writable(output.absolute(), f"output = {output}")

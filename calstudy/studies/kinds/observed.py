@@ -15,9 +15,8 @@ from calstudy.experiment.model import FIGURES
 from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.power.settings import PowerSettings
-from calstudy.products.expected_loss import expected_loss
 from calstudy.products.graph import MeasuredGraph
-from calstudy.products.observed_injection import transfer
+from calstudy.products.observed_injection import expected_loss, transfer
 from calstudy.products.observed_results import observed_spectra, quality
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
