@@ -40,13 +40,14 @@ from calstudy.products.files import (
 from calstudy.report.headline import read_headline
 from calstudy.results.folder import EXPERIMENT, RunFolder
 from calstudy.results.reader import Tables
+from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task
 from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study, study_of
 from calstudy.studies.show import describe_plan, show_plan
-from calstudy.studies.study import Budget, Study, run_study
+from calstudy.studies.study import Study, run_study
 from calstudy.verdicts.standing import LIMIT
 
 if TYPE_CHECKING:

@@ -91,8 +91,8 @@ def calibrate(
     from calstudy.base.resources import parse_memory
     from calstudy.products.files import quiet_libraries
     from calstudy.realdata.selection import split_selections
+    from calstudy.run.execution import Budget
     from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
-    from calstudy.studies.study import Budget
 
     changes = {
         "solver": solver,

@@ -102,10 +102,11 @@ def run(
 
     Products that are in the store are not made again; the same command resumes an interrupted run.
     """
+    from calstudy.run.execution import Budget
     from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import show_run
-    from calstudy.studies.study import Budget, run_study
+    from calstudy.studies.study import run_study
 
     console = Console(soft_wrap=True, highlight=False)
     changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
@@ -127,10 +128,10 @@ def plan(
     as_json: AsJson = False,
 ) -> None:
     """Show what a run would do: stages, products in the store, estimated time, memory and disk."""
+    from calstudy.run.execution import Budget
     from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import describe_plan, show_plan
-    from calstudy.studies.study import Budget
 
     study = load_study(file, scale, overrides or ())
     if finished:

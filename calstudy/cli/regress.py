@@ -48,7 +48,7 @@ def regress(
     from calstudy.regression.reference import accept, find_references
     from calstudy.regression.remake import remake
     from calstudy.regression.tables import show, write_json
-    from calstudy.studies.study import Budget
+    from calstudy.run.execution import Budget
 
     console = Console(soft_wrap=True, highlight=False)
     if against is not None:

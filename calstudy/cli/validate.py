@@ -34,7 +34,7 @@ def validate(
     Exit status 0 if every step passes, 1 if one fails.
     """
     from calstudy.experiment.files import StudyFile
-    from calstudy.studies.study import Budget
+    from calstudy.run.execution import Budget
     from calstudy.validation.ladder import Ladder, passed, run_ladder, tally
     from calstudy.verdicts.tables import show_verdicts, to_json
 

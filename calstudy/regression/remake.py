@@ -9,8 +9,9 @@ from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.regression.reference import EXPERIMENT
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 
 
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:

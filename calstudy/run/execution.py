@@ -53,6 +53,25 @@ class Schedule:
 
 
 @dataclass(frozen=True)
+class Budget:
+    """Resources of a run.
+
+    Attributes
+    ----------
+    workers
+        Number of worker processes, or None for one per core within the memory.
+    max_memory
+        Memory of all workers together, such as "6 GB", or None for all free memory.
+    scheduler
+        Address of a running dask scheduler, whose memory is not checked, or None.
+    """
+
+    workers: int | None = None
+    max_memory: str | None = None
+    scheduler: str | None = None
+
+
+@dataclass(frozen=True)
 class Workers:
     """The processes that make the products.
 

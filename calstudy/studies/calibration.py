@@ -34,12 +34,12 @@ from calstudy.products.observed_results import QUALITY, quality
 from calstudy.realdata.halves import WHOLE, Facts, Parts, modelled, read_facts
 from calstudy.realdata.interference import require_surroundings
 from calstudy.realdata.settings import DataSettings, with_defaults
-from calstudy.run.execution import Workers
+from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import LOG, log_to, publish
-from calstudy.studies.study import Budget, RunProducts, Study, make
+from calstudy.studies.study import RunProducts, Study, make
 
 CALFITS, FIGURE, UNFINISHED = "gains.calfits", "diagnostics", ".unfinished"
 FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))

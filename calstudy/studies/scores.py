@@ -27,12 +27,12 @@ from calstudy.products.graph import Graph, required
 from calstudy.products.score import MEASURED, SUMMARY
 from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import COUNTS, upper_limit
-from calstudy.run.execution import Workers
+from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store
 from calstudy.studies.export import Contents
 from calstudy.studies.folder import log_to
 from calstudy.studies.kinds.comparison import Comparison
-from calstudy.studies.study import Budget, make
+from calstudy.studies.study import make
 from calstudy.verdicts.measured import LARGEST_ERROR, is_measured
 from calstudy.verdicts.standing import standing_table, standings
 

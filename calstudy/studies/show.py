@@ -15,11 +15,11 @@ from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
 from calstudy.report.headline import PLACE, measured_numbers, read_signal
 from calstudy.report.page import REPORT
 from calstudy.results.folder import MANIFEST, RunFolder
-from calstudy.run.execution import largest_disk, schedule
+from calstudy.run.execution import Budget, largest_disk, schedule
 from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
-from calstudy.studies.study import Budget, Run, Study, said_of_other_code
+from calstudy.studies.study import Run, Study, said_of_other_code
 from calstudy.verdicts.standing import answers, standing_table
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_MARKDOWN, measured, tally
 

@@ -21,8 +21,9 @@ from calstudy.regression.comparison import compare_array, compare_claims, compar
 from calstudy.regression.reference import accept, find_references, read_reference, read_run
 from calstudy.regression.remake import remake
 from calstudy.regression.tables import Regression, show
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 from calstudy.verdicts.criterion import Verdict
 
 QUIET = Console(quiet=True)

@@ -27,11 +27,12 @@ from calstudy.products import tolerances
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import MeasureScore, score
+from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
 from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
 from calstudy.studies.preflight import refusal_of_calibrator
-from calstudy.studies.study import KINDS, Budget, kind_of
+from calstudy.studies.study import KINDS, kind_of
 
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")

@@ -24,12 +24,13 @@ from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.products.signal_loss import transfer
 from calstudy.products.spectra import spectra
+from calstudy.run.execution import Budget
 from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit, require_data_fit
 from calstudy.studies.preflight import notes_of, require_possible
 from calstudy.studies.setup import describe_data, describe_setup
-from calstudy.studies.study import Budget, Study, built_in_kinds
+from calstudy.studies.study import Study, built_in_kinds
 
 SKY_MODEL_TABLE = "sky-model.csv"
 AS_BUILT_TABLE = "as-built.csv"
