@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calstudy.base.errors import InputError
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json
 from calstudy.base.resources import cores
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.provenance import of_other_code

@@ -25,8 +25,7 @@ from uuid import uuid4
 from filelock import FileLock, Timeout
 
 from calstudy.base.errors import InputError, error_number
-from calstudy.base.files import sha256
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json, sha256
 
 RECORD, DIGEST = "product.json", "digest"
 """The record of a product, and its field with the digest of all others."""

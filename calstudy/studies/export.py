@@ -13,8 +13,8 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
+from calstudy.base.files import digest_json
 from calstudy.base.gains import CASACORE
-from calstudy.base.identity import digest_json
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
-from calstudy.base.files import sha256
-from calstudy.base.identity import digest_json, identity
+from calstudy.base.files import digest_json, sha256
+from calstudy.base.identity import identity
 from calstudy.base.schema import Section
 from calstudy.base.table import Table, one_line, plain_text
 from calstudy.calibrate.records import Status

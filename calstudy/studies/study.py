@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 
 from rich.console import Console
 
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
 from calstudy.base.table import to_json

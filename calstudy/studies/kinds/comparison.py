@@ -14,7 +14,8 @@ import yaml
 from pydantic import BeforeValidator, Field, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.identity import digest_json, identity
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.interface import CALIBRATORS
