@@ -320,7 +320,7 @@ class OpenRun:
     @property
     def cylindrical(self) -> ByVariant:
         """Cylindrical power spectra, by variant: datasets with `power` against `baseline_length` and `delay`."""
-        from calstudy.results.labelled import by_length_and_delay
+        from calstudy.results.reader import by_length_and_delay
 
         return self._by_variant(lambda name: by_length_and_delay(self._tables.wedge(name)))
 
@@ -337,7 +337,7 @@ class OpenRun:
     @property
     def transfer_map(self) -> xarray.Dataset:
         """The transfer function against `baseline_length` and `delay`."""
-        from calstudy.results.labelled import by_length_and_delay
+        from calstudy.results.reader import by_length_and_delay
 
         return by_length_and_delay(self._tables.transfer_map())
 
@@ -488,14 +488,14 @@ class OpenRun:
         return ByVariant(self._tables.variants, read)
 
     def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
-        from calstudy.results.labelled import by_wavenumber
+        from calstudy.results.reader import by_wavenumber
 
         return lambda name: by_wavenumber(self._tables.spherical(name, modes))
 
     def _by_region(self, read: Callable[[str], TransferFunction]) -> xarray.Dataset:
         import xarray
 
-        from calstudy.results.labelled import by_wavenumber
+        from calstudy.results.reader import by_wavenumber
 
         found = [by_wavenumber(read(region)) for region in REGIONS]
         return xarray.concat(found, xarray.IndexVariable("region", list(REGIONS)), combine_attrs="override")

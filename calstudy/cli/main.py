@@ -22,14 +22,12 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import DiskError, ExperimentError, InputError, Terminated, exit_status, refusal_of_disk
 from calstudy.base.mwa_files import MWA_FILES
-from calstudy.cli.calibrate import calibrate
-from calstudy.cli.compare_gains import compare_gains
+from calstudy.cli.calibrate import calibrate, compare_gains
+from calstudy.cli.checks import regress, validate
 from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
-from calstudy.cli.regress import regress
 from calstudy.cli.start import init, write_schema
 from calstudy.cli.storage import runs, store
-from calstudy.cli.validate import validate
 
 app = typer.Typer(
     cls=Sections,

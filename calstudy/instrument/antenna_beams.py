@@ -20,8 +20,8 @@ from calstudy.base.plugins import guarded
 from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beam_grid import bspline_coefficients, cells, fixed_components, polar_components, spline_fields
 from calstudy.instrument.beams import make_beam
-from calstudy.instrument.distinct_beams import AssignedBeam, assigned_beams, nominal_beams
 from calstudy.instrument.interface import AntennaBeam, AntennaBeams, Beam, model_of
+from calstudy.instrument.settings import AssignedBeam, assigned_beams, nominal_beams
 from calstudy.instrument.tabulated import describe, tabulate
 
 if TYPE_CHECKING:

@@ -21,9 +21,8 @@ from calstudy.instrument.as_built import Misalignment, dipole_amplitudes, misali
 from calstudy.instrument.beam_frequencies import MWA_GROUP
 from calstudy.instrument.beams import ExactBeam, MwaTile, make_beam
 from calstudy.instrument.dipoles import dipole_fields
-from calstudy.instrument.distinct_beams import assigned_beams
 from calstudy.instrument.interface import AntennaBeams
-from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.settings import InstrumentSettings, assigned_beams
 from calstudy.instrument.telescope import make_template
 
 FREQUENCY = np.array([183.04e6])

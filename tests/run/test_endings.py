@@ -22,9 +22,8 @@ from tiny import tiny
 from calstudy.base.errors import InputError
 from calstudy.run import store as store_module
 from calstudy.run.execution import Workers, execute, schedule
-from calstudy.run.inventory import leftovers, products
 from calstudy.run.perform import WorkOrder, perform
-from calstudy.run.store import Store
+from calstudy.run.store import Store, leftovers, products
 from calstudy.run.task import Task
 from calstudy.studies.folder import LOG, log_to, open_folder
 

@@ -15,7 +15,7 @@ from calstudy.instrument.antenna_beams import make_beams
 from calstudy.instrument.interface import AntennaBeams
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
-from calstudy.papers.calamity2022.substitutions import substitutions
+from calstudy.papers.calamity2022 import substitutions
 from calstudy.products import corruption, simulation
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
