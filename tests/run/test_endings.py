@@ -131,7 +131,7 @@ def test_what_killed_runs_left_is_listed_and_deleted_and_no_product(store, capsy
     assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h") == (0, "")
     assert len(leftovers(store)) == 2
     later = time.time() + 7200
-    monkeypatch.setattr("calstudy.run.inventory.time.time", lambda: later)
+    monkeypatch.setattr("calstudy.run.store.time.time", lambda: later)
     assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h") == (0, "")
     assert leftovers(store) == []
     assert [product.path for product in products(store)] == [whole.path]
