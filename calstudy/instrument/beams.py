@@ -15,7 +15,8 @@ from pyuvdata.analytic_beam import AnalyticBeam
 from scipy.constants import speed_of_light
 from scipy.interpolate import CubicSpline
 
-from calstudy.base.identity import digest_json, identity
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.instrument.interface import Beam, model_of
 from calstudy.instrument.settings import Channels
