@@ -192,6 +192,7 @@ def test_damaged_claims_are_named(content, tmp_path):
     from calstudy.report.headline import read_headline
     from calstudy.results.folder import RunFolder
 
+    (tmp_path / "manifest.json").write_text(json.dumps({"name": "study"}))
     (tmp_path / "claims.json").write_text(content)
     with pytest.raises(InputError, match=r"claims.json: is damaged; write it again: calstudy claims"):
         read_headline(RunFolder(tmp_path))
