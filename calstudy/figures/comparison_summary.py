@@ -17,6 +17,7 @@ from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import BAND, LIMIT, SIGMAS, Fault, faults, upper_limit
 from calstudy.run.task import Job
+from calstudy.verdicts.measured import is_measured
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,10 +34,10 @@ DARK = 10.0
 ROW_HEIGHT, HEADING_HEIGHT = 0.3, 0.45
 LABELS_WIDTH = 72
 """Number of characters that fit below the matrix."""
+FAINT = (1, 1, 1, 0.45)
+"""Colour of the hatching, over which text can be read on any cell."""
 LARGE_ERROR = 0.1
 """Largest standard deviation of T that is written with two decimals alone; a larger one would make it look exact."""
-ABSURD = 10.0
-"""T from which on gains are no solution, and only its order of magnitude is written."""
 ROOM_FOR_ERROR = 8
 """Largest number of worlds side by side in whose cells T fits with its error; with more, it has one decimal."""
 
@@ -48,7 +49,8 @@ def draw_matrix(
     """Draw a matrix for each band of k: worlds from left to right, calibrators from top to bottom.
 
     The colour is the bias. For a bias within two standard deviations of zero, the 95 % upper limit is written and
-    coloured. `cases` are by world and calibrator; a case without scores is left white and labelled.
+    coloured, and the cell is hatched; a T that is not measured is not written. `cases` are by world and calibrator; a
+    case without scores is left white and labelled.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
@@ -65,7 +67,7 @@ def draw_matrix(
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
     _name_worlds(panels[-1], worlds)
     bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
-    bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$")
+    bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$; hatched: upper limit")
     style.note_stand_ins(figure, stand_ins)
     return figure
 
@@ -86,6 +88,8 @@ def _draw_band(
     band: int,
     shades: ScalarMappable,
 ) -> None:
+    from matplotlib.patches import Rectangle
+
     colours = np.full((len(calibrators), len(cases), 4), 1.0)
     for column, found in enumerate(cases.values()):
         for row, name in enumerate(calibrators):
@@ -97,10 +101,12 @@ def _draw_band(
             shown, bias = _bias(bands.bias[band], bands.bias_error[band])
             if np.isfinite(shown):
                 colours[row, column] = shades.to_rgba(np.asarray(shown))
+            if _is_limit(bands.bias[band], bands.bias_error[band]):
+                axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, hatch="////", ec=FAINT, lw=0))
             axes.text(
                 column,
                 row,
-                f"{bias}\n$T$ = {_transfer(bands.transfer[band], bands.transfer_error[band], len(cases))}",
+                f"{bias}\n{_transfer(bands.transfer[band], bands.transfer_error[band], len(cases))}",
                 ha="center",
                 va="center",
                 fontsize=style.SMALL_SIZE,
@@ -112,22 +118,25 @@ def _draw_band(
     axes.tick_params(length=0)
 
 
+def _is_limit(bias: float, error: float) -> bool:
+    """Whether the bias is within two standard deviations of zero, so that only its upper limit is known."""
+    return bool(np.isfinite(error) and abs(bias) < SIGMAS * error)
+
+
 def _bias(bias: float, error: float) -> tuple[float, str]:
     """Return the size that is coloured, the bias or its upper limit, and the text."""
-    if np.isfinite(error) and abs(bias) < SIGMAS * error:
+    if _is_limit(bias, error):
         limit = upper_limit(bias, error)
         return limit, f"bias < {_digits(limit)}"
     return abs(bias), f"bias {_digits(bias)}"
 
 
 def _transfer(value: float, error: float, n_worlds: int) -> str:
-    if not np.isfinite(value):
-        return "–"
-    if abs(value) >= ABSURD:
-        return _digits(value)
+    if not is_measured(value, error):
+        return "no $T$"
     if not (np.isfinite(error) and error > LARGE_ERROR):
-        return f"{value:.2f}"
-    return number(value, error) if n_worlds <= ROOM_FOR_ERROR else f"{value:.1f}"
+        return f"$T$ = {value:.2f}"
+    return f"$T$ = {number(value, error) if n_worlds <= ROOM_FOR_ERROR else f'{value:.1f}'}"
 
 
 def _digits(value: float) -> str:
@@ -141,12 +150,12 @@ def _digits(value: float) -> str:
 class ComparisonMatrix(CasesFigure):
     """A matrix of calibrators and worlds for each band of k: colour and number are the bias, T is written below it."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     kind: str = "comparison-matrix"
     caption = (
-        "Bias of every calibrator in every world, in units of the EoR (<: 95 % upper limit), and the part T of the EoR "
-        "that is left."
+        "Bias of every calibrator in every world, in units of the EoR (< and hatched: 95 % upper limit), and the part T "
+        "of the EoR that is left, if it was measured."
     )
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
