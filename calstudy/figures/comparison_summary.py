@@ -154,8 +154,8 @@ class ComparisonMatrix(CasesFigure):
 
     kind: str = "comparison-matrix"
     caption = (
-        "Bias of every calibrator in every world, in units of the EoR (< and hatched: 95 % upper limit), and the part T "
-        "of the EoR that is left, if it was measured."
+        "Bias of every calibrator in every world, in units of the EoR (< and hatched: 95 % upper limit), and the part "
+        "T of the EoR that is left, if it was measured."
     )
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
