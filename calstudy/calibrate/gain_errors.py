@@ -33,13 +33,12 @@ foregrounds outside their basis. They are part of the residual, and there they c
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
@@ -49,6 +48,8 @@ ORDERS = 3
 """Powers of a smooth change of the gains that are larger than the noise."""
 RESOLVED = 1e-9
 """Eigenvalues of H relative to its diagonal below this are directions that are not determined."""
+AT_ONCE = 2**20
+"""Elements of the matrices of several channels that are inverted together."""
 MOST_UNKNOWNS = 2560
 """Largest number of real unknowns, twice antennas times channels, whose matrix is inverted."""
 NoiseFrom = Literal["weights", "residual"]
@@ -122,7 +123,7 @@ def gain_errors(
         )
     tangent, has_data = TangentSpace.at(problem, gains, model), problem.antenna_weights > 0
     alignment = _Alignment.at(problem, gains, has_data)
-    degrees = 2 * (np.count_nonzero(problem.weights) - np.count_nonzero(has_data)) + alignment.count
+    degrees = 2 * (np.count_nonzero(problem.weights) - np.count_nonzero(has_data)) + alignment.n_aligned
     degrees -= sum(2 * response.sequences.shape[2] for response in tangent.responses)
     if not tangent.finite and degrees < 1:
         return "the fit has as many unknowns as data, and leaves no residual that tells the noise"
@@ -159,12 +160,12 @@ def gain_errors(
 class _Alignment(NamedTuple):
     """The alignment of a change: |g|^2 over its sum over antennas, (Nants, Nfreqs), and over that over channels too.
 
-    The latter is None where data determine the scale. `count` is the number of numbers that are aligned.
+    The latter is None where data determine the scale. `n_aligned` is the number of numbers that are aligned.
     """
 
     of_channel: np.ndarray
     of_all: np.ndarray | None
-    count: int
+    n_aligned: int
 
     @classmethod
     def at(cls, problem: CalibrationProblem, gains: np.ndarray, has_data: np.ndarray) -> _Alignment:
@@ -201,17 +202,22 @@ def _spans(has_data: np.ndarray, smooth: np.ndarray | None) -> list[np.ndarray]:
 
 def _by_channel(tangent: TangentSpace, antennas: np.ndarray, alignment: _Alignment) -> np.ndarray:
     """Return the diagonal of H^-1 for known foregrounds, which couple neither channels nor amplitudes and phases."""
-    power, (n_antennas, n_frequencies) = np.abs(tangent.slope) ** 2, alignment.of_channel.shape
-    # The difference of two phases and the sum of two amplitudes: the graph's Laplacian, and that without signs.
-    matrices = np.zeros((2, n_antennas, n_antennas, n_frequencies))
-    for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        for part, sign in enumerate((1, 1 if a == b else -1)):
-            np.add.at(matrices[part], (antennas[:, a], antennas[:, b]), sign * power)
-    inverse = _inverse(np.moveaxis(matrices, 3, 1))
-    shares = alignment.of_channel.T[:, None, :]
-    phases = inverse[1] - shares @ inverse[1]
-    inverse[1] = phases - phases @ np.swapaxes(shares, 1, 2)
-    return np.maximum(np.einsum("cfaa->caf", inverse), 0)
+    power, shares = np.abs(tangent.slope) ** 2, alignment.of_channel
+    found, n_antennas = np.empty((2, *shares.shape)), len(shares)
+    step = max(1, AT_ONCE // n_antennas**2)
+    for start in range(0, shares.shape[1], step):
+        channels = slice(start, start + step)
+        rows = shares[:, channels].T[:, None, :]
+        # The difference of two phases and the sum of two amplitudes: the graph's Laplacian, and that without signs.
+        matrices = np.zeros((2, n_antennas, n_antennas, len(rows)))
+        for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            for part, sign in enumerate((1, 1 if a == b else -1)):
+                np.add.at(matrices[part], (antennas[:, a], antennas[:, b]), sign * power[:, channels])
+        inverse = _inverse(np.moveaxis(matrices, 3, 1))
+        phases = inverse[1] - rows @ inverse[1]
+        inverse[1] = phases - phases @ np.swapaxes(rows, 1, 2)
+        found[:, :, channels] = np.einsum("cfaa->caf", inverse)
+    return np.maximum(found, 0)
 
 
 def _with_foregrounds(
@@ -219,11 +225,13 @@ def _with_foregrounds(
 ) -> np.ndarray:
     """Return the diagonal of H^-1 within the spans, (2, Nants, Nfreqs)."""
     shape = (2, *alignment.of_channel.shape)
-    span = scipy.linalg.block_diag(*spans, *spans)
-    inverse = span @ _inverse(span.T @ _curvature(tangent, antennas, shape[1:]) @ span) @ span.T
-    half = alignment.align(inverse.reshape(*shape, -1)).reshape(len(span), -1)
-    whole = alignment.align(half.T.reshape(*shape, -1)).reshape(len(span), -1)
-    return np.maximum(np.diag(whole), 0).reshape(shape)
+    inverse = _inverse(_curvature(tangent, antennas, spans))
+    whole, edges = np.zeros((*shape, len(inverse))), np.cumsum([0, *(span.shape[1] for span in spans)])
+    for part, offset in enumerate((0, edges[-1])):
+        for antenna, span in enumerate(spans):
+            whole[part, antenna, :, offset + edges[antenna] : offset + edges[antenna + 1]] = span
+    aligned = alignment.align(whole).reshape(-1, len(inverse))
+    return np.maximum(np.sum((aligned @ inverse) * aligned, axis=1), 0).reshape(shape)
 
 
 def _inverse(matrices: np.ndarray) -> np.ndarray:
@@ -241,21 +249,27 @@ def _inverse(matrices: np.ndarray) -> np.ndarray:
     return (both - squared @ both) / (RESOLVED * scale)
 
 
-def _curvature(tangent: TangentSpace, antennas: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return H, (n, n), of Re of all gains of a shape (Nants, Nfreqs), then Im."""
-    size, places = math.prod(shape), np.arange(math.prod(shape)).reshape(shape)
+def _curvature(tangent: TangentSpace, antennas: np.ndarray, spans: list[np.ndarray]) -> np.ndarray:
+    """Return H of the coefficients of the spans, (n, n): of Re of all antennas, then Im."""
+    widths = [span.shape[1] for span in spans]
+    size, edges = sum(widths), np.cumsum([0, *widths])
+    places = [np.arange(*ends) for ends in pairwise(edges)]
     matrix = np.zeros((2 * size, 2 * size))
     for pair, power in zip(antennas, np.abs(tangent.slope) ** 2, strict=True):
         for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            block = (spans[pair[a]] * power[:, None]).T @ spans[pair[b]]
             for part, sign in ((0, 1), (size, 1 if a == b else -1)):
-                matrix[part + places[pair[a]], part + places[pair[b]]] += sign * power
+                matrix[np.ix_(part + places[pair[a]], part + places[pair[b]])] += sign * block
     for response in tangent.responses:
         absorbed = [(response.members, response.common)]
         if response.own is not None:
             absorbed += [(response.members[p : p + 1], own[None]) for p, own in enumerate(response.own)]
         for members, sequences in absorbed:
-            touched, columns = _pulled(tangent, antennas, members, sequences)
-            rows = (np.array([[0], [size]]) + places[touched].ravel()).ravel()
+            touched, found = _pulled(tangent, antennas, members, sequences)
+            parts = [zip(touched, part, strict=True) for part in _pair(found)]
+            columns = np.concatenate([spans[antenna].T @ change for part in parts for antenna, change in part])
+            rows = np.concatenate([places[antenna] for antenna in touched])
+            rows = np.concatenate([rows, size + rows])
             matrix[np.ix_(rows, rows)] -= columns @ columns.T
     return matrix
 
@@ -265,7 +279,7 @@ def _pulled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the antennas of some baselines, and J^T q for sequences q of these, (Nmembers, Nfreqs, Nvec).
 
-    J^T q is real, (2 Nantennas Nfreqs, 2 Nvec), for q and i q.
+    J^T q is complex, (Nantennas, Nfreqs, 2 Nvec), for q and i q.
     """
     touched = np.unique(antennas[members])
     both = np.concatenate([sequences, 1j * sequences], axis=2)
@@ -275,7 +289,7 @@ def _pulled(
     first, second = np.searchsorted(touched, antennas[members]).T
     np.add.at(found, first, gradient)
     np.add.at(found, second, gradient.conj())
-    return touched, _pair(found).reshape(2 * touched.size * both.shape[1], both.shape[2])
+    return touched, found
 
 
 def _pair(values: np.ndarray) -> np.ndarray:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import xarray
 
     from calstudy.power.score import Score
@@ -41,6 +43,28 @@ def by_length_and_delay(spectrum: CylindricalSpectrum | TransferMap) -> xarray.D
     edges = spectrum.bin_edges
     arrays |= {f"length_{end}": (("baseline_length",), edges[:, place]) for place, end in enumerate(("from", "to"))}
     return _dataset(spectrum, arrays, (*COORDINATES, "length_from", "length_to"))
+
+
+def gain_errors(path: Path) -> xarray.Dataset:
+    """Return standard deviations `amplitude`, of |g|, and `phase`, rad, of a file of gains; raises InputError if none.
+
+    Coordinates are `antenna` (number), `frequency` (Hz), `time` (JD) and `feed` (AIPS number of the Jones element).
+    """
+    import xarray
+    from pyuvdata import UVCal
+
+    from calstudy.base.gains import read_gain_errors
+
+    amplitude, phase = read_gain_errors(path)
+    gains = UVCal.from_file(path)
+    places = {"antenna": gains.ant_array, "frequency": gains.freq_array, "time": gains.time_array}
+    coordinates = {**places, "feed": gains.jones_array}
+    found = xarray.Dataset(
+        {"amplitude": (tuple(coordinates), amplitude), "phase": (tuple(coordinates), phase)}, coordinates
+    )
+    for name, unit in (("phase", "rad"), ("frequency", "Hz"), ("time", "JD")):
+        found[name].attrs["units"] = unit
+    return found
 
 
 def _arrays(spectrum: object) -> list[dataclasses.Field]:
