@@ -17,6 +17,7 @@ import calstudy
 from calstudy.base.errors import InputError
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
+from calstudy.interface import CalibratedData
 from calstudy.power.tables import load_spectrum
 from calstudy.realdata.settings import defaults
 from calstudy.studies.calibration import FIGURE_FILES
@@ -248,7 +249,7 @@ def test_gains_have_their_errors_beside_what_other_readers_see(command, data, tm
     code, _ = command(data, *OPTIONS, "--output", "out")
     assert code == 0
     gains = UVCal.from_file(str(tmp_path / "out" / "gains.calh5"))
-    found = calstudy.interface.CalibratedData(tmp_path / "out")
+    found = CalibratedData(tmp_path / "out")
     errors = found.gain_errors
     assert errors.amplitude.shape == gains.gain_array.shape
     # No errors where there are no gains.
@@ -259,7 +260,7 @@ def test_gains_have_their_errors_beside_what_other_readers_see(command, data, tm
         assert summary["noise_from"] == "residual"
         assert summary["median_signal_to_noise"] * summary["median_relative_amplitude"] == pytest.approx(1)
     command(data, "--output", "smooth", *OPTIONS, "--set", "gain_delay=200 ns")
-    smooth = calstudy.interface.CalibratedData(tmp_path / "smooth")
+    smooth = CalibratedData(tmp_path / "smooth")
     assert "restricted to smooth functions" in smooth.solution["records"][0]["gain_errors"]["reason"]
     with pytest.raises(InputError, match="has no errors of gains"):
         _ = smooth.gain_errors
