@@ -47,11 +47,12 @@ from calstudy.calibrate.tangent_space import SPAN_CUTOFF, TangentSpace
 ORDERS = 3
 """Powers of a smooth change of the gains that are larger than the noise."""
 RESOLVED = 1e-9
-"""Eigenvalues of H relative to its diagonal below this are directions that are not determined."""
+"""Added to eigenvalues of H relative to its diagonal. Directions with less, as of two arrays without a baseline between
+them, get enormous errors."""
 AT_ONCE = 2**20
 """Elements of the matrices of several channels that are inverted together."""
-MOST_UNKNOWNS = 2560
-"""Largest number of real unknowns, twice antennas times channels, whose matrix is inverted."""
+MOST_UNKNOWNS = 2048
+"""Largest number of real unknowns, besides smooth ones, whose matrix is inverted."""
 NoiseFrom = Literal["weights", "residual"]
 
 
@@ -113,14 +114,9 @@ def gain_errors(
     frequencies
         Channel centres, Hz, (Nfreqs,).
     """
-    structure, unknowns = problem.structure, 2 * gains.size
+    structure = problem.structure
     if structure.gain_vectors is not None:
         return "the gains are restricted to smooth functions, whose errors are not known"
-    if not problem.frozen and unknowns > MOST_UNKNOWNS:
-        return (
-            f"{structure.n_antennas} antennas in {structure.n_frequencies} channels have {unknowns} unknowns, and "
-            f"errors of gains that are fitted with foregrounds are known for {MOST_UNKNOWNS} at most"
-        )
     tangent, has_data = TangentSpace.at(problem, gains, model), problem.antenna_weights > 0
     alignment = _Alignment.at(problem, gains, has_data)
     degrees = 2 * (np.count_nonzero(problem.weights) - np.count_nonzero(has_data)) + alignment.n_aligned
@@ -131,8 +127,12 @@ def gain_errors(
     delay = ORDERS * max(bucket.half_width for bucket in structure.basis.buckets) if free else 0.0
     spans = _spans(has_data, gain_vectors(frequencies, delay) if free else None)
     if not any(span.size for span in spans):
+        return f"foregrounds can follow gains up to delays of {delay * 1e9:.0f} ns, and the channels resolve no others"
+    unknowns = 2 * sum(span.shape[1] for span in spans)
+    if not problem.frozen and unknowns > MOST_UNKNOWNS:
         return (
-            f"foregrounds can follow gains at all delays below {delay * 1e9:.0f} ns, and the channels resolve no other"
+            f"{structure.n_antennas} antennas in {structure.n_frequencies} channels have {unknowns} unknowns, and "
+            f"errors of gains that are fitted with foregrounds are known for {MOST_UNKNOWNS} at most"
         )
     if problem.frozen:
         variances = _by_channel(tangent, structure.antennas, alignment)
@@ -213,7 +213,11 @@ def _by_channel(tangent: TangentSpace, antennas: np.ndarray, alignment: _Alignme
         for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
             for part, sign in enumerate((1, 1 if a == b else -1)):
                 np.add.at(matrices[part], (antennas[:, a], antennas[:, b]), sign * power[:, channels])
-        inverse = _inverse(np.moveaxis(matrices, 3, 1))
+        scaled, scale = _scaled(np.moveaxis(matrices, 3, 1))
+        # The common phase, which no data determine, and which the alignment removes.
+        common = np.sqrt(np.einsum("faa->fa", scale[1]))
+        scaled[1] += common[:, :, None] * common[:, None, :] / np.maximum(np.sum(common**2, axis=1), 1)[:, None, None]
+        inverse = np.linalg.inv(scaled) / scale
         phases = inverse[1] - rows @ inverse[1]
         inverse[1] = phases - phases @ np.swapaxes(rows, 1, 2)
         found[:, :, channels] = np.einsum("cfaa->caf", inverse)
@@ -224,29 +228,26 @@ def _with_foregrounds(
     tangent: TangentSpace, antennas: np.ndarray, alignment: _Alignment, spans: list[np.ndarray]
 ) -> np.ndarray:
     """Return the diagonal of H^-1 within the spans, (2, Nants, Nfreqs)."""
-    shape = (2, *alignment.of_channel.shape)
-    inverse = _inverse(_curvature(tangent, antennas, spans))
-    whole, edges = np.zeros((*shape, len(inverse))), np.cumsum([0, *(span.shape[1] for span in spans)])
+    from scipy.linalg import solve_triangular
+
+    shape, edges = (2, *alignment.of_channel.shape), np.cumsum([0, *(span.shape[1] for span in spans)])
+    matrix, whole = _curvature(tangent, antennas, spans), np.zeros((*shape, 2 * edges[-1]))
     for part, offset in enumerate((0, edges[-1])):
         for antenna, span in enumerate(spans):
             whole[part, antenna, :, offset + edges[antenna] : offset + edges[antenna + 1]] = span
-    aligned = alignment.align(whole).reshape(-1, len(inverse))
-    return np.maximum(np.sum((aligned @ inverse) * aligned, axis=1), 0).reshape(shape)
+    aligned = alignment.align(whole)
+    scaled, scale = _scaled(matrix)
+    rows = aligned.reshape(-1, len(matrix)) / np.sqrt(np.diag(scale))
+    half = solve_triangular(np.linalg.cholesky(scaled), rows.T, lower=True, check_finite=False)
+    return np.sum(half**2, axis=0).reshape(shape)
 
 
-def _inverse(matrices: np.ndarray) -> np.ndarray:
-    """Invert positive semidefinite matrices (..., n, n), without their null spaces.
-
-    Of B = m (H + m K)^-1 K, with the diagonal K and a small number m, (1 - B^2) (1 + B) is one but for a null space,
-    where it is zero.
-    """
+def _scaled(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return matrices (..., n, n) with a unit diagonal and no negative eigenvalue, and by what they were divided."""
     diagonal = np.einsum("...aa->...a", matrices)
     roots = np.sqrt(np.where(diagonal > 0, diagonal, 1))
     scale = roots[..., :, None] * roots[..., None, :]
-    left = RESOLVED * np.linalg.inv(matrices / scale + RESOLVED * np.eye(matrices.shape[-1]))
-    squared = left @ left
-    both = left + squared
-    return (both - squared @ both) / (RESOLVED * scale)
+    return matrices / scale + RESOLVED * np.eye(matrices.shape[-1]), scale
 
 
 def _curvature(tangent: TangentSpace, antennas: np.ndarray, spans: list[np.ndarray]) -> np.ndarray:
