@@ -3,7 +3,7 @@
 Each test fits 40 realizations and counts pulls, deviations from the truth over their errors, below 1 and 1.96. There
 are 25,000 of them or more; deviations of an antenna without its smooth part have 27 independent numbers in 64 channels,
 so that a count of 68 % has a standard deviation of less than 0.5 %. Errors of smooth gains from a prior have 10 of
-these, and 0.7 %. Limits of 3 % and 2 % are four of them, and exceeded by errors that are 5 % too small or too large.
+these, and 0.7 %. Limits of 3 % and 2 % are four of them, and exceeded by errors that are 7 % too small or too large.
 """
 
 from __future__ import annotations
