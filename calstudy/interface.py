@@ -43,13 +43,14 @@ from calstudy.products.gain_errors import gain_errors as errors_of_gains
 from calstudy.report.headline import read_headline
 from calstudy.results.folder import EXPERIMENT, RunFolder
 from calstudy.results.reader import Tables
+from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task
 from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study, study_of
 from calstudy.studies.show import describe_plan, show_plan
-from calstudy.studies.study import Budget, Study, run_study
+from calstudy.studies.study import Study, run_study
 from calstudy.verdicts.standing import LIMIT
 
 if TYPE_CHECKING:
@@ -156,7 +157,7 @@ class CalibratedData:
     @property
     def gain_errors(self) -> xarray.Dataset:
         """Standard deviations of gains by noise, `amplitude` and `phase`; InputError if the calibration has none."""
-        from calstudy.results.labelled import gain_errors
+        from calstudy.results.reader import gain_errors
 
         return gain_errors(self.folder / GAINS)
 
@@ -329,7 +330,7 @@ class OpenRun:
     @property
     def cylindrical(self) -> ByVariant:
         """Cylindrical power spectra, by variant: datasets with `power` against `baseline_length` and `delay`."""
-        from calstudy.results.labelled import by_length_and_delay
+        from calstudy.results.reader import by_length_and_delay
 
         return self._by_variant(lambda name: by_length_and_delay(self._tables.wedge(name)))
 
@@ -346,7 +347,7 @@ class OpenRun:
     @property
     def transfer_map(self) -> xarray.Dataset:
         """The transfer function against `baseline_length` and `delay`."""
-        from calstudy.results.labelled import by_length_and_delay
+        from calstudy.results.reader import by_length_and_delay
 
         return by_length_and_delay(self._tables.transfer_map())
 
@@ -447,7 +448,7 @@ class OpenRun:
         InputError
             If they are not known for the calibrator or the size of the array, with the reason.
         """
-        from calstudy.results.labelled import gain_errors
+        from calstudy.results.reader import gain_errors
 
         self._calibration(variant, half)
         study = self._experiment
@@ -525,14 +526,14 @@ class OpenRun:
         return ByVariant(self._tables.variants, read)
 
     def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
-        from calstudy.results.labelled import by_wavenumber
+        from calstudy.results.reader import by_wavenumber
 
         return lambda name: by_wavenumber(self._tables.spherical(name, modes))
 
     def _by_region(self, read: Callable[[str], TransferFunction]) -> xarray.Dataset:
         import xarray
 
-        from calstudy.results.labelled import by_wavenumber
+        from calstudy.results.reader import by_wavenumber
 
         found = [by_wavenumber(read(region)) for region in REGIONS]
         return xarray.concat(found, xarray.IndexVariable("region", list(REGIONS)), combine_attrs="override")

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import defaultdict
 from pathlib import Path
 
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json
 from calstudy.base.package_files import experiment_names
 from calstudy.run.task import Task
 from calstudy.studies.load import load_study

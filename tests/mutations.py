@@ -213,9 +213,15 @@ MUTATIONS = (
     ),
     Mutation(
         "a calibrator passes without its error",
-        '"passes" if size + margin < limit',
-        '"passes" if size < limit',
+        '"passes" if known and self.upper_limit < limit',
+        '"passes" if known and abs(self.bias) < limit',
         ("tests/verdicts",),
+    ),
+    Mutation(
+        "a T with any error is measured",
+        "error > LARGEST_ERROR",
+        "error > 10 * LARGEST_ERROR",
+        ("tests/verdicts", "tests/power/test_transfer.py"),
     ),
 )
 

@@ -9,8 +9,9 @@ import pytest
 from tiny import tiny
 
 from calstudy.experiment.files import override, validate
+from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 
 DRAWN = True
 

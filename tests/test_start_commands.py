@@ -18,8 +18,8 @@ from calstudy.cli import main as cli
 from calstudy.experiment.files import dump, override, validate
 from calstudy.experiment.yaml_files import parse_yaml
 from calstudy.run.store import Store
-from calstudy.studies.json_schema import SCHEMA_FILE, experiment_schema
 from calstudy.studies.load import load_study
+from calstudy.studies.reference import SCHEMA_FILE, experiment_schema
 
 REFUSED = 2
 

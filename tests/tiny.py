@@ -16,7 +16,8 @@ TINY: dict[str, Any] = {
     "sky": {"foregrounds": {"kind": "g4jy-and-counts", "count": 100}, "eor": {"nside": 16}},
     "corruption": {"noise": {"factor": 2}},
     "simulation": {"chunks": 2},
-    "calibration": {"chunks": 2},
+    # Weights from the fit's own gains take several solves in place of one; tests of these ask for them.
+    "calibration": {"chunks": 2, "weights": "flags"},
     "power": {"pairs": "same-baseline", "bins": {"width": "0.1 h/Mpc", "max": "0.8 h/Mpc"}},
 }
 
@@ -28,5 +29,4 @@ def tiny(folder: Path) -> dict[str, Any]:
 
 def of_the_paper(folder: Path) -> dict[str, Any]:
     """Return the tiny experiment with the weights of Ewall-Wice et al. (2022), compared with what they say."""
-    calibration = {**TINY["calibration"], "weights": "flags"}
-    return {**tiny(folder), "calibration": calibration, "papers": ["calamity2022"]}
+    return {**tiny(folder), "papers": ["calamity2022"]}

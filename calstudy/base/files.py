@@ -1,13 +1,14 @@
-"""The hash of a file, and files that are written completely or not at all."""
+"""Hashes of files and of JSON, and files that are written completely or not at all."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 from uuid import uuid4
 
 
@@ -15,6 +16,12 @@ def sha256(path: Path) -> str:
     """Return the SHA-256 of a file's content, in hexadecimal, without a cache."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def digest_json(value: Any) -> str:
+    """Return a 32-digit key of any JSON-able value, which does not depend on the order of keys in it."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 @contextmanager

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +10,6 @@ from pydantic import BaseModel
 
 from calstudy.base.plugins import Plugin, digest_file
 from calstudy.base.schema import defaults
-
-
-def digest_json(value: Any) -> str:
-    """Return a 32-digit key of any JSON-able value, which does not depend on the order of keys in it."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def identity(value: Any) -> Any:

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from calstudy.base.downloads import default_directory
-from calstudy.base.files import replacing
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json, replacing
 
 logger = logging.getLogger(__name__)
 

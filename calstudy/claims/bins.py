@@ -1,4 +1,4 @@
-"""Comparisons of spherical spectra bin by bin, for statements of papers and steps of the validation ladder."""
+"""Comparisons of spectra bin by bin, and means over their modes, for statements of papers and steps of the ladder."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from calstudy.verdicts.statement import Unevaluated
 
 if TYPE_CHECKING:
     from calstudy.results.reader import Results
+
 
 SIGMAS_95 = 1.96
 TINY = 1e-9
@@ -191,3 +192,27 @@ def bias(run: Results, k_min: float, k_max: float) -> Finding:
     left = power_without_eor(run, used, modes)
     unit = run.score.flux_scale**2 / float(np.sum(modes * eor.power.real[used]) / np.sum(modes))
     return Finding(unit * left.value, unit * left.uncertainty)
+
+
+def clustered_mean(values: np.ndarray, weights: np.ndarray | None = None) -> Finding:
+    """Return the mean over (Nunits, Nmodes) and its standard error, with the modes of each unit as one sample.
+
+    Modes that are NaN are left out. `weights` are those of the units, (Nunits,); equal by default.
+    """
+    used = np.isfinite(values)
+    scale = np.ones(len(values)) if weights is None else np.asarray(weights, float)
+    sums, counts = scale * np.where(used, values, 0).sum(axis=1), scale * used.sum(axis=1)
+    filled = counts > 0
+    if not filled.any():
+        return Finding(np.nan, np.nan)
+    mean = sums.sum() / counts.sum()
+    deviations = (sums - mean * counts)[filled]
+    error = np.sqrt(np.sum(deviations**2) * filled.sum() / max(filled.sum() - 1, 1)) / counts.sum()
+    return Finding(float(mean), float(error))
+
+
+def pooled(findings: list[Finding]) -> Finding:
+    """Return the mean of independent measurements of one number, weighted by their inverse variances."""
+    weights = np.array([finding.uncertainty**-2 for finding in findings])
+    values = np.array([finding.value for finding in findings])
+    return Finding(float(np.sum(weights * values) / weights.sum()), float(weights.sum() ** -0.5))

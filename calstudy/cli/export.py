@@ -37,11 +37,11 @@ def export(
     publish the printed SHA-256 at once, and the recipe at the end.
     """
     from calstudy.products.files import quiet_libraries
+    from calstudy.run.execution import Budget
     from calstudy.studies.blind import write_recipe
     from calstudy.studies.export import CARRIER
     from calstudy.studies.export import export as write
     from calstudy.studies.kinds.comparison import load_worlds
-    from calstudy.studies.study import Budget
 
     console = Console(soft_wrap=True, highlight=False)
     if blind is not None:
@@ -93,9 +93,9 @@ def score(
     """
     from calstudy.base.errors import InputError
     from calstudy.products.files import quiet_libraries
+    from calstudy.run.execution import Budget
     from calstudy.studies.kinds.comparison import load_worlds
     from calstudy.studies.scores import measure_scores, tables
-    from calstudy.studies.study import Budget
 
     if output is not None and output.exists() and not overwrite:
         raise InputError(f"--output {output}: is there already; use --overwrite or another name")

@@ -22,14 +22,12 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import DiskError, ExperimentError, InputError, Terminated, exit_status, refusal_of_disk
 from calstudy.base.mwa_files import MWA_FILES
-from calstudy.cli.calibrate import calibrate
-from calstudy.cli.compare_gains import compare_gains
+from calstudy.cli.calibrate import calibrate, compare_gains
+from calstudy.cli.checks import regress, validate
 from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
-from calstudy.cli.regress import regress
 from calstudy.cli.start import init, write_schema
 from calstudy.cli.storage import runs, store
-from calstudy.cli.validate import validate
 
 app = typer.Typer(
     cls=Sections,
@@ -102,10 +100,11 @@ def run(
 
     Products that are in the store are not made again; the same command resumes an interrupted run.
     """
+    from calstudy.run.execution import Budget
     from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import show_run
-    from calstudy.studies.study import Budget, run_study
+    from calstudy.studies.study import run_study
 
     console = Console(soft_wrap=True, highlight=False)
     changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
@@ -127,10 +126,10 @@ def plan(
     as_json: AsJson = False,
 ) -> None:
     """Show what a run would do: stages, products in the store, estimated time, memory and disk."""
+    from calstudy.run.execution import Budget
     from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import describe_plan, show_plan
-    from calstudy.studies.study import Budget
 
     study = load_study(file, scale, overrides or ())
     if finished:

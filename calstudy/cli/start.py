@@ -39,7 +39,7 @@ def init(
     """
     from calstudy.base.package_files import published
     from calstudy.experiment.starter import copy_text, observed_text, starter_text
-    from calstudy.studies.json_schema import SCHEMA_FILE
+    from calstudy.studies.reference import SCHEMA_FILE
 
     if listed:
         _list_examples()
@@ -101,7 +101,7 @@ def write_schema(path: Path) -> None:
     An editor with the YAML language server reads it if the first line of a file is
     `# yaml-language-server: $schema=FILE`; files of `calstudy init` have this line.
     """
-    from calstudy.studies.json_schema import experiment_schema
+    from calstudy.studies.reference import experiment_schema
 
     try:
         path.write_text(experiment_schema(), encoding="utf-8")

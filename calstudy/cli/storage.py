@@ -64,9 +64,8 @@ def store(
     --larger-than, --unreferenced and --verify must choose the products.
     """
     from calstudy.results.folder import find_runs
-    from calstudy.run.inventory import age_of, leftovers, products
-    from calstudy.run.inventory import unreferenced as without_run
-    from calstudy.run.store import Store
+    from calstudy.run.store import Store, age_of, leftovers, products
+    from calstudy.run.store import unreferenced as without_run
 
     if not folder.is_dir():
         raise InputError(f"{folder}: no such store")
@@ -126,7 +125,7 @@ def _verify(store: Store, delete: bool) -> None:
 
 def _show(chosen: list[Product], folder: Path, console: Console) -> None:
     from calstudy.base.table import Table
-    from calstudy.run.inventory import age_of
+    from calstudy.run.store import age_of
 
     rows = []
     for stage in sorted({str(product.record["stage"]) for product in chosen}):

@@ -18,9 +18,8 @@ from calstudy.experiment.assumed import FIELD, SKY_MODEL, AssumedFile, assumed_c
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import parse_yaml, read_mapping
-from calstudy.instrument.distinct_beams import nominal_beams
 from calstudy.instrument.interface import model_of
-from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.settings import InstrumentSettings, nominal_beams
 from calstudy.instrument.size import antenna_count
 
 M = TypeVar("M", bound=BaseModel)

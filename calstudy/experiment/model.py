@@ -12,7 +12,6 @@ from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.schema import Section, fault
-from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import AdamaxSettings, GaussNewtonSettings, Solver
 from calstudy.corrupt.noise import Autocorrelations
@@ -24,7 +23,7 @@ from calstudy.sky.settings import SkySettings
 
 Component = Literal["foregrounds", "eor", "noise"]
 SIGNAL_LOSS_VARIANTS = ("residual", "residual_without_eor", "eor")
-FIGURES: Registry[Any] = Registry("figure", "calstudy.figures", "calstudy.figures:StudyFigure")
+FIGURES: Registry[Any] = Registry("figure", "calstudy.figures", "calstudy.figures:StudyFigure", families=True)
 PAPERS: Registry[Any] = Registry("paper", "calstudy.papers", "calstudy.claims.paper:Paper")
 DEFAULT_FIGURES = ("layout", "gains", "model", "data", "baselines", "wedge", "spherical", "signal-loss")
 
@@ -187,7 +186,9 @@ class Experiment(Section):
     sky: SkySettings = SkySettings()
     simulation: SimulationSettings = SimulationSettings()
     corruption: CorruptionSettings = CorruptionSettings()
-    calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Calamity()
+    calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Field(
+        default_factory=lambda: CALIBRATORS.make("calamity")
+    )
     power: PowerSettings = PowerSettings()
     variants: dict[str, Variant] = Field(
         default_factory=_paper_variants, min_length=1, description="By default the six of the paper's figures."

@@ -1,7 +1,7 @@
-"""Figures of studies: one module each, with its caption, its inputs, its drawing, and its tolerances.
+"""Figures of studies, one module for each subject: captions, inputs, drawing, and tolerances.
 
-A `StudyFigure` declares all that the rest of the package needs to know about it. Its name is that of its module; a
-user's own figure is named by the path of its file in ``outputs.figures``.
+A `StudyFigure` declares all that the rest of the package needs to know about it. Its name is the default of its field
+`kind`; a user's own figure is named by the path of its file in ``outputs.figures``.
 """
 
 from __future__ import annotations
@@ -96,6 +96,11 @@ class StudyFigure(Plugin):
     tolerances: ClassVar[Rules] = ()
 
     kind: str
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the name of a built-in figure."""
+        return (cls.model_fields["kind"].default,)
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""

@@ -11,8 +11,7 @@ import numpy as np
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.gains import inspected_calibration
 from calstudy.plotting import style
-from calstudy.plotting.domains import TAPER
-from calstudy.plotting.panels import mark_horizon, name_baseline
+from calstudy.plotting.domains import TAPER, mark_horizon, name_baseline
 from calstudy.power.delay import channel_width, delay_transform, delays, horizon_delay
 from calstudy.products import corruption
 from calstudy.products.files import DATA, MODEL, RESIDUAL
@@ -106,6 +105,8 @@ def rms_over_time(spectra: np.ndarray, frequency: np.ndarray) -> np.ndarray:
 
 class Baselines(StudyFigure):
     """Data, model and residual of some baselines against delay."""
+
+    kind: str = "baselines"
 
     caption = "RMS over time of delay-transformed visibilities of several baselines."
     variants = ("residual", "noise")

@@ -4,23 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin
+from calstudy.base.visibilities import baseline_vectors, from_cube
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
 from calstudy.instrument.settings import Channels, InstrumentSettings
 from calstudy.plotting import style
+from calstudy.power.delay import horizon_delay
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
+from calstudy.simulate.nodes import integration_times
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from pyuvdata import UVData
 
     from calstudy.instrument.beams import GriddedBeam
+    from calstudy.instrument.settings import InstrumentSettings
+    from calstudy.simulate.floor import DelayFloor
+    from calstudy.simulate.settings import SimulationSettings
+    from calstudy.sky.settings import SkySettings
+
 
 INTERPOLATIONS = get_args(MwaEmbeddedBeam.model_fields["interpolation"].annotation)
 SMOOTH = INTERPOLATIONS[0]
@@ -116,6 +127,8 @@ def draw_interpolations(found: BeamInterpolation, stand_ins: Sequence[str] = ())
 class BeamFitFigure(StudyFigure):
     """The smooth fit of a tabulated beam in frequency against its table, and other interpolations against the fit."""
 
+    kind: str = "beam-fit"
+
     caption = "Interpolations of the beam in frequency: differences of Jones components over the zenith."
     sections = ("instrument",)
 
@@ -134,3 +147,139 @@ class BeamFitFigure(StudyFigure):
         rms = {name: float(np.sqrt(np.mean(values**2))) for name, values in found.others.items()}
         fit = {"rms": float(np.sqrt(np.mean(found.fit_rms**2))), "largest": float(found.fit_max.max())}
         return Drawing(draw_interpolations(found, job.settings["notes"]), found, {"fit": fit, "rms_to_fit": rms})
+
+
+PAPER_FLOOR = -45.0
+"""Artefacts of beam interpolation in the paper, dB of brightness."""
+LINES = {"dolph-chebyshev": "-", "blackman-harris": ":"}
+
+
+@dataclass(frozen=True)
+class InterpolationFloor:
+    """Delay spectra and floors of foregrounds simulated with one interpolation of the beam.
+
+    `spectrum` is the rms over the shortest third of the baselines, relative to its largest value, with the
+    Dolph-Chebyshev taper, at `delay` >= 0, (Ndelays,), s. `horizon` is the longest horizon delay of these baselines, s.
+    `floors` are by taper.
+    """
+
+    delay: np.ndarray
+    spectrum: np.ndarray
+    horizon: float
+    floors: dict[str, DelayFloor]
+
+
+def compare_floors(
+    instrument: InstrumentSettings, sky: SkySettings, simulation: SimulationSettings
+) -> dict[str, InterpolationFloor]:
+    """Simulate foregrounds at the middle integration, once with every interpolation of a tabulated beam.
+
+    Every channel is simulated, so that only the beam is interpolated.
+    """
+    from calstudy.instrument.telescope import make_template, subset_template
+    from calstudy.simulate.chunks import simulate_visibilities
+    from calstudy.sky.foregrounds import make_foregrounds
+
+    whole = make_template(instrument)
+    times = integration_times(whole)
+    template = subset_template(whole, times[len(times) // 2 :][:1], whole.freq_array)
+    sources = make_foregrounds(sky.foregrounds, whole.freq_array, sky.diffuse).sky
+    accuracy = simulation.nodes.for_foregrounds(smooth_beam=False, smooth_sky=False)
+    floors = {}
+    for name in INTERPOLATIONS:
+        beam = interpolated(instrument.beam, instrument.channels, name)
+        cube = simulate_visibilities(simulation.engine, sources, beam, template, accuracy)
+        floors[name] = _measure(from_cube(template, cube))
+    return floors
+
+
+def _measure(foregrounds: UVData) -> InterpolationFloor:
+    from calstudy.simulate.floor import MAIN_LOBES, delay_floor, delay_profile, floor_buffers
+
+    buffers = floor_buffers(foregrounds)
+    if len(buffers) < len(MAIN_LOBES):
+        raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")
+    lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
+    short = lengths <= np.quantile(lengths, 1 / 3)
+    delays, power = delay_profile(foregrounds, "dolph-chebyshev")
+    delay, folded = folded_spectrum(delays, power[short].mean(axis=0))
+    return InterpolationFloor(
+        delay=delay,
+        spectrum=np.sqrt(folded / folded.max()),
+        horizon=horizon_delay(float(lengths[short].max())),
+        floors={taper: delay_floor(foregrounds, buffer, taper) for taper, buffer in buffers.items()},
+    )
+
+
+def folded_spectrum(delays: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return delays >= 0, (N // 2,), and the mean power of both signs of each, from the order of `numpy.fft`."""
+    half = delays.size // 2
+    return delays[:half], np.concatenate([power[:1], (power[1:half] + power[:-half:-1]) / 2])
+
+
+@style.journal_style()
+def draw_delay_floors(
+    floors: Mapping[str, InterpolationFloor], eor_level: float | None, stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw delay spectra of short baselines (left) and the floor beyond the horizon against baseline length (right).
+
+    `eor_level` is marked, in amplitude dB, if it is not None.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 3.0)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for name, floor in floors.items():
+        colour = INTERPOLATION_COLOURS[name]
+        left.plot(floor.delay * 1e9, 10 * np.log10(floor.spectrum), color=colour, linewidth=0.8, label=name)
+        for taper, line in LINES.items():
+            _draw_steps(right, floor, taper, colour, line)
+    horizon = next(iter(floors.values())).horizon
+    left.axvline(horizon * 1e9, color=style.BLACK, linestyle="--", linewidth=0.7)
+    for axes in (left, right):
+        axes.axhline(PAPER_FLOOR, color=style.GREY, linewidth=0.6, linestyle="-.")
+        if eor_level is not None:
+            axes.axhline(eor_level, color=style.BLACK, linewidth=0.6)
+    left.set(xlabel=style.DELAY, ylabel="brightness relative to peak (dB)", ylim=(-105, 3))
+    left.margins(x=0)
+    right.set(xlabel=style.BASELINE_LENGTH)
+    for line, label in (("-", "Dolph–Chebyshev"), (":", "Blackman–Harris"), ("-.", "paper's artefacts")):
+        right.plot([], [], color=style.GREY, linestyle=line, label=label)
+    if eor_level is not None:
+        right.plot([], [], color=style.BLACK, linewidth=0.6, label="EoR asked for")
+    right.legend(loc="upper right")
+    left.legend(loc="upper right")
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_steps(axes: Axes, floor: InterpolationFloor, taper: str, colour: str, line: str) -> None:
+    measured = floor.floors[taper]
+    axes.stairs(measured.rms_db, measured.edges, baseline=None, linewidth=1.0, color=colour, linestyle=line)
+
+
+class DelayFloorFigure(StudyFigure):
+    """The delay floor of the foregrounds at one integration, for every interpolation of the beam in frequency."""
+
+    kind: str = "delay-floor"
+
+    caption = "Delay floor of the foregrounds for every interpolation of the beam in frequency."
+    needs_foregrounds = True
+    sections = ("instrument", "sky", "simulation")
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return nothing: single integrations are simulated."""
+        del graph
+        return {}
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Refuse an experiment without foregrounds, or with a beam in closed form."""
+        return super().refusal(experiment) or not_tabulated(experiment)
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return what is simulated, and the level of the EoR."""
+        return {**super().settings(graph), "eor_level": graph.experiment.corruption.eor_level}
+
+    def draw(self, job: Job) -> Drawing:
+        """Simulate with every interpolation."""
+        floors = compare_floors(**{name: job.settings[name] for name in self.sections})
+        notes = {name: {taper: found.worst_db for taper, found in item.floors.items()} for name, item in floors.items()}
+        return Drawing(draw_delay_floors(floors, job.settings["eor_level"], job.settings["notes"]), floors, notes)

@@ -122,6 +122,8 @@ COLUMNS = ("solver", "steps", "bias", "bias error", "with EoR", "with EoR error"
 class Convergence(StudyFigure):
     """The bias of the residual power against the steps of several solvers, with convergence.csv."""
 
+    kind: str = "convergence"
+
     caption = "What solvers leave of the foregrounds in even and odd alike, against their steps, over the EoR."
     variants = SIGNAL_LOSS_VARIANTS
     needs_signal_loss = True

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -20,6 +17,8 @@ from calstudy.products.observed import calibrated, observed
 from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from pyuvdata import UVData
 
     from calstudy.calibrate.records import CalibrationResult
@@ -124,6 +123,8 @@ def draw_diagnostics(found: Diagnostics, stand_ins: Sequence[str] = ()) -> Figur
 
 
 def _draw_images(figure: Figure, panels: list[Axes], found: Diagnostics) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     peak = max(found.data.max(), np.finfo(float).tiny)
     edges = np.linspace(found.delay[0], found.delay[-1], found.delay.size) * 1e9
     rows = np.arange(found.lengths.size)
@@ -173,6 +174,8 @@ def _label_between_powers(axes: Axes) -> None:
 
     The default labels, such as 6 × 10⁻¹, are so wide that a constrained layout finds no room for the axes.
     """
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
     if axes.get_yscale() != "log":
         return
     low, high = axes.get_ylim()
@@ -186,6 +189,8 @@ def _label_one_digit(value: float, _: float) -> str:
 
 
 def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     antennas = np.arange(found.chi2_antennas.size)
     integrations = np.arange(found.chi2_by_integration.size)
     for axes, places, values, label in (
@@ -204,6 +209,8 @@ def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
 
 
 def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     for losses, converged in zip(found.losses, found.converged, strict=True):
         positive = np.where(losses > 0, losses, np.nan)
         axes.plot(positive, color=style.BLUE if converged else style.RED, linewidth=0.7, marker=".", markersize=2)
@@ -275,6 +282,8 @@ def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarr
 
 class DiagnosticsFigure(StudyFigure):
     """Diagnostics of a calibration of measured data, of the even half or of all data."""
+
+    kind: str = "diagnostics"
 
     of = ("observed",)
     caption = (

@@ -14,7 +14,7 @@ from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.corrupt.levels import rms
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.delay_floor import folded_spectrum
+from calstudy.figures.beam_fit import folded_spectrum
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
 from calstudy.products import simulation
@@ -180,6 +180,8 @@ def _draw_spectra(axes: Axes, group: GroupAgreement, colour: str) -> None:
 
 class EngineAgreementFigure(StudyFigure):
     """The foregrounds against the same foregrounds from another engine, by baseline length and in delay."""
+
+    kind: str = "engine-agreement"
 
     caption = "Foregrounds of two simulation engines: difference in delay and by baseline length."
     needs_foregrounds = True

@@ -1,4 +1,4 @@
-"""Array layouts side by side (the paper's Fig. LAYOUTS)."""
+"""Array layouts, of one array or two side by side (the paper's Fig. LAYOUTS)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.instrument.settings import Layout as LayoutSettings
 from calstudy.plotting import style
 from calstudy.products.graph import Graph
@@ -17,6 +17,7 @@ from calstudy.run.task import Job, Task
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 NUMBERED_ANTENNAS = 64
 """Largest number of antennas that are drawn with their numbers."""
@@ -92,6 +93,8 @@ def layout_panel(layout: LayoutSettings, title: str | None = None) -> LayoutPane
 class Layout(StudyFigure):
     """The antennas of the array."""
 
+    kind: str = "layout"
+
     caption = "The array."
     shows_sky = False
 
@@ -107,3 +110,24 @@ class Layout(StudyFigure):
         """Draw the array."""
         panel = layout_panel(job.settings["layout"])
         return Drawing(draw_layouts([panel], stand_ins=job.settings["notes"]), panel)
+
+
+class Layouts(StudyFigure):
+    """The arrays of the members that play the roles `minimally_redundant` and `redundant`."""
+
+    kind: str = "layouts"
+
+    of = ("collection",)
+    caption = "The two arrays."
+    titles = TWO_ARRAYS
+    shows_sky = False
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return nothing: the settings are sufficient."""
+        del graph
+        return {}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the arrays from left to right."""
+        panels = [layout_panel(job.settings["layouts"][role], title) for role, title in self.titles.items()]
+        return Drawing(draw_layouts(panels, stand_ins=job.settings["notes"]), panels)

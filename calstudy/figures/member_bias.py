@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from calstudy.figures import Drawing, StudyFigure, members_of
-from calstudy.figures.comparison_spectra import look
+from calstudy.figures.comparison import look
 from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.graph import Graph, required
@@ -77,6 +77,8 @@ class MemberBiasFigure(StudyFigure):
     """The foregrounds that calibration leaves over the EoR, for every member of a collection."""
 
     version: ClassVar[int] = 2
+
+    kind: str = "member-bias"
     of = ("collection",)
     caption = (
         "Absolute value of the bias of each member outside the wedge with 95 % bars; open symbols: 95 % upper limit "

@@ -101,6 +101,8 @@ def _add_legend(figure: Figure, series: Sequence[RuntimeSeries], symbol: str) ->
 class Runtime(StudyFigure):
     """Time per step, or per solve, of the solvers against the size of the array."""
 
+    kind: str = "runtime"
+
     of = ("runtime",)
     caption = "Run time against the size of the array: medians, central 95 %, fitted powers."
     tolerances = ((r".*", MACHINE),)

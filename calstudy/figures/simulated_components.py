@@ -204,6 +204,8 @@ def _draw_baseline(axes: Axes, baseline: BaselineDelays, buffer: float) -> None:
 class SimulatedComponentsFigure(StudyFigure):
     """The simulated components alone: wedge of F, P(k) of S over its input, delay spectra of three baselines."""
 
+    kind: str = "simulated-components"
+
     caption = "Simulated components alone: wedge of F, P(k) of S over its input, and delay spectra of three baselines."
     needs_foregrounds = True
     sections = ("instrument", "sky", "corruption", "power")

@@ -109,6 +109,8 @@ class SolverComparison(StudyFigure):
     `minimally_redundant` and `redundant` the default one. An array is shown if both of its roles are played.
     """
 
+    kind: str = "solver-comparison"
+
     of = ("collection",)
     caption = "Residual power outside the wedge with the paper's solver and the default one: with EoR, and without."
     titles: ClassVar[Mapping[str, str]] = {role: title for title, roles in ARRAYS.items() for role in roles}

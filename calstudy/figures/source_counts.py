@@ -121,6 +121,8 @@ def draw_counts(counts: SourceCounts, stand_ins: Sequence[str] = ()) -> Figure:
 class SourceCountsFigure(StudyFigure):
     """The differential source counts of the foreground sky, over those of Franzen et al. (2019)."""
 
+    kind: str = "source-counts"
+
     caption = "Differential source counts at 200 MHz, and their ratio to those of Franzen et al. (2019)."
     needs_foregrounds = True
     sections = ("sky", "instrument")

@@ -1,15 +1,15 @@
-"""Spherical power spectra of one array (the paper's Figs. SPHERICAL and SPHERICAL_LOW_SNR)."""
+"""Spherical power spectra with 95 % bars, of one array or two (the paper's Figs. SPHERICAL*)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calstudy.power.spectra import SphericalSpectrum
+
 
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""
@@ -225,6 +226,8 @@ def read_column(folder: Path, title: str, modes: str) -> SphericalColumn:
 class Spherical(StudyFigure):
     """Spherical power spectra over all modes, and outside the wedge."""
 
+    kind: str = "spherical"
+
     caption = "Spherical power spectra with 95 % bars; open where negative."
     variants = ("eor",)
     tolerances = SPHERICAL_RULES
@@ -243,3 +246,56 @@ class Spherical(StudyFigure):
         everything = read_column(job.inputs["spectra"], "all modes", "all-modes")
         columns = {"all_modes": everything, "excised": self.excised(job)}
         return Drawing(draw_spherical(list(columns.values()), stand_ins=job.settings["notes"]), columns)
+
+
+class SphericalExcised(Spherical):
+    """Spherical power spectra outside the wedge."""
+
+    kind: str = "spherical-excised"
+
+    caption = "Spherical power spectra outside the wedge with 95 % bars; open where negative."
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw one column."""
+        column = self.excised(job)
+        return Drawing(draw_spherical([column], stand_ins=job.settings["notes"]), {"excised": column})
+
+
+def draw_spherical_comparison(
+    minimally_redundant: SphericalColumn,
+    redundant: SphericalColumn,
+    zoom_k: float = 1.0,
+    stand_ins: Sequence[str] = (),
+) -> Figure:
+    """Draw both arrays as `draw_spherical` does, the minimally redundant one left and the redundant one right.
+
+    The columns should average the same Fourier modes: those outside the wedge and its buffer. Their titles are replaced
+    by the names of the arrays.
+    """
+    columns = (
+        replace(minimally_redundant, title="Minimally redundant"),
+        replace(redundant, title="Redundant"),
+    )
+    return draw_spherical(columns, zoom_k, stand_ins)
+
+
+class SphericalComparison(StudyFigure):
+    """Spherical power spectra outside the wedge of the members in the roles `minimally_redundant` and `redundant`."""
+
+    kind: str = "spherical-comparison"
+
+    of = ("collection",)
+    titles = TWO_ARRAYS
+    caption = "Spherical power spectra outside the wedge, of both arrays; below, enlarged."
+    tolerances = SPHERICAL_RULES
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a column for each array."""
+        columns = {
+            role: read_column(job.inputs[f"spectra:{role}"], title, "outside-wedge")
+            for role, title in self.titles.items()
+        }
+        figure = draw_spherical_comparison(
+            columns["minimally_redundant"], columns["redundant"], stand_ins=job.settings["notes"]
+        )
+        return Drawing(figure, columns)

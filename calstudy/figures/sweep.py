@@ -143,6 +143,8 @@ def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> 
 class Sweep(StudyFigure):
     """The signal loss of all points of a sweep."""
 
+    kind: str = "sweep"
+
     of = ("sweep",)
     caption = "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars."
 

@@ -159,6 +159,8 @@ def _colour_bars(figure: Figure, grid: np.ndarray, norms: tuple[LogNorm, LogNorm
 class Wedge(StudyFigure):
     """Cylindrical power spectra of five variants of the data."""
 
+    kind: str = "wedge"
+
     caption = "Cylindrical power spectra; negative values in blue."
     variants = ("uncorrupted", "uncalibrated", "residual", "eor", "noise")
     needs_calibration = True

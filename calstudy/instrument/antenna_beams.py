@@ -20,8 +20,8 @@ from calstudy.base.plugins import guarded
 from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beam_grid import bspline_coefficients, cells, fixed_components, polar_components, spline_fields
 from calstudy.instrument.beams import make_beam
-from calstudy.instrument.distinct_beams import AssignedBeam, assigned_beams, nominal_beams
-from calstudy.instrument.interface import AntennaBeam, Beam, model_of
+from calstudy.instrument.interface import AntennaBeam, AntennaBeams, Beam, model_of
+from calstudy.instrument.settings import AssignedBeam, assigned_beams, nominal_beams
 from calstudy.instrument.tabulated import describe, tabulate
 
 if TYPE_CHECKING:
@@ -31,23 +31,6 @@ if TYPE_CHECKING:
 
 
 Source = TypeVar("Source")
-
-
-@dataclass(frozen=True)
-class AntennaBeams:
-    """The distinct beams of an array, and the index of the beam of each antenna in the order of the layout, (Nants,).
-
-    The first beam is `instrument.beam`, as built for the first antenna that has it.
-    """
-
-    beams: tuple[AntennaBeam, ...]
-    index: np.ndarray
-
-    @property
-    def stand_in(self) -> str | None:
-        """The note on the beam of `instrument.beam`, and the number of antennas with other beams."""
-        others = f"antennas with another: {int((self.index > 0).sum())}"
-        return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
 
 
 def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | AntennaBeams:

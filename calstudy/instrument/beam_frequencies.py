@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.mwa_files import BEAM
 
 # The tabulated MWA beam scatters from frequency to frequency by 2.4e-5 rms of the zenith value. A polynomial of order 8
@@ -67,6 +68,7 @@ def mwa_frequencies(path: Path | None) -> np.ndarray:
 @lru_cache(maxsize=4)
 def _mwa_frequencies(path: Path, modified: int) -> np.ndarray:
     del modified
+    require_self_contained(path)
     try:
         with h5py.File(path) as file:
             matches = [MWA_GROUP.fullmatch(name) for name in file]

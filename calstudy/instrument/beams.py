@@ -15,6 +15,8 @@ from pyuvdata.analytic_beam import AnalyticBeam
 from scipy.constants import speed_of_light
 from scipy.interpolate import CubicSpline
 
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.instrument.interface import Beam, model_of
 from calstudy.instrument.settings import Channels
@@ -71,6 +73,7 @@ class ExactBeam:
         self.name = name
         self.stand_in: str | None = stand_in
         self._analytic = analytic
+        self._angles: dict[tuple[int, bytes], np.ndarray] = {}
 
     def at(self, frequencies: np.ndarray) -> AnalyticBeam:
         """Return the analytic E-field beam, which is valid at any frequency (Hz)."""
@@ -78,15 +81,20 @@ class ExactBeam:
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
         """Return Ω_p and Ω_pp in sr, (Nfreqs,) each; see `Beam`."""
+        wanted = np.asarray(frequencies, dtype=float)
+        key = FEEDS[polarization], wanted.tobytes()
+        if key not in self._angles:
+            self._angles[key] = np.array([self._solid_angles(frequency, key[0]) for frequency in wanted]).T
+        first, second = self._angles[key].copy()
+        return first, second
+
+    def _solid_angles(self, frequency: float, feed: int) -> tuple[float, float]:
         azimuth, zenith_angle = (grid.ravel() for grid in np.meshgrid(AZIMUTHS, ZENITH_ANGLES))
-        angles = []
-        for frequency in frequencies:
-            jones = self._analytic.efield_eval(
-                az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency], dtype=float)
-            )
-            power = (np.abs(jones[:, FEEDS[polarization], 0]) ** 2).sum(axis=0)
-            angles.append(integrate_power(power.reshape(len(ZENITH_ANGLES), len(AZIMUTHS)), ZENITH_ANGLES))
-        return tuple(np.array(angles).T)
+        jones = self._analytic.efield_eval(
+            az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency], dtype=float)
+        )
+        power = (np.abs(jones[:, feed, 0]) ** 2).sum(axis=0)
+        return integrate_power(power.reshape(len(ZENITH_ANGLES), len(AZIMUTHS)), ZENITH_ANGLES)
 
 
 class GriddedBeam:
@@ -148,5 +156,13 @@ def make_beam(settings: Plugin, channels: Channels | None = None) -> Beam:
     Tabulated beams are read and fitted over a slightly wider band than the channels, and do not accept frequencies
     outside it. Raises InputError if a beam file is missing, cannot be read, or does not cover the channels.
     """
+    channels = Channels() if channels is None else channels
     with guarded(settings):
-        return model_of(settings).make(Channels() if channels is None else channels)
+        beam = model_of(settings).make(channels)
+    if not isinstance(beam, ExactBeam):
+        return beam
+    # All spectra of a run have the same beam, whose solid angles take longer than a small spectrum.
+    return _EXACT_BEAMS.setdefault(digest_json([identity(settings), identity(channels)]), beam)
+
+
+_EXACT_BEAMS: dict[str, ExactBeam] = {}

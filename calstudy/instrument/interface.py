@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Protocol, cast
 
 from pydantic import Field
@@ -42,6 +43,23 @@ class Beam(AntennaBeam, Protocol):
 
         `frequencies` are in Hz; `polarization` is "xx" or "yy".
         """
+
+
+@dataclass(frozen=True)
+class AntennaBeams:
+    """The distinct beams of an array, and the index of the beam of each antenna in the order of the layout, (Nants,).
+
+    The first beam is `instrument.beam`, as built for the first antenna that has it.
+    """
+
+    beams: tuple[AntennaBeam, ...]
+    index: np.ndarray
+
+    @property
+    def stand_in(self) -> str | None:
+        """The note on the beam of `instrument.beam`, and the number of antennas with other beams."""
+        others = f"antennas with another: {int((self.index > 0).sum())}"
+        return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
 
 
 def model_of(section: Plugin) -> BeamModel:

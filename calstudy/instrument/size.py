@@ -7,7 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from calstudy.base.identity import digest_json, identity
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.observation import Frame
 from calstudy.base.plugins import Plugin
 from calstudy.instrument.layouts import make_layout

@@ -59,6 +59,7 @@ from numpy.typing import ArrayLike
 from calstudy.power.clusters import Clusters, clusters_in_k, linear_error
 from calstudy.power.correctable import correctable
 from calstudy.power.delay import horizon_delay
+from calstudy.verdicts.measured import is_measured
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -161,10 +162,12 @@ class Injection:
                 )
 
 
-def known_within(found: TransferFunction, largest_error: float) -> TransferFunction:
-    """Return a transfer function in which bins whose T has a larger error hold NaN, but for the signal."""
+def where_measured(found: TransferFunction) -> TransferFunction:
+    """Return a transfer function in which bins whose T is not measured hold NaN, but for the signal."""
     names = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence")
-    unknown = found.transfer_error > largest_error
+    unknown = np.array(
+        [not is_measured(*pair) for pair in zip(found.transfer, found.transfer_error, strict=True)], bool
+    )
     changes: dict[str, Any] = {
         name: np.where(unknown, np.nan, getattr(found, name)) for stem in names for name in (stem, f"{stem}_error")
     }

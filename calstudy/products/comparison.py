@@ -16,6 +16,8 @@ from calstudy.products.files import json_number, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
+from calstudy.verdicts.measured import is_measured, why_not_measured
+from calstudy.verdicts.standing import answers, standing_table, standings
 
 if TYPE_CHECKING:
     from calstudy.power.score import CalibratedSpectra, Score
@@ -102,12 +104,12 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     """Return the best calibrator of a world in a band of k, or None if nothing is known there.
 
     It has the largest T of those whose bias is below the EoR with two standard deviations; if all are above, the
-    smallest upper limit of the bias.
+    smallest upper limit of the bias. Those whose T is not measured are left out.
     """
     limits = {
         name: upper_limit(float(case.bands.bias[band]), float(case.bands.bias_error[band]))
         for name, case in found.items()
-        if np.isfinite(case.bands.transfer[band])
+        if is_measured(float(case.bands.transfer[band]), float(case.bands.transfer_error[band]))
     }
     known = {name: limit for name, limit in limits.items() if np.isfinite(limit)}
     below = [name for name, limit in known.items() if limit < COUNTS]
@@ -116,7 +118,7 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=3):
+class Comparison(Task, stage="comparison", version=4):
     """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there."""
 
     title: str
@@ -140,7 +142,7 @@ class Comparison(Task, stage="comparison", version=3):
         }
         text = json.dumps(summaries, indent=1, ensure_ascii=False, allow_nan=False)
         (output / JSON).write_text(text + "\n", encoding="utf-8")
-        (output / MARKDOWN).write_text(_markdown(self, cases, less), encoding="utf-8")
+        (output / MARKDOWN).write_text(_markdown(self, cases, less, summaries), encoding="utf-8")
         return {}
 
     def shown(self, folder: Path) -> Sequence[Table]:
@@ -219,9 +221,21 @@ def _markdown(
     task: Comparison,
     cases: Mapping[str, Mapping[str, Case]],
     less: Mapping[str, Mapping[str, Sequence[Mapping[str, Any]]]],
+    summaries: Mapping[str, Mapping[str, Mapping[str, Any]]],
 ) -> str:
+    standing = standings(summaries, [(world, name, why) for world, name, why in task.refusals])
+    answer = standing_table(standing)
     lines = [
         f"# Calibrators compared: {task.title}",
+        "",
+        f"## {answer.title}",
+        "",
+        *(f"- {sentence}" for sentence in answers(standing)),
+        "",
+        answer.markdown(numbers=False),
+        answer.note,
+        "",
+        "## Scores",
         "",
         "T is the part of the EoR's power that is left, and the bias the power of the residual without EoR over that "
         "of the EoR, both free of the flux scale s, outside the wedge, in bands of k in h/Mpc, with one standard "
@@ -242,7 +256,7 @@ def _markdown(
     ]
     lines += _tolerances(cases, task.calibrators)
     for world, found in cases.items():
-        lines += [f"## {world}", ""]
+        lines += [f"### {world}", ""]
         if found:
             summaries = {name: case.summary for name, case in found.items()}
             lines += [_sky_models(found), "", score_table(summaries).markdown()]
@@ -324,8 +338,11 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
 
 def _transfer_cell(band: Mapping[str, Any]) -> str:
     """Write T and, if it differs from the linear response by more than its error, this as well."""
-    cell, linear = _cell(band["transfer"], band["transfer_error"]), band.get("linear_transfer")
-    if linear is None or band["transfer"] is None or abs(band["transfer"] - linear) <= band["transfer_error"]:
+    transfer, error, linear = band["transfer"], band["transfer_error"], band.get("linear_transfer")
+    cell = _cell(transfer, error)
+    if transfer is not None and why_not_measured(transfer, error):
+        return f"not measured ({cell})"
+    if linear is None or transfer is None or abs(transfer - linear) <= error:
         return cell
     return f"{cell} (linear {linear:.2f})"
 

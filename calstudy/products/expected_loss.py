@@ -1,4 +1,4 @@
-"""Fraction of the EoR that a fit leaves, to first order, from its own tangent space, of simulated and measured data."""
+"""Fraction of the EoR that a fit leaves, to first order, from its own tangent space."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
-from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
 from calstudy.instrument.size import Size
 from calstudy.power.settings import PowerSettings
-from calstudy.products import calibration, corruption, observed
-from calstudy.products.calibration import Calibrated, prepared_fit, read_result
+from calstudy.products import calibration, corruption
+from calstudy.products.calibration import Calibrated, prepared_fit
 from calstudy.products.files import DATA, MODEL, integration_times, json_number, read_visibilities, write_json
-from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
+from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
@@ -27,13 +27,10 @@ if TYPE_CHECKING:
 
     from calstudy.calibrate.expected_loss import ExpectedTransfer
     from calstudy.calibrate.problem import CalibrationProblem
-    from calstudy.calibrate.records import CalibrationResult
     from calstudy.power.expected import ExpectedBins
     from calstudy.power.spectra import BaselineModes
 
 EXPECTED, RESPONSE = "expected-loss.h5", "linear-response.json"
-TRANSFER = "expected-transfer"
-"""Start of the names of the files of the expected transfer functions, which a polarization follows."""
 # Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
 # further within a bin.
 PROBES = 16
@@ -46,23 +43,10 @@ NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
 
 
 @memoize
-def expected_loss(graph: Graph) -> Task | None:
-    """Return the task that predicts T for the middle integration, or the middle solve of measured data.
-
-    Measured data without a fit by least squares have none.
-    """
+def expected_loss(graph: Graph) -> Task:
+    """Return the task that predicts T for the middle integration."""
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
-    if not isinstance(graph, MeasuredGraph):
-        return ExpectedLoss(LABEL, probes=PROBES, power=power, **_solved(graph))
-    if not isinstance(graph.experiment.calibration, GainFit):
-        return None
-    return ExpectedLossOfData(LABEL, power=power, **_of_data(graph, "even"))
-
-
-@memoize
-def expected_transfer(graph: MeasuredGraph, part: str) -> Task:
-    """Return the task of the expected transfer function of every baseline, delay and polarization of a part."""
-    return ExpectedTransfers(LABEL, **_of_data(graph, part))
+    return ExpectedLoss(LABEL, probes=PROBES, power=power, **_solved(graph))
 
 
 @memoize
@@ -93,16 +77,6 @@ def _solved(graph: Graph) -> dict[str, Any]:
         "calibration": calibration.calibration(graph, residual, "even"),
         "calibrator": graph.experiment.calibration.with_defaults("assumed"),
         "integration": graph.experiment.instrument.times.count // 2,
-    }
-
-
-def _of_data(graph: MeasuredGraph, part: str) -> dict[str, Any]:
-    return {
-        "data": observed.observed(graph, part),
-        "calibration": observed.calibrated(graph, part),
-        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
-        "sky_model": graph.experiment.observed.sky_model is not None,
-        "probes": PROBES,
     }
 
 
@@ -217,87 +191,6 @@ class LinearResponse(_Solved, stage="linear-response", version=1):
         ]
         write_json(output / RESPONSE, {"bands": bands})
         return {}
-
-
-class _OfData(Task):
-    """The calibration of a part of measured data, which have the sky model and the noise with them."""
-
-    data: Input
-    calibration: Input
-    calibrator: GainFit = called("calibration")
-    sky_model: bool
-    probes: int
-
-    def expect(self, result: CalibrationResult, polarization: int, taper: str) -> ExpectedTransfer | None:
-        """Return the expected remainder of a white signal in the middle one of the usable solves, or None without any.
-
-        It is exact for arrays whose matrices are small, and from random vectors for others. The baselines are those of
-        the model, repeated for each integration where several were solved together.
-        """
-        import numpy as np
-
-        from calstudy.base.visibilities import to_cube
-        from calstudy.calibrate.expected_loss import DENSE, DelayModes, jacobian_size
-        from calstudy.calibrate.expected_loss import expected_transfer as expected_of
-        from calstudy.calibrate.preparation import problem_at
-
-        number = int(result.model.polarization_array[polarization])
-        usable = [record for record in result.solutions if record.polarization == number and record.usable]
-        if not usable:
-            return None
-        record = usable[len(usable) // 2]
-        times = slice(record.integration, record.integration + record.n_integrations)
-        prepared = prepared_fit(self.calibrator, *observed.read_observed(self.data, self.calibrator, self.sky_model))
-        order = np.argsort(result.gains.ant_array)
-        rows = order[np.searchsorted(result.gains.ant_array, prepared.data.numbers, sorter=order)]
-        gains = result.gains.gain_array[rows, :, times.start, polarization]
-        problem = problem_at(prepared, self.calibrator, times, polarization, gains)
-        if isinstance(problem, str):
-            return None
-        model = to_cube(result.model)[times, :, :, polarization].reshape(problem.visibilities.shape)
-        probes = None if jacobian_size(problem) <= DENSE else self.probes
-        return expected_of(problem, gains, model, DelayModes(prepared.data.frequencies, taper), probes)
-
-    def _cost(self) -> Cost:
-        return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * size_of(self).samples * COMPLEX128, 1e6)
-
-
-class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=2):
-    """The expected T of the middle solve of one half of measured data."""
-
-    power: PowerSettings
-
-    def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the expected T in bins of k and of length and delay."""
-        import numpy as np
-
-        from calstudy.base.visibilities import baseline_vectors
-        from calstudy.power.tables import save_spectrum
-
-        result = read_result(self.calibration)
-        found = self.expect(result, 0, self.power.taper)
-        if found is None:
-            raise InputError("expected-loss: no solve of the calibration gave gains")
-        lengths: np.ndarray = np.linalg.norm(baseline_vectors(result.model), axis=1)
-        centre = float(np.mean(result.model.freq_array))
-        save_spectrum(output / EXPECTED, binned(found, np.resize(lengths, len(found.transfer)), centre, self.power))
-        return {"probes": self.probes}
-
-
-class ExpectedTransfers(_OfData, stage="expected-transfer", version=1):
-    """The expected transfer functions of all polarizations of measured data."""
-
-    def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the transfer function of every polarization that has solutions to a file of its own."""
-        from calstudy.calibrate.expected_loss import TAPER
-        from calstudy.power.tables import save_spectrum
-
-        result = read_result(self.calibration)
-        for index, name in enumerate(result.model.get_pols()):
-            found: Any = self.expect(result, index, TAPER)
-            if found is not None:
-                save_spectrum(output / f"{TRANSFER}.{name}.h5", found)
-        return {"probes": self.probes}
 
 
 def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:

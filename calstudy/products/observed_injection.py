@@ -1,4 +1,4 @@
-"""Signal loss of measured data: a simulated EoR is added under the solved gains, and the data are calibrated again."""
+"""Signal loss of measured data: measured by an EoR that is added under the solved gains, and expected of the fit."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.settings import GainFit
+from calstudy.products.calibration import prepared_fit, read_result
+from calstudy.products.expected_loss import EXPECTED, LABEL, NOT_OF_THE_FIT, PROBES, binned
 from calstudy.products.files import (
     AVERAGE,
     DATA,
@@ -21,26 +24,30 @@ from calstudy.products.files import (
     write_visibilities,
 )
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
-from calstudy.products.observed import average, calibrated, crosses_of, observed
+from calstudy.products.observed import average, calibrated, crosses_of, observed, read_observed
 from calstudy.products.observed_results import observed_spectra
 from calstudy.products.signal_loss import Difference, Injected, write_corrected, write_transfer
 from calstudy.products.spectra import EXCISION, InBlocks, cross_power
 from calstudy.realdata.halves import PARITIES
-from calstudy.run.task import Input, Task
+from calstudy.run.task import Input, Task, called
 from calstudy.simulate.interface import SimulationSize
+from calstudy.verdicts.measured import HIGHEST, LARGEST_ERROR, LOWEST
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pyuvdata import UVData
 
+    from calstudy.calibrate.expected_loss import ExpectedTransfer
+    from calstudy.calibrate.records import CalibrationResult
     from calstudy.instrument.settings import Beam, Channels
+    from calstudy.power.settings import PowerSettings
     from calstudy.simulate.settings import SimulationSettings
     from calstudy.sky.settings import Eor
 
 FACTOR = "factor.json"
-LARGEST_ERROR = 0.5
-"""Standard deviation of a T that is measured: T is a fraction, and 95 % intervals of larger ones hold all of 0 to 1."""
+EXPECTED_TRANSFER = "expected-transfer"
+"""Start of the names of the files of the expected transfer functions, which a polarization follows."""
 
 
 @memoize
@@ -90,6 +97,31 @@ def transfer(graph: MeasuredGraph) -> Task | None:
         cross=cross_power(graph, "eor x response", [signals[0], responses[1]]),
         spectra=observed_spectra(graph),
     )
+
+
+@memoize
+def expected_loss(graph: MeasuredGraph) -> Task | None:
+    """Return the task that predicts T for the middle solve, or None without a fit by least squares."""
+    if not isinstance(graph.experiment.calibration, GainFit):
+        return None
+    power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
+    return ExpectedLossOfData(LABEL, power=power, **_of_data(graph, "even"))
+
+
+@memoize
+def expected_transfer(graph: MeasuredGraph, part: str) -> Task:
+    """Return the task of the expected transfer function of every baseline, delay and polarization of a part."""
+    return ExpectedTransfers(LABEL, **_of_data(graph, part))
+
+
+def _of_data(graph: MeasuredGraph, part: str) -> dict[str, Any]:
+    return {
+        "data": observed(graph, part),
+        "calibration": calibrated(graph, part),
+        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
+        "sky_model": graph.experiment.observed.sky_model is not None,
+        "probes": PROBES,
+    }
 
 
 class SimulateEor(Task, stage="observed-eor", version=3):
@@ -227,7 +259,7 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
         return _cost_of_average(self)
 
 
-class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost(4, disk=1e6)):
+class ObservedTransfer(Injected, stage="observed-transfer", version=4, cost=Cost(4, disk=1e6)):
     """T of measured data."""
 
     def make(self, output: Path) -> Mapping[str, Any]:
@@ -239,7 +271,7 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost
 
         found = self.read()
         # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
-        summary = write_transfer(output, found, self.power, 1.0, LARGEST_ERROR)
+        summary = write_transfer(output, found, self.power, 1.0, only_measured=True)
         signals = {}
         for modes, excise in EXCISION.items():
             spectrum = spherical_average(found.signal, self.power, excise)
@@ -253,16 +285,15 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=3, cost=Cost
 
 def _not_measured(summary: Mapping[str, Any]) -> list[str]:
     """Return a sentence that names the bands outside the wedge in which T is not measured; none without any."""
-    unknown = [band for band in summary["outside-wedge"] if band["transfer"] is None and band["error"] is not None]
+    unknown = [band for band in summary["outside-wedge"] if band["error"] is not None and band["not_measured"]]
     if not unknown:
         return []
-    named = ", ".join(
-        f"{low:g} to {high:g} (error {band['error']:.2g})" for band in unknown for low, high in [band["k"]]
-    )
+    named = ", ".join(f"{low:g} to {high:g} ({band['not_measured']})" for band in unknown for low, high in [band["k"]])
     return [
-        f"T is not measured at k of {named} h/Mpc: an error above {LARGEST_ERROR:g} leaves open all that T can be; "
-        "interference that is not flagged (observed.flag_interference: true), few integrations or a weak "
-        "injection.level are the usual reasons"
+        f"T is not measured at k of {named} h/Mpc: T is the part of the EoR that is left, so that a T below {LOWEST:g} "
+        f"or above {HIGHEST:g} is none, and an error above {LARGEST_ERROR:g} leaves open what it is; interference that "
+        "is not flagged (observed.flag_interference: true), few integrations or a weak injection.level are the usual "
+        "reasons"
     ]
 
 
@@ -270,3 +301,84 @@ def _cost_of_average(task: Task) -> Cost:
     size = size_of(task)
     disk = getattr(task, "blocks", 1) * size.samples / size.times * COMPLEX128
     return Cost(2, LIBRARIES_MEMORY + 8 * size.samples * COMPLEX128, disk)
+
+
+class _OfData(Task):
+    """The calibration of a part of measured data, which have the sky model and the noise with them."""
+
+    data: Input
+    calibration: Input
+    calibrator: GainFit = called("calibration")
+    sky_model: bool
+    probes: int
+
+    def expect(self, result: CalibrationResult, polarization: int, taper: str) -> ExpectedTransfer | None:
+        """Return the expected remainder of a white signal in the middle one of the usable solves, or None without any.
+
+        It is exact for arrays whose matrices are small, and from random vectors for others. The baselines are those of
+        the model, repeated for each integration where several were solved together.
+        """
+        import numpy as np
+
+        from calstudy.base.visibilities import to_cube
+        from calstudy.calibrate.expected_loss import DENSE, DelayModes, jacobian_size
+        from calstudy.calibrate.expected_loss import expected_transfer as expected_of
+        from calstudy.calibrate.preparation import problem_at
+
+        number = int(result.model.polarization_array[polarization])
+        usable = [record for record in result.solutions if record.polarization == number and record.usable]
+        if not usable:
+            return None
+        record = usable[len(usable) // 2]
+        times = slice(record.integration, record.integration + record.n_integrations)
+        prepared = prepared_fit(self.calibrator, *read_observed(self.data, self.calibrator, self.sky_model))
+        order = np.argsort(result.gains.ant_array)
+        rows = order[np.searchsorted(result.gains.ant_array, prepared.data.numbers, sorter=order)]
+        gains = result.gains.gain_array[rows, :, times.start, polarization]
+        problem = problem_at(prepared, self.calibrator, times, polarization, gains)
+        if isinstance(problem, str):
+            return None
+        model = to_cube(result.model)[times, :, :, polarization].reshape(problem.visibilities.shape)
+        probes = None if jacobian_size(problem) <= DENSE else self.probes
+        return expected_of(problem, gains, model, DelayModes(prepared.data.frequencies, taper), probes)
+
+    def _cost(self) -> Cost:
+        return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * size_of(self).samples * COMPLEX128, 1e6)
+
+
+class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=2):
+    """The expected T of the middle solve of one half of measured data."""
+
+    power: PowerSettings
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the expected T in bins of k and of length and delay."""
+        import numpy as np
+
+        from calstudy.base.visibilities import baseline_vectors
+        from calstudy.power.tables import save_spectrum
+
+        result = read_result(self.calibration)
+        found = self.expect(result, 0, self.power.taper)
+        if found is None:
+            raise InputError("expected-loss: no solve of the calibration gave gains")
+        lengths: np.ndarray = np.linalg.norm(baseline_vectors(result.model), axis=1)
+        centre = float(np.mean(result.model.freq_array))
+        save_spectrum(output / EXPECTED, binned(found, np.resize(lengths, len(found.transfer)), centre, self.power))
+        return {"probes": self.probes}
+
+
+class ExpectedTransfers(_OfData, stage="expected-transfer", version=1):
+    """The expected transfer functions of all polarizations of measured data."""
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the transfer function of every polarization that has solutions to a file of its own."""
+        from calstudy.calibrate.expected_loss import TAPER
+        from calstudy.power.tables import save_spectrum
+
+        result = read_result(self.calibration)
+        for index, name in enumerate(result.model.get_pols()):
+            found: Any = self.expect(result, index, TAPER)
+            if found is not None:
+                save_spectrum(output / f"{EXPECTED_TRANSFER}.{name}.h5", found)
+        return {"probes": self.probes}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import Cost
@@ -24,13 +25,14 @@ from calstudy.products.files import (
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
 from calstudy.run.task import Input, Inputs, Task
+from calstudy.verdicts.measured import why_not_measured
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from calstudy.power.settings import PowerSettings
     from calstudy.power.spectra import SphericalSpectrum
-    from calstudy.power.transfer import Injection
+    from calstudy.power.transfer import Injection, TransferFunction
 
 REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Parts of Fourier space; true for the part inside the wedge."""
@@ -128,9 +130,9 @@ class Injected(Task):
         rows = [
             (
                 f"{outside.bin_edges[band]:g} to {outside.bin_edges[band + 1]:g}",
-                _with_error(outside.transfer[band], outside.transfer_error[band]),
+                _transfer(outside, band),
                 _with_error(outside.squared_coherence[band], outside.squared_coherence_error[band]),
-                _with_error(inside.transfer[band], inside.transfer_error[band]),
+                _transfer(inside, band),
             )
             for band in range(outside.k.size)
         ]
@@ -159,30 +161,34 @@ class Transfer(Injected, stage="transfer", version=4, cost=Cost(1, disk=1e6)):
 
 
 def write_transfer(
-    folder: Path, injection: Injection, settings: PowerSettings, scale: float, largest_error: float = math.inf
+    folder: Path, injection: Injection, settings: PowerSettings, scale: float, only_measured: bool = False
 ) -> dict[str, Any]:
     """Write T per k outside and inside the wedge, in fine bins and in bands, and per (|b|, tau).
 
-    The flux scale of the calibration is NaN if it is not known. Per k, a T with an error above `largest_error` is NaN.
-    Return T in bands, as plain JSON types, by part of Fourier space; errors are kept.
+    The flux scale of the calibration is NaN if it is not known. With `only_measured`, T per k is NaN where it is not
+    measured (`calstudy.verdicts.measured`). Return T in bands, as plain JSON types, by part of Fourier space, with why
+    it is not measured.
     """
     from calstudy.power.binned import make_bin_edges
     from calstudy.power.tables import save_spectrum, write_transfer_csv
-    from calstudy.power.transfer import BANDS, cylindrical_transfer, known_within, spherical_transfer
+    from calstudy.power.transfer import BANDS, cylindrical_transfer, spherical_transfer, where_measured
 
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
         for name, edges in ((TRANSFER, fine), (BAND, BANDS)):
             measured = spherical_transfer(injection, edges, buffer, inside, scale)
-            found = known_within(measured, largest_error)
+            found = where_measured(measured) if only_measured else measured
             save_spectrum(folder / spectrum_file(name, region), found)
             write_transfer_csv(folder / f"{name}.{region}.csv", found)
         summary[region] = [
-            {"k": [low, high], "transfer": _json(value), "error": _json(error)}
-            for low, high, value, error in zip(
-                BANDS[:-1], BANDS[1:], found.transfer, measured.transfer_error, strict=True
-            )
+            {
+                "k": [low, high],
+                "transfer": _json(found.transfer[band]),
+                "error": _json(measured.transfer_error[band]),
+                "not_measured": why_not_measured(measured.transfer[band], measured.transfer_error[band]) or None,
+            }
+            for band, (low, high) in enumerate(pairwise(BANDS))
         ]
     save_spectrum(folder / spectrum_file(TRANSFER, "wedge"), cylindrical_transfer(injection, settings.length_bin))
     return summary
@@ -257,7 +263,16 @@ class FluxScale(Task, stage="flux-scale", version=1):
 
 
 def _with_error(value: float, error: float) -> str:
-    return f"{value:.3f} ± {error:.3f}" if math.isfinite(value) else "no modes"
+    return f"{value:.3f} ± {error:.3f}" if math.isfinite(value) else "-"
+
+
+def _transfer(found: TransferFunction, band: int) -> str:
+    """Write T with its error, and say where it is not measured."""
+    value, error = found.transfer[band], found.transfer_error[band]
+    if not math.isfinite(value):
+        return "not measured" if math.isfinite(found.signal[band]) else "no modes"
+    text = _with_error(value, error)
+    return f"not measured ({text})" if why_not_measured(value, error) else text
 
 
 def _json(value: float) -> float | None:

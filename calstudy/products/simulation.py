@@ -10,8 +10,8 @@ import numpy as np
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.instrument.distinct_beams import beam_count
 from calstudy.instrument.layouts import layout_of
+from calstudy.instrument.settings import beam_count
 from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, memoize

@@ -1,4 +1,4 @@
-"""Reference results on disk: the kept part of a finished run, its reading and acceptance."""
+"""Reference results on disk: the kept part of a finished run, its reading and acceptance, and its study run again."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ from uuid import uuid4
 import numpy as np
 import yaml
 from pydantic import ValidationError
+from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.experiment.model import FIGURES
 from calstudy.results.folder import EXPERIMENT, MANIFEST, NO_RUN, RunFolder
+from calstudy.run.execution import Budget
+from calstudy.studies.load import load_study
+from calstudy.studies.study import run_study
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import CLAIMS_FILES
 from calstudy.verdicts.tolerances import Rules
@@ -158,3 +162,16 @@ def _without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
         return {**content, "experiment": _without_folders(content["experiment"]), "worlds": worlds}
     outputs = {key: value for key, value in content.get("outputs", {}).items() if key not in ("store", "runs")}
     return {**content, "outputs": outputs}
+
+
+def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
+    """Run the study of a reference folder with ``path=value`` overrides, and return the run's folder.
+
+    Products of other code are made again.
+
+    Raise InputError if the experiment is a sweep, or as the run raises it.
+    """
+    study = load_study(reference / EXPERIMENT, None, overrides)
+    if not study.has_reference:
+        raise InputError(f"{reference}: is a {study.key}, which has no reference results")
+    return run_study(study, budget, console, strict=True).folder

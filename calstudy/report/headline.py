@@ -9,12 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.products.score import SUMMARY
 from calstudy.results.folder import RunFolder
 from calstudy.verdicts.criterion import Verdict
+from calstudy.verdicts.measured import why_not_measured
 from calstudy.verdicts.sentences import counts, outcomes_of_sentences
 
 BAND = (0.2, 0.5)
 """Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""
+MEASURED_BAND = (0.3, 0.5)
+"""The same for measured data, whose T is in other bands."""
 PLACE = f"outside the wedge, k of {BAND[0]:g} to {BAND[1]:g} h/Mpc"
 SIGNIFICANT = 5.0
 """Standard deviations below which a bias may be noise."""
@@ -43,14 +47,21 @@ class Signal:
     bias: float
     bias_error: float
     scale: float
+    linear_transfer: float | None = None
+    """T of the linear response of the fit, the yardstick for T; None if it is not known."""
 
     @property
     def numbers(self) -> list[Number]:
         """The same numbers as text."""
+        pair = (self.transfer, self.transfer_error)
+        transfer = _with_error(*pair)
         left = f"part of the EoR's power that is left, {PLACE}"
+        if self.linear_transfer is not None:
+            transfer += f" (linear response of the fit {self.linear_transfer:.3f})"
+            left += "; the linear response is what a fit of so many unknowns to these data must leave"
         bias = f"power of the residual without EoR over that of the EoR, {PLACE}; errors by leaving out antennas"
         return [
-            Number("T", _with_error(self.transfer, self.transfer_error), left),
+            Number("T", f"not measured ({transfer})" if why_not_measured(*pair) else transfer, left),
             Number("bias", _with_error(self.bias, self.bias_error), bias),
             Number("flux scale", f"{self.scale:.4f}", "of the calibrated data; T and bias are free of it"),
         ]
@@ -67,9 +78,9 @@ class Signal:
 
 
 def read_headline(run: RunFolder) -> list[Number]:
-    """Return T, bias and flux scale of a finished run, and counts of its claims, if it has them."""
+    """Return T, bias and flux scale of a finished run, or the fit to measured data, and counts of its claims."""
     signal = read_signal(run)
-    numbers = [] if signal is None else signal.numbers
+    numbers = measured_numbers(run) if signal is None else signal.numbers
     verdicts = _verdicts(run.claims)
     return [*numbers, *([] if verdicts is None else [verdicts])]
 
@@ -81,14 +92,34 @@ def read_signal(run: RunFolder) -> Signal | None:
     except InputError:
         return None
     band = int(np.argmin(np.abs(score.bin_edges[:-1] - BAND[0])))
+    bands = run.tables.summary["bands"] if run.tables.has(SUMMARY) else ()
+    linear = next((entry.get("linear_transfer") for entry in bands if entry["k"][0] == score.bin_edges[band]), None)
     signal = Signal(
         float(score.transfer[band]),
         float(score.transfer_error[band]),
         float(score.bias[band]),
         float(score.bias_error[band]),
         score.flux_scale,
+        linear,
     )
     return signal if math.isfinite(signal.transfer) and math.isfinite(signal.bias) else None
+
+
+def measured_numbers(run: RunFolder) -> list[Number]:
+    """Return the fit and T of measured data, from the notes of their products; empty for other runs."""
+    notes = {entry.get("stage"): entry.get("notes", {}) for entry in run.products}
+    halves = notes.get("observed-quality", {}).get("chi_squared", {})
+    fits = {half: found.get("per_degree_of_freedom") for half, found in halves.items()}
+    known = [f"{half} {value:.3f}" for half, value in fits.items() if value is not None]
+    numbers = [Number("χ² per degree of freedom", ", ".join(known), "1 for a fit to the noise")] if known else []
+    for band in notes.get("observed-transfer", {}).get("transfer", {}).get("outside-wedge", ()):
+        if tuple(band["k"]) == MEASURED_BAND and band["error"] is not None:
+            why = band.get("not_measured")
+            text = f"not measured ({why})" if why else _with_error(band["transfer"], band["error"])
+            low, high = MEASURED_BAND
+            left = f"part of an injected EoR's power that is left, outside the wedge, k of {low:g} to {high:g} h/Mpc"
+            numbers.append(Number("T", text, left))
+    return numbers
 
 
 def _verdicts(claims: Sequence[Verdict]) -> Number | None:

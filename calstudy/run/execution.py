@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calstudy.base.errors import InputError
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json
 from calstudy.base.resources import cores
 from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.provenance import of_other_code
@@ -50,6 +50,25 @@ class Schedule:
     ready: dict[str, Product]
     damaged: tuple[Task, ...]
     again: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Resources of a run.
+
+    Attributes
+    ----------
+    workers
+        Number of worker processes, or None for one per core within the memory.
+    max_memory
+        Memory of all workers together, such as "6 GB", or None for all free memory.
+    scheduler
+        Address of a running dask scheduler, whose memory is not checked, or None.
+    """
+
+    workers: int | None = None
+    max_memory: str | None = None
+    scheduler: str | None = None
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
@@ -22,20 +23,22 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class WorkOrder:
-    """A task without the tasks behind it, as sent to a worker."""
+    """A task without the tasks behind it, as sent to a worker, and what the one who sends it would make it with."""
 
     task: Task
     key: str
     inputs: Mapping[str, tuple[str, str]]
     store: Path
     again: bool
+    made_with: Mapping[str, Any]
 
     @classmethod
     def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
         """Return the order for `task`; with `again`, its product is made even if it exists."""
+        own = made_with(task)
         inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
         bare = task.given({name: name for name in inputs})
-        return cls(task=bare, key=task.key, inputs=inputs, store=store.root, again=again)
+        return cls(task=bare, key=task.key, inputs=inputs, store=store.root, again=again, made_with=own)
 
     @property
     def name(self) -> str:
@@ -46,14 +49,19 @@ class WorkOrder:
 def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> Product:
     """Make the ordered product, or return it if another run has made it meanwhile.
 
-    Raises InputError if an input was removed or damaged, the stage refuses a value, or the store cannot be written. Any
-    other error of a stage is a bug, and passes with its traceback.
+    Raises InputError if the worker has other code, an input was removed or damaged, the stage refuses a value, or the
+    store cannot be written. Any other error of a stage is a bug, and passes with its traceback.
     """
     store = Store(order.store)
     if not store.root.is_dir():
         raise InputError(
             f"outputs.store = {str(store.root)!r}: {order.name}: the worker on "
             f"{socket.gethostname()} has no such folder; all workers must see the store under this path"
+        )
+    if other := _other(order.made_with, made_with(order.task)):
+        raise InputError(
+            f"{order.name}: the worker on {socket.gethostname()} has {other}; install the same version of calstudy and "
+            "of its packages on all workers, and start them again"
         )
     try:
         with store.lock(order.task.stage.name, order.key, told):
@@ -72,6 +80,16 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
             f"outputs.store = {str(store.root)!r}: {order.name} could not be written ({reason}); "
             "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
         ) from None
+
+
+def _other(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
+    """Return in a few words what a worker would make a product with, if it differs from here; else an empty text."""
+    parts = ["other code of calstudy"] if here["source"] != there["source"] else []
+    for name, version in here["versions"].items():
+        if (found := there["versions"].get(name)) != version:
+            parts.append(f"{name} {found or 'missing'} (here {version or 'missing'})")
+    parts += [f"another file {name}" for name, digest in here["files"].items() if there["files"].get(name) != digest]
+    return ", ".join(parts)
 
 
 def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:

@@ -16,8 +16,7 @@ import psutil
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
-from calstudy.base.files import sha256
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json, sha256
 from calstudy.base.kept_arrays import kept_arrays
 from calstudy.base.package_files import PackageFile
 from calstudy.base.paths import leaves

@@ -26,8 +26,7 @@ from typing import Any, TypeGuard
 from pydantic import BaseModel
 
 from calstudy.base.downloads import default_directory
-from calstudy.base.files import replacing
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json, replacing
 from calstudy.base.package_files import PackageFile
 from calstudy.base.plugins import FILE_MODULE
 from calstudy.run.task import Task

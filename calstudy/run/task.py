@@ -10,7 +10,8 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias, dataclass_transform
 
-from calstudy.base.identity import digest_json, identity
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.resources import Cost
 from calstudy.base.table import Table
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
-    from calstudy.instrument.antenna_beams import AntennaBeams
+    from calstudy.instrument.interface import AntennaBeams
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.settings import SimulationSettings
     from calstudy.sky.settings import Diffuse, Foregrounds

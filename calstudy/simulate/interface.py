@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pyuvdata import UVBeam, UVData
     from pyuvdata.analytic_beam import AnalyticBeam
 
-    from calstudy.instrument.antenna_beams import AntennaBeams
+    from calstudy.instrument.interface import AntennaBeams
 
 
 class BeamSource(Protocol):

@@ -32,7 +32,8 @@ from threadpoolctl import threadpool_limits
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_indices, baseline_vectors, require_rectangular
-from calstudy.instrument.antenna_beams import AntennaBeams, split_beams
+from calstudy.instrument.antenna_beams import split_beams
+from calstudy.instrument.interface import AntennaBeams
 from calstudy.simulate.interface import BeamSource
 from calstudy.simulate.nodes import (
     SINGLE_PRECISION,

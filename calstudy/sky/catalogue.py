@@ -200,8 +200,6 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     )
 
 
-LOG = logging.getLogger(__name__)
-
 # Hurley-Walker et al. (2017), second release.
 GLEAM_URL = (
     "https://vizier.cds.unistra.fr/viz-bin/votable?-source=VIII/100/gleamegc&-out.max=unlimited"

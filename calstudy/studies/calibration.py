@@ -20,28 +20,27 @@ from calstudy.base.observation import Frame
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.given_gains import ByFile
-from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
-from calstudy.products.expected_loss import TRANSFER, expected_transfer
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, read_json
 from calstudy.products.gain_errors import ERRORS, observed_gain_errors
 from calstudy.products.graph import MeasuredGraph
 from calstudy.products.observed import calibrated, observed
+from calstudy.products.observed_injection import EXPECTED_TRANSFER, expected_transfer
 from calstudy.products.observed_results import QUALITY, quality
 from calstudy.realdata.halves import WHOLE, Facts, Parts, modelled, read_facts
 from calstudy.realdata.interference import require_surroundings
 from calstudy.realdata.settings import DataSettings, with_defaults
-from calstudy.run.execution import Workers
+from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import LOG, log_to, publish
-from calstudy.studies.study import Budget, RunProducts, Study, make
+from calstudy.studies.study import RunProducts, Study, make
 
 CALFITS, FIGURE, UNFINISHED = "gains.calfits", "diagnostics", ".unfinished"
 FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
@@ -60,7 +59,7 @@ class DataFile(Section):
     description: str = ""
     observed: DataSettings
     calibration: Annotated[SerializeAsAny[Calibrator], CALIBRATORS.field("calamity")] = Field(
-        default_factory=Calamity,
+        default_factory=lambda: CALIBRATORS.make("calamity"),
         description="As in an experiment. Without `solver`, Gauss-Newton steps go on longer, for data of few baselines "
         "converge slowly; without `prior` and sky model, the size of the gains fixes the scale.",
     )
@@ -290,7 +289,7 @@ def require_free(output: Path, overwrite: bool) -> None:
         raise InputError(f"output = {output}: is a file, not a folder")
     names = (GAINS, CALFITS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
     present = [name for name in names if (output / name).exists()]
-    present += [path.name for path in sorted(output.glob(f"{TRANSFER}.*.h5"))]
+    present += [path.name for path in sorted(output.glob(f"{EXPECTED_TRANSFER}.*.h5"))]
     if present and not overwrite:
         raise InputError(f"output = {output}: holds {', '.join(present)} already; use `overwrite` or another folder")
     require_writable(output.absolute(), f"output = {output}")

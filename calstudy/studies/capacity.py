@@ -16,9 +16,9 @@ from calstudy.experiment.model import Experiment, Folders
 from calstudy.instrument.size import Size
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.simulation import SimulateChunk
+from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task
-from calstudy.studies.study import Budget
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """Limits of the number of workers, of which more than cores wait for each other."""

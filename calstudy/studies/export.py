@@ -13,8 +13,8 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
+from calstudy.base.files import digest_json
 from calstudy.base.gains import CASACORE
-from calstudy.base.identity import digest_json
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
@@ -23,13 +23,13 @@ from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import LEVELS, PARITIES
 from calstudy.products.files import DATA, VISIBILITIES, read_json, read_visibilities, write_visibilities
 from calstudy.products.graph import Graph
-from calstudy.run.execution import Workers
+from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import log_to, write
 from calstudy.studies.kinds.comparison import Comparison
-from calstudy.studies.study import Budget, make
+from calstudy.studies.study import make
 
 if TYPE_CHECKING:
     from pyuvdata import UVData

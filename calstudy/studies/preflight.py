@@ -12,10 +12,9 @@ from calstudy.calibrate.interface import Calibrator
 from calstudy.corrupt.interface import require_usable
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.distinct_beams import nominal_beams
 from calstudy.instrument.interface import model_of
 from calstudy.instrument.layouts import Layout, make_array, make_layout
-from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.settings import InstrumentSettings, nominal_beams
 from calstudy.instrument.size import Size
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph

@@ -1,7 +1,8 @@
-"""The reference of all fields of an experiment file, generated from the schema."""
+"""The reference of all fields of an experiment file, as text, and as the JSON schema by which editors check files."""
 
 from __future__ import annotations
 
+import json
 import re
 import types
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from pydantic.json_schema import models_json_schema
 from pydantic_core import PydanticUndefined
 
 from calstudy.base.errors import InputError, nearest
@@ -218,3 +220,36 @@ def field_reference() -> str:
         if kind.heading:
             lines += [f"# {kind.heading}", "", *wrap(kind.guide, 120), "", *_section(kind.model, "", listed)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+SCHEMA_FILE = "experiment.schema.json"
+"""Name of the published schema, next to the experiments."""
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def experiment_schema() -> str:
+    """Return the JSON schema of the files of all built-in kinds of study as text.
+
+    It has strings for quantities; only ``calstudy plan`` checks units and conditions on several fields.
+    """
+    kinds = {kind.model: kind.key for kind in built_in_kinds() if kind.model is not Experiment}
+    models: list[type[BaseModel]] = [Experiment, *kinds]
+    references, found = models_json_schema([(model, "validation") for model in models])
+    schema: dict[str, Any] = references[Experiment, "validation"]
+    for model, key in kinds.items():
+        schema = {"if": {"required": [key]}, "then": references[model, "validation"], "else": schema}
+    definitions = {name: _plain(block) for name, block in found["$defs"].items()}
+    whole = {"$schema": DIALECT, "title": "calstudy experiment", "type": "object", **schema, "$defs": definitions}
+    return json.dumps(whole, indent=1, sort_keys=True) + "\n"
+
+
+def _plain(block: Any) -> Any:
+    """Return a schema without the titles that pydantic derives from names, and without defaults of whole blocks."""
+    if isinstance(block, list):
+        return [_plain(item) for item in block]
+    if not isinstance(block, dict):
+        return block
+    left_out = {"title"} if isinstance(block.get("title"), str) else set()
+    if isinstance(block.get("default"), dict | list):
+        left_out.add("default")
+    return {key: _plain(value) for key, value in block.items() if key not in left_out}

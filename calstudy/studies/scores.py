@@ -14,8 +14,8 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
-from calstudy.base.files import sha256
-from calstudy.base.identity import digest_json, identity
+from calstudy.base.files import digest_json, sha256
+from calstudy.base.identity import identity
 from calstudy.base.schema import Section
 from calstudy.base.table import Table, one_line, plain_text
 from calstudy.calibrate.records import Status
@@ -27,12 +27,13 @@ from calstudy.products.graph import Graph, required
 from calstudy.products.score import MEASURED, SUMMARY
 from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import COUNTS, upper_limit
-from calstudy.run.execution import Workers
+from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store
 from calstudy.studies.export import Contents
 from calstudy.studies.folder import log_to
 from calstudy.studies.kinds.comparison import Comparison
-from calstudy.studies.study import Budget, make
+from calstudy.studies.study import make
+from calstudy.verdicts.measured import LARGEST_ERROR, is_measured
 from calstudy.verdicts.standing import standing_table, standings
 
 LOG = "score.log"
@@ -211,8 +212,9 @@ class _Standing:
             limit = upper_limit(band["bias"], band["bias_error"]) if known else float("inf")
             limits.append(limit)
             # No calibration can leave more than the whole signal, or less than nothing.
-            if limit < COUNTS and -band["transfer_error"] <= band["transfer"] <= 1 + band["transfer_error"]:
-                kept.append(band["transfer"])
+            transfer, error = band["transfer"], band["transfer_error"]
+            if limit < COUNTS and is_measured(transfer, error) and -error <= transfer <= 1 + error:
+                kept.append(transfer)
         return cls(len(kept), len(limits), sum(kept) / len(kept) if kept else 0.0, min(limits))
 
     @property
@@ -272,8 +274,9 @@ def _explanation() -> list[str]:
         "Each cell: in how many bands of k the bias is below the EoR with two standard deviations, |bias| + 2σ < 1, "
         "and the mean of T in these bands. Rows are ordered by these two, added up over worlds. T is the part of the "
         "EoR's power that is left, the bias the power of the residual without EoR over that of the EoR; both are free "
-        "of the flux scale. A band in which T is below 0 or above 1 by more than its error does not count. All columns "
-        "of the tables are explained in the [guide](guide.md#comparisons).",
+        "of the flux scale. A band in which T is below 0 or above 1 by more than its error, or has an error above "
+        f"{LARGEST_ERROR:g}, does not count. All columns of the tables are explained in the "
+        "[guide](guide.md#comparisons).",
         "",
         "Numbers are the word of a row's author, unless the column `verified` says who scored the gains or the program "
         "again.",

@@ -12,14 +12,14 @@ from rich.console import Console
 from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory, total_memory
 from calstudy.base.table import Table
 from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
-from calstudy.report.headline import PLACE, read_signal
+from calstudy.report.headline import PLACE, measured_numbers, read_signal
 from calstudy.report.page import REPORT
 from calstudy.results.folder import MANIFEST, RunFolder
-from calstudy.run.execution import largest_disk, schedule
+from calstudy.run.execution import Budget, largest_disk, schedule
 from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
-from calstudy.studies.study import Budget, Run, Study, said_of_other_code
+from calstudy.studies.study import Run, Study, said_of_other_code
 from calstudy.verdicts.standing import answers, standing_table
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_MARKDOWN, measured, tally
 
@@ -181,6 +181,8 @@ def _show_signal(folder: Path, console: Console) -> None:
         console.print(run.manifest["setup"], markup=False)
     signal = read_signal(run)
     if signal is None:
+        for number in measured_numbers(run):
+            console.print(f"{number.name}: {number.text}", markup=False)
         return
     numbers = ", ".join(f"{number.name} {number.text}" for number in signal.numbers)
     console.print(f"{PLACE}: {numbers}", markup=False)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 
 from rich.console import Console
 
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
 from calstudy.base.table import to_json
@@ -22,7 +22,7 @@ from calstudy.experiment.files import StudyFile, dump
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
 from calstudy.results.folder import SHOWN
-from calstudy.run.execution import Lifetimes, Schedule, Workers, execute, found_of, schedule
+from calstudy.run.execution import Budget, Lifetimes, Schedule, Workers, execute, found_of, schedule
 from calstudy.run.leases import Lease
 from calstudy.run.progress import report
 from calstudy.run.provenance import of_other_code, other_code
@@ -40,25 +40,6 @@ from calstudy.studies.folder import (
 )
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Budget:
-    """Resources of a run.
-
-    Attributes
-    ----------
-    workers
-        Number of worker processes, or None for one per core within the memory.
-    max_memory
-        Memory of all workers together, such as "6 GB", or None for all free memory.
-    scheduler
-        Address of a running dask scheduler, whose memory is not checked, or None.
-    """
-
-    workers: int | None = None
-    max_memory: str | None = None
-    scheduler: str | None = None
 
 
 @dataclass(frozen=True)

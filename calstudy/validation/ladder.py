@@ -17,10 +17,11 @@ from calstudy.claims.paper import stand_ins, unique_notes
 from calstudy.experiment.files import StudyFile, checked, override, validate
 from calstudy.experiment.model import Experiment, Outputs
 from calstudy.products.files import read_json
+from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import publish, write
-from calstudy.studies.study import Budget, RunProducts, Study, run_study
+from calstudy.studies.study import RunProducts, Study, run_study
 from calstudy.validation.step import FINDINGS, MINREDUNDANT, STEPS, Case, Step, inputs_of, step_task
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, to_json, to_markdown

@@ -2,7 +2,8 @@
 
 In a band of k, a calibrator
 
-- *passes* in a world if its bias is below the limit by two standard deviations: |bias| + 2 sigma < limit,
+- *passes* in a world if its bias is below the limit by two standard deviations, |bias| + 2 sigma < limit, and T is
+  measured (`calstudy.verdicts.measured`),
 - *fails* if it is above by two standard deviations, if T is not that of a solution (below -0.1 or above 1.2 by more
   than two standard deviations), or if the calibrator cannot work there,
 - is *open* otherwise: the errors of this run are too large to tell. Without a bias, the measured one is about sigma,
@@ -20,13 +21,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from calstudy.base.table import Table
+from calstudy.verdicts.measured import HIGHEST, LOWEST, is_measured
 
 Standing = Literal["passes", "open", "fails"]
 WORST = ("fails", "open", "passes")
 LIMIT = 0.1
 """Largest tolerated bias, over the EoR."""
 SIGMAS = 2.0
-TRANSFER_OF_A_SOLUTION = (-0.1, 1.2)
 AT_LIMIT = 1.05
 NAMED = 3
 """Number of worlds that are named; others are counted."""
@@ -45,13 +46,14 @@ class InWorld:
 
     def standing(self, limit: float) -> Standing:
         """Return whether the bias is below the limit."""
-        low, high = TRANSFER_OF_A_SOLUTION
         margin = SIGMAS * self.transfer_error
-        if self.refused or self.transfer + margin < low or self.transfer - margin > high:
+        if self.refused or self.transfer + margin < LOWEST or self.transfer - margin > HIGHEST:
             return "fails"
-        size, margin = abs(self.bias), SIGMAS * self.bias_error
         # With NaN, no comparison is true.
-        return "passes" if size + margin < limit else "fails" if size - margin > limit else "open"
+        if abs(self.bias) - SIGMAS * self.bias_error > limit:
+            return "fails"
+        known = is_measured(self.transfer, self.transfer_error)
+        return "passes" if known and self.upper_limit < limit else "open"
 
     @property
     def upper_limit(self) -> float:
@@ -63,8 +65,7 @@ class InWorld:
         """The world with the number for which a calibrator fails there."""
         if self.refused:
             return f"{self.world} (cannot work)"
-        low, high = TRANSFER_OF_A_SOLUTION
-        is_solution = low <= self.transfer <= high
+        is_solution = LOWEST <= self.transfer <= HIGHEST
         return f"{self.world} ({f'bias {_short(self.bias)}' if is_solution else f'T {_short(self.transfer)}'})"
 
 
@@ -85,8 +86,9 @@ class InBand:
 
     @property
     def transfer(self) -> float:
-        """The smallest T of all worlds where it is known."""
-        return min((world.transfer for world in self.worlds if math.isfinite(world.transfer)), default=math.nan)
+        """The smallest T of all worlds where it is measured."""
+        known = [world.transfer for world in self.worlds if is_measured(world.transfer, world.transfer_error)]
+        return min(known, default=math.nan)
 
     @property
     def decisive(self) -> list[InWorld]:
@@ -103,7 +105,8 @@ class InBand:
     @property
     def numbers(self) -> str:
         """The upper limit of the bias in all worlds, and the smallest T."""
-        return f"bias < {_short(self.upper_limit)}, T ≥ {self.transfer:.2f}"
+        known = "T not measured" if math.isnan(self.transfer) else f"T ≥ {self.transfer:.2f}"
+        return f"bias < {_short(self.upper_limit)}, {known}"
 
     def __str__(self) -> str:
         decisive = self.decisive
@@ -112,8 +115,10 @@ class InBand:
         if self.standing == "fails":
             more = f" and {len(decisive) - NAMED} more" if len(decisive) > NAMED else ""
             return f"fails in {', '.join(world.reason for world in decisive[:NAMED])}{more}"
-        smaller = (SIGMAS + 1) * max(world.bias_error for world in decisive) / self.limit
+        large = [world.bias_error for world in decisive if not world.upper_limit < self.limit]
+        smaller = (SIGMAS + 1) * max(large, default=0.0) / self.limit
         told = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
+        told = told if large else "T is not measured there"
         return f"open in {len(decisive)} of {len(self.worlds)} worlds: {self.numbers}; {told}"
 
 

@@ -9,18 +9,20 @@ import pytest
 from matplotlib.figure import Figure
 
 from calstudy.figures.baselines import BaselineSpectra, draw_baselines
-from calstudy.figures.data import draw_data
-from calstudy.figures.gains import compare_gains, draw_gains
+from calstudy.figures.gains import compare_gains, draw_gains, draw_reflections
 from calstudy.figures.layout import LayoutPanel, draw_layouts
-from calstudy.figures.model import draw_model
-from calstudy.figures.reflections import draw_reflections
 from calstudy.figures.runtime import draw_runtime, summarize_runtime
 from calstudy.figures.solver_comparison import draw_solver_comparison
-from calstudy.figures.spherical import SphericalColumn, draw_spherical
-from calstudy.figures.spherical_comparison import draw_spherical_comparison
+from calstudy.figures.spherical import SphericalColumn, draw_spherical, draw_spherical_comparison
+from calstudy.figures.visibilities import (
+    Visibilities,
+    VisibilityComparison,
+    compare_visibilities,
+    draw_data,
+    draw_model,
+)
 from calstudy.figures.wedge import WedgePanels, draw_wedge
 from calstudy.plotting.domains import in_two_domains
-from calstudy.plotting.visibility_comparison import Visibilities, VisibilityComparison, compare_visibilities
 from calstudy.power.delay import delays
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 

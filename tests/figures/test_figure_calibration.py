@@ -7,11 +7,9 @@ from hypothesis import strategies as st
 
 from calstudy.calibrate.degeneracy import align
 from calstudy.figures.baselines import draw_baselines
-from calstudy.figures.data import draw_data
-from calstudy.figures.gains import compare_gains, draw_gains
-from calstudy.figures.model import draw_model
-from calstudy.figures.reflections import draw_reflections
+from calstudy.figures.gains import compare_gains, draw_gains, draw_reflections
 from calstudy.figures.runtime import draw_runtime, summarize_runtime
+from calstudy.figures.visibilities import draw_data, draw_model
 from calstudy.plotting.domains import in_two_domains
 from calstudy.power.delay import horizon_delay
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.colors import same_color
 
 from calstudy.experiment.model import FIGURES
-from calstudy.figures.comparison_matrix import draw_matrix
+from calstudy.figures.comparison_summary import draw_matrix
 from calstudy.plotting import style
 from calstudy.power.score import BANDS, Score
 from calstudy.products.comparison import Case

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calstudy.figures.comparison_tolerances import draw_tolerances
+from calstudy.figures.comparison_summary import draw_tolerances
 from calstudy.power.score import BANDS, Score
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import faults

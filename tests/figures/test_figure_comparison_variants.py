@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from test_figure_comparison_matrix import case
 
-from calstudy.figures.comparison_variants import COLOURS, draw_variants, variants
+from calstudy.figures.comparison import VARIANT_COLOURS, draw_variants, variants
 from calstudy.products.tolerances import upper_limit
 
 
@@ -38,7 +38,7 @@ def test_labels_are_split_at_their_last_comma():
 def test_symbols_say_what_was_measured(figure):
     panel = figure.axes[0]
     points = {(line.get_marker(), line.get_color()): line for line in panel.lines if line.get_linestyle() == "None"}
-    equal, gains = COLOURS[:2]
+    equal, gains = VARIANT_COLOURS[:2]
     assert set(points) == {("o", equal), ("x", equal), ("o", gains), ("s", gains)}
     assert points["o", equal].get_xdata()[0] == 10.0
     assert points["o", equal].get_markerfacecolor() == equal

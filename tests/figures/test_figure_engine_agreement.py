@@ -14,8 +14,9 @@ from calstudy.experiment.files import validate
 from calstudy.figures.engine_agreement import compare_simulations, draw_engine_agreement
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
+from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 
 INSTRUMENT = {
     "layout": {"kind": "mwa-compact-minredundant", "count": 6},

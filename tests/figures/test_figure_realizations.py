@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from realization_samples import BINS, LOSS, design_of, draw
 
-from calstudy.figures.realizations import draw_realizations
-from calstudy.figures.realizations_comparison import _differences, draw_comparison
+from calstudy.figures.realizations import _differences, draw_comparison, draw_realizations
 from calstudy.products.realizations import JUDGED_REGION, RegionResults, judge, results_of
 
 DESIGN = design_of((("gains", "noise"), 10), (("eor",), 4))

@@ -16,13 +16,13 @@ from calstudy.base.errors import InputError
 from calstudy.base.identity import identity
 from calstudy.base.mwa_files import BEAM
 from calstudy.instrument import as_built as section
-from calstudy.instrument.antenna_beams import AntennaBeams, MisalignedBeam, make_beams
+from calstudy.instrument.antenna_beams import MisalignedBeam, make_beams
 from calstudy.instrument.as_built import Misalignment, dipole_amplitudes, misalignments, position_offsets
 from calstudy.instrument.beam_frequencies import MWA_GROUP
 from calstudy.instrument.beams import ExactBeam, MwaTile, make_beam
 from calstudy.instrument.dipoles import dipole_fields
-from calstudy.instrument.distinct_beams import assigned_beams
-from calstudy.instrument.settings import InstrumentSettings
+from calstudy.instrument.interface import AntennaBeams
+from calstudy.instrument.settings import InstrumentSettings, assigned_beams
 from calstudy.instrument.telescope import make_template
 
 FREQUENCY = np.array([183.04e6])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 
+import h5py
 import healpy
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.mwa_files import BEAM
 from calstudy.instrument import settings as section
 from calstudy.instrument import tabulated
+from calstudy.instrument.beam_frequencies import mwa_frequencies
 from calstudy.instrument.beam_models.formulas import AiryBeam, DipoleBeam, GaussianBeam, MwaAnalyticBeam
 from calstudy.instrument.beam_models.tables import HERA_FILES, FileBeam, HeraBeam, MwaEmbeddedBeam
 from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, MwaTile, integrate_power, make_beam
@@ -136,6 +138,15 @@ def test_the_kept_fit_of_the_embedded_element_is_the_fit(monkeypatch, tmp_path, 
     other.write_text("not a beam")
     with pytest.raises(InputError, match="cannot be read as an MWA beam file"):
         tabulated.mwa_embedded_element(other, band, interpolation)
+
+
+def test_a_beam_file_that_takes_data_from_other_files_is_refused(tmp_path):
+    """A link would be followed to a file of the machine that reads the beam."""
+    path = tmp_path / "beam.h5"
+    with h5py.File(path, "w") as file:
+        file["X1_150000000"] = h5py.ExternalLink("other.h5", "/X1_150000000")
+    with pytest.raises(InputError, match="X1_150000000 is an external link; write it again as one file"):
+        mwa_frequencies(path)
 
 
 def test_x_is_the_east_west_dipole(embedded):

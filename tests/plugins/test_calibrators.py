@@ -24,8 +24,9 @@ from calstudy.instrument.telescope import make_template
 from calstudy.products.calibration import calibration
 from calstudy.products.graph import Graph
 from calstudy.products.spectra import power
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 
 
 @pytest.fixture(params=["path", "entry point"])

@@ -9,9 +9,10 @@ import yaml
 from plugin_files import TEXT
 from tiny import tiny
 
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import plugin_reference
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 
 BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", flags=re.MULTILINE | re.DOTALL)
 MOST_LINES = 40

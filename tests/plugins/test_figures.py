@@ -21,8 +21,9 @@ from calstudy.regression.comparison import compare_figures, rules_of
 from calstudy.regression.reference import accept, read_reference, read_run
 from calstudy.report.contents import read_contents
 from calstudy.results.folder import RunFolder
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Budget, Run, run_study
+from calstudy.studies.study import Run, run_study
 
 DRAWN = True
 

@@ -14,10 +14,11 @@ from tiny import tiny
 from calstudy.base.errors import InputError
 from calstudy.experiment.files import load
 from calstudy.results.folder import RunFolder
+from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import plugin_reference
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 
 CODE = '''
 """An experiment with several seeds of its EoR, each with a run folder of its own."""

@@ -20,9 +20,10 @@ from calstudy.experiment.files import override, validate
 from calstudy.regression.reference import accept, read_reference
 from calstudy.report.contents import read_contents
 from calstudy.results.folder import RunFolder
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.show import show_run
-from calstudy.studies.study import Budget, Run, run_study
+from calstudy.studies.study import Run, run_study
 from calstudy.verdicts.tables import from_json
 
 CODE = sections()["A paper"]["python"]

@@ -19,11 +19,12 @@ from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
 from calstudy.products import calibration, corruption
 from calstudy.products.files import read_visibilities
+from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import CodeSources
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 
 OWN_CODE = Path(__file__).parents[2] / "notebooks" / "own_code.py"
 

@@ -17,12 +17,11 @@ from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.cli.main import app
 from calstudy.experiment.files import load, override
-from calstudy.regression.comparison import compare_array, compare_claims, compare_figures
-from calstudy.regression.reference import accept, find_references, read_reference, read_run
-from calstudy.regression.remake import remake
-from calstudy.regression.tables import Regression, show
+from calstudy.regression.comparison import Regression, compare_array, compare_claims, compare_figures, show
+from calstudy.regression.reference import accept, find_references, read_reference, read_run, remake
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
-from calstudy.studies.study import Budget, run_study
+from calstudy.studies.study import run_study
 from calstudy.verdicts.criterion import Verdict
 
 QUIET = Console(quiet=True)

@@ -2,6 +2,7 @@
 
 import base64
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from calstudy.power.score import Score
 from calstudy.power.tables import save_spectrum
-from calstudy.products.score import BANDS
+from calstudy.products.score import BANDS, SUMMARY
 from calstudy.report.charts import read_charts
 from calstudy.report.headline import read_headline, read_signal
 from calstudy.results.folder import RunFolder
@@ -37,10 +38,15 @@ def scores(bias: float = 0.07, bias_error: float = 0.014) -> Score:
     )
 
 
+def run_of(folder: Path, **manifest) -> RunFolder:
+    (folder / "manifest.json").write_text(json.dumps({"name": "study", **manifest}))
+    return RunFolder(folder)
+
+
 def finished_run(folder: Path, score: Score) -> RunFolder:
     (folder / "tables").mkdir(exist_ok=True)
     save_spectrum(folder / "tables" / BANDS, score)
-    return RunFolder(folder)
+    return run_of(folder)
 
 
 def test_the_headline_is_the_score_of_its_band(tmp_path):
@@ -66,8 +72,32 @@ def test_noise_above_the_eor_is_no_excess(tmp_path):
 
 
 def test_a_run_without_scores_has_no_headline(tmp_path):
-    assert read_signal(RunFolder(tmp_path)) is None
+    assert read_signal(run_of(tmp_path)) is None
     assert read_signal(finished_run(tmp_path, scores(np.nan))) is None
+
+
+def test_the_yardstick_for_the_transfer_is_beside_it(tmp_path):
+    run = finished_run(tmp_path, scores())
+    bands = [{"k": [low, 2 * low], "linear_transfer": value} for low, value in ((0.1, 0.3), (0.2, 0.7489))]
+    (tmp_path / "tables" / SUMMARY).write_text(json.dumps({"bands": bands}))
+    assert read_headline(run)[0].text == "0.757 ± 0.012 (linear response of the fit 0.749)"
+
+
+def test_a_transfer_that_is_not_measured_is_no_result(tmp_path):
+    (number, *_) = read_headline(finished_run(tmp_path, replace(scores(), transfer=np.array([0.1, 6178.0, 0.1]))))
+    assert number.text == "not measured (6178.000 ± 0.012)"
+
+
+@pytest.mark.parametrize(("not_measured", "text"), [(None, "0.874 ± 0.040"), ("error 5.4", "not measured (error 5.4)")])
+def test_measured_data_have_their_fit_and_their_transfer(not_measured, text, tmp_path):
+    band = {"k": [0.3, 0.5], "transfer": 0.874, "error": 0.04, "not_measured": not_measured}
+    fit = {"even": {"per_degree_of_freedom": 1.014}, "odd": {"per_degree_of_freedom": None}}
+    products = [
+        {"stage": "observed-quality", "notes": {"chi_squared": fit}},
+        {"stage": "observed-transfer", "notes": {"transfer": {"outside-wedge": [band]}}},
+    ]
+    found = {number.name: number.text for number in read_headline(run_of(tmp_path, products=products))}
+    assert found == {"χ² per degree of freedom": "even 1.014", "T": text}
 
 
 def test_the_headline_counts_verdicts(tmp_path):
@@ -78,7 +108,7 @@ def test_the_headline_counts_verdicts(tmp_path):
         for place, verdict in enumerate(words)
     ]
     (tmp_path / "claims.json").write_text(json.dumps(claims))
-    found = [(number.name, number.text) for number in read_headline(RunFolder(tmp_path))]
+    found = [(number.name, number.text) for number in read_headline(run_of(tmp_path))]
     assert found == [("claims", "2 supported, 1 contradicted, 1 undecided")]
 
 

@@ -182,11 +182,19 @@ def test_a_run_without_a_role_has_a_sentence_in_place_of_the_table(folder):
 
 
 def save_transfer(path: Path, values: list[float]) -> None:
+    """Without a T, a bin has no modes."""
     numbers, error = np.array(values), np.full(len(values), 0.01)
     edges = 0.1 * np.arange(1, len(values) + 2)
     found = TransferFunction(
         **dict.fromkeys((item.name for item in dataclasses.fields(TransferFunction)), error)
-        | {"bin_edges": edges, "k": edges[1:], "transfer": numbers, "squared_coherence": numbers, "flux_scale": 1.0}
+        | {
+            "bin_edges": edges,
+            "k": edges[1:],
+            "transfer": numbers,
+            "squared_coherence": numbers,
+            "signal": numbers,
+            "flux_scale": 1.0,
+        }
         | {"squared_coherence_error": 2 * error}
     )
     save_spectrum(path, found)

@@ -16,8 +16,7 @@ import yaml
 from tiny import tiny
 
 from calstudy.results.folder import find_runs
-from calstudy.run.inventory import products
-from calstudy.run.store import Store
+from calstudy.run.store import Store, products
 
 MEMBERS, TOGETHER = 20, 4
 KILLED = 0.5

@@ -22,9 +22,8 @@ from tiny import tiny
 from calstudy.base.errors import InputError
 from calstudy.run import store as store_module
 from calstudy.run.execution import Workers, execute, schedule
-from calstudy.run.inventory import leftovers, products
 from calstudy.run.perform import WorkOrder, perform
-from calstudy.run.store import Store
+from calstudy.run.store import Store, leftovers, products
 from calstudy.run.task import Task
 from calstudy.studies.folder import LOG, log_to, open_folder
 
@@ -132,7 +131,7 @@ def test_what_killed_runs_left_is_listed_and_deleted_and_no_product(store, capsy
     assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h") == (0, "")
     assert len(leftovers(store)) == 2
     later = time.time() + 7200
-    monkeypatch.setattr("calstudy.run.inventory.time.time", lambda: later)
+    monkeypatch.setattr("calstudy.run.store.time.time", lambda: later)
     assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h") == (0, "")
     assert leftovers(store) == []
     assert [product.path for product in products(store)] == [whole.path]
@@ -193,6 +192,7 @@ def test_damaged_claims_are_named(content, tmp_path):
     from calstudy.report.headline import read_headline
     from calstudy.results.folder import RunFolder
 
+    (tmp_path / "manifest.json").write_text(json.dumps({"name": "study"}))
     (tmp_path / "claims.json").write_text(content)
     with pytest.raises(InputError, match=r"claims.json: is damaged; write it again: calstudy claims"):
         read_headline(RunFolder(tmp_path))

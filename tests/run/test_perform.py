@@ -1,10 +1,11 @@
 """Making one product: mistakes of a user end in a sentence, defects in a traceback, and neither in a hanging run."""
 
 import errno
+import socket
 import subprocess
 import sys
 import traceback
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from calstudy.run import execution
 from calstudy.run.execution import Lifetimes, Workers, execute, largest_disk, schedule
 from calstudy.run.leases import Lease
 from calstudy.run.perform import WorkOrder, perform
-from calstudy.run.store import Store
+from calstudy.run.store import Store, products
 from calstudy.run.task import Inputs, Piece, Task
 
 EXIT_INPUT = 2
@@ -362,6 +363,24 @@ def test_what_a_worker_began_last_is_known_by_its_address(store):
         (address,) = client.scheduler_info()["workers"]
         assert execution._last_begun(client, address) == "number (last)"
         assert execution._last_begun(client, "tcp://elsewhere:1") is None
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"source": "0"}, "other code of calstudy"),
+        ({"versions": {"numpy": "1.0"}}, r"numpy missing \(here 1.0\)"),
+        ({"files": {"pyradiosky/gleam.vot": "0"}}, "another file pyradiosky/gleam.vot"),
+    ],
+)
+def test_a_worker_with_other_code_makes_nothing(change, sentence, store):
+    """It would make products whose keys are those of another program."""
+    order = WorkOrder.of(Number("first", number=1), store)
+    other = replace(order, made_with={**order.made_with, **change})
+    with pytest.raises(InputError, match=rf"^number \(first\): the worker on {socket.gethostname()} has {sentence}; "):
+        perform(other)
+    assert not list(products(store))
+    assert perform(order).path.is_dir()
 
 
 @pytest.mark.parametrize("make", ["write_much", "write_hdf5"])

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calstudy.base.errors import InputError
-from calstudy.base.identity import digest_json
+from calstudy.base.files import digest_json
 from calstudy.run.store import Store
 
 KEY = "0" * 32

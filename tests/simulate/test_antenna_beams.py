@@ -11,10 +11,11 @@ from simulation_cases import ALL_ENGINES, FAST_ENGINES, needs_engines, observe, 
 from calstudy.base.errors import ExperimentError
 from calstudy.base.visibilities import antenna_indices, to_cube
 from calstudy.experiment.files import validate
-from calstudy.instrument.antenna_beams import AntennaBeams, make_beams
+from calstudy.instrument.antenna_beams import make_beams
+from calstudy.instrument.interface import AntennaBeams
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
-from calstudy.papers.calamity2022.substitutions import substitutions
+from calstudy.papers.calamity2022 import substitutions
 from calstudy.products import corruption, simulation
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph

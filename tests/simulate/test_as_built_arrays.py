@@ -14,9 +14,10 @@ from calstudy.base.errors import ExperimentError
 from calstudy.base.visibilities import antenna_indices, baseline_vectors, to_cube
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import dump, override, validate
-from calstudy.instrument.antenna_beams import AntennaBeams, MisalignedBeam
+from calstudy.instrument.antenna_beams import MisalignedBeam
 from calstudy.instrument.as_built import Misalignment, position_offsets
 from calstudy.instrument.beams import ExactBeam
+from calstudy.instrument.interface import AntennaBeams
 from calstudy.instrument.layouts import make_layout
 from calstudy.papers.calamity2022 import Calamity2022
 from calstudy.products import corruption, simulation, sky_model

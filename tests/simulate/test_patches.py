@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulation_cases import healpix_sky, local_coordinates, observe, point_sky, relative_error
 
-from calstudy.instrument.antenna_beams import AntennaBeams
+from calstudy.instrument.interface import AntennaBeams
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.nodes import Accuracy, integration_times, patch_nside, time_axis
 from calstudy.simulate.patches import Patches

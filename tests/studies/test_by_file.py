@@ -34,7 +34,7 @@ from calstudy.studies.study import Budget, run_study
 ROOT = Path(__file__).parents[2]
 # With the weights of the program of the challenge's page.
 SKYCAL = {"calibrator": "skycal", "weights": "flags"}
-CALAMITY = {"calibrator": "calamity", "prior": "sky-model", "chunks": 1}
+CALAMITY = {"calibrator": "calamity", "prior": "sky-model", "weights": "flags", "chunks": 1}
 ASSUMED = {"sky.foregrounds.errors": {"flux_scatter": 0.01}}
 NAMES = [f"data-{number}" for number in range(1, 5)]
 

@@ -28,7 +28,7 @@ CALIBRATORS = {
     # With equal weights, on gains that are white, the errors of the sky reach all delays.
     "sky-based": {"calibrator": "sky-based", "weights": "flags"},
     "trusting": {"calibrator": "delay-weighted", "foreground_prior": {"deviation": 0.03}},
-    "CALAMITY": {"calibrator": "calamity", "prior": "sky-model"},
+    "CALAMITY": {"calibrator": "calamity", "prior": "sky-model", "weights": "flags"},
     "none": "none",
 }
 FIGURES = ("comparison-matrix", "comparison-spectra", "comparison-curves", "comparison-tolerances")

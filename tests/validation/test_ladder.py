@@ -14,7 +14,7 @@ import pytest
 from ladders import load_ladder
 from rich.console import Console
 
-from calstudy.studies.study import Budget
+from calstudy.run.execution import Budget
 from calstudy.validation.ladder import Ladder, run_ladder
 from calstudy.verdicts.criterion import Verdict
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from ladders import load_ladder
 
 from calstudy.base.errors import InputError
+from calstudy.claims.bins import clustered_mean, pooled
 from calstudy.power.spectra import DelaySpectra
 from calstudy.validation.ladder import SCALES, passed, tally
-from calstudy.validation.means import clustered_mean, pooled
 from calstudy.validation.steps.steep_signal import windowed
 from calstudy.verdicts.criterion import Finding
 

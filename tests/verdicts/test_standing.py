@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from calstudy.verdicts.measured import why_not_measured
 from calstudy.verdicts.standing import answers, standing_table, standings
 
 WORLDS = ("ideal", "sources missing")
@@ -56,7 +57,7 @@ def test_errors_that_are_smaller_by_the_stated_factor_tell():
 
 def test_what_is_no_solution_fails_though_its_bias_is_small():
     assert standing_of(case(0.0, 0.01, transfer=-155.0, transfer_error=10.0)).standing == "fails"
-    assert standing_of(case(0.0, 0.01, transfer=1.3, transfer_error=0.2)).standing == "passes"
+    assert standing_of(case(0.0, 0.01, transfer=1.3, transfer_error=0.2)).standing == "open"
     assert str(standing_of(case(0.0, 0.01), case(0.0, 0.01, transfer=3.0))) == "fails in sources missing (T 3)"
 
 
@@ -92,3 +93,25 @@ def test_the_answer_ranks_those_that_pass_by_t():
     rows = {row[0]: row[1] for row in standing_table(found).rows}
     assert rows["biased"] == "fails in ideal (bias 5)"
     assert math.isclose(found[0].upper_limit, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("transfer", "error", "reason"),
+    [
+        (0.8, 0.29, ""),
+        (0.8, 0.31, "error 0.31"),
+        (-0.09, 0.01, ""),
+        (1.21, 0.01, "T 1.2"),
+        (6178.0, 3394.0, "error 3.4e+03"),
+        (math.nan, math.nan, "no modes"),
+        (None, None, "no modes"),
+    ],
+)
+def test_a_transfer_is_measured_if_it_is_a_part_of_the_signal_and_well_known(transfer, error, reason):
+    """The first run on HERA's file printed 6178 +- 3394 as a result."""
+    assert why_not_measured(transfer, error) == reason
+
+
+def test_nothing_passes_whose_signal_loss_is_not_known():
+    found = standing_of(case(0.0, 0.01, transfer=0.5, transfer_error=0.4))
+    assert str(found) == "open in 1 of 1 worlds: bias < 0.02, T not measured; T is not measured there"

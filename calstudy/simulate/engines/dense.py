@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
-    from calstudy.instrument.antenna_beams import AntennaBeams
+    from calstudy.instrument.interface import AntennaBeams
 
 
 class DenseEngine(Engine):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pyuvdata.analytic_beam import AnalyticBeam
     from pyuvsim.simsetup import SkyModelData
 
-    from calstudy.instrument.antenna_beams import AntennaBeams
+    from calstudy.instrument.interface import AntennaBeams
 
 
 # matvis splits its sources so that a block takes about this much memory (bytes).
@@ -188,7 +188,7 @@ class FftvisEngine(Engine):
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
-        from calstudy.instrument.antenna_beams import AntennaBeams
+        from calstudy.instrument.interface import AntennaBeams
 
         if isinstance(beam, AntennaBeams) and (template.polarization_array < CROSS_HANDS).any():
             return "fftvis confuses the feeds of cross-hand polarizations if antennas have different beams"

@@ -14,7 +14,8 @@ import yaml
 from pydantic import BeforeValidator, Field, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.identity import digest_json, identity
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.interface import CALIBRATORS
@@ -27,11 +28,12 @@ from calstudy.products import tolerances
 from calstudy.products.comparison import case_name, comparison
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import MeasureScore, score
+from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
 from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
 from calstudy.studies.preflight import refusal_of_calibrator
-from calstudy.studies.study import KINDS, Budget, kind_of
+from calstudy.studies.study import KINDS, kind_of
 
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")

@@ -13,6 +13,7 @@ from calstudy.base.identity import identity
 from calstudy.base.table import Table
 from calstudy.claims.paper import stand_ins, unique_notes
 from calstudy.claims.product import claims
+from calstudy.corrupt.noise import NoiseRelativeToEor, NoiseRelativeToForegrounds, NoNoise, RadiometerNoise
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.figures import StudyFigure, figure_task, figures_for
@@ -24,12 +25,12 @@ from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.products.signal_loss import transfer
 from calstudy.products.spectra import spectra
+from calstudy.run.execution import Budget
 from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit, require_data_fit
-from calstudy.studies.preflight import notes_of, require_possible
-from calstudy.studies.setup import describe_data, describe_setup
-from calstudy.studies.study import Budget, Study, built_in_kinds
+from calstudy.studies.preflight import frame_of, notes_of, require_possible
+from calstudy.studies.study import Study, built_in_kinds
 
 SKY_MODEL_TABLE = "sky-model.csv"
 AS_BUILT_TABLE = "as-built.csv"
@@ -240,3 +241,39 @@ def study_of(experiment: Experiment) -> Study:
     """Return the study of an experiment: of the kind whose key it has, such as `sweep`."""
     special: list[Any] = [kind for kind in built_in_kinds() if kind.model is Experiment and kind.key]
     return next((kind for kind in special if getattr(experiment, kind.key)), ExperimentStudy).of(experiment)
+
+
+def describe_setup(experiment: Experiment) -> str:
+    """Return the data of an experiment and how they are calibrated."""
+    calibrated = any(variant.calibrate for variant in experiment.variants.values())
+    return f"{describe_data(experiment)}; {experiment.calibration.label if calibrated else 'not calibrated'}"
+
+
+def describe_data(experiment: Experiment) -> str:
+    """Return the array, the band, the times, the gains and the noise of an experiment."""
+    instrument = experiment.instrument
+    frame, channels, times = frame_of(instrument), instrument.channels, instrument.times
+    effects = ", ".join(effect.label for effect in experiment.corruption.effects)
+    return "; ".join(
+        (
+            f"{frame.n_antennas} antennas ({instrument.layout.label}), baselines to {frame.lengths.max():.3g} m, "
+            f"beam {instrument.beam.label}",
+            f"{channels.count} channels of {channels.width / 1e3:g} kHz from {channels.first / 1e6:g} MHz",
+            f"{times.count} integrations of {times.integration:g} s",
+            effects or "no gains",
+            _noise(experiment),
+        )
+    )
+
+
+def _noise(experiment: Experiment) -> str:
+    noise = experiment.corruption.noise
+    match noise:
+        case NoiseRelativeToEor():
+            return f"noise {noise.factor:g} times the EoR"
+        case NoiseRelativeToForegrounds():
+            return f"noise {noise.factor:g} times the foregrounds"
+        case RadiometerNoise():
+            return f"thermal noise of {noise.nights} night{'s' if noise.nights > 1 else ''}"
+        case NoNoise():
+            return "no noise"

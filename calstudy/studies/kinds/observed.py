@@ -15,15 +15,14 @@ from calstudy.experiment.model import FIGURES
 from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.power.settings import PowerSettings
-from calstudy.products.expected_loss import expected_loss
 from calstudy.products.graph import MeasuredGraph
-from calstudy.products.observed_injection import transfer
+from calstudy.products.observed_injection import expected_loss, transfer
 from calstudy.products.observed_results import observed_spectra, quality
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
+from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.calibration import DataFile, DataStudy, read_file, read_selected
-from calstudy.studies.study import Budget
 
 DEFAULT_FIGURES = ("diagnostics", "observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)

@@ -23,9 +23,10 @@ from calstudy.figures import draw_task
 from calstudy.instrument.array_layouts.geometric import LinearLayout, RectangularLayout
 from calstudy.instrument.settings import Channels
 from calstudy.products.run_times import CountSteps, RunTimes, TimedArray, TimeSteps
+from calstudy.run.execution import Budget
 from calstudy.run.provenance import machine, package_versions
 from calstudy.run.task import Task
-from calstudy.studies.study import Budget, Study
+from calstudy.studies.study import Study
 
 
 def _require_increasing(sizes: Sequence[float]) -> None:

@@ -22,13 +22,13 @@ from calstudy.base.visibilities import flag_cube, to_cube
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.records import CalibrationResult
+from calstudy.claims.bins import clustered_mean
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, simulation
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA, VISIBILITIES, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.means import clustered_mean
 from calstudy.validation.single_integration import first_integrations
 from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only, required
 from calstudy.verdicts.criterion import AtMost, Finding

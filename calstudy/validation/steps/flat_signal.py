@@ -23,13 +23,13 @@ from astropy import constants
 from pydantic import Field
 from scipy.stats import expon, goodness_of_fit
 
+from calstudy.claims.bins import clustered_mean, pooled
 from calstudy.experiment.model import Variant
 from calstudy.power.delay import mode_correlation
 from calstudy.power.spectra import DelaySpectra
 from calstudy.products import corruption, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.means import clustered_mean, pooled
 from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Case, Findings, Limit, Step, StepInput
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
 

@@ -13,6 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from calstudy.claims.bins import clustered_mean
 from calstudy.experiment.model import Component, Variant
 from calstudy.power.delay import horizon_delay
 from calstudy.power.spectra import DelaySpectra
@@ -21,7 +22,6 @@ from calstudy.products import spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.simulate.floor import MAIN_LOBES
-from calstudy.validation.means import clustered_mean
 from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only
 from calstudy.verdicts.criterion import AtMost, Finding
 

@@ -20,13 +20,13 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 
 from calstudy.base.units import Wavenumber
+from calstudy.claims.bins import clustered_mean, pooled
 from calstudy.experiment.model import Variant
 from calstudy.power.delay import make_taper
 from calstudy.power.spectra import DelaySpectra
 from calstudy.products import corruption, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.means import clustered_mean, pooled
 from calstudy.validation.step import Case, Findings, Limit, Step, StepInput
 from calstudy.verdicts.criterion import Equal, Finding, Within
 

@@ -1,7 +1,8 @@
-"""``calstudy regress``: comparison of studies, made again, with their reference results."""
+"""``calstudy validate`` and ``calstudy regress``: the validation ladder, and comparison with reference results."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,10 +10,11 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-from calstudy.cli.options import MaxMemory, Scheduler, Set, Workers
+from calstudy.cli.options import AsJson, MaxMemory, Scheduler, Set, Workers
 
 if TYPE_CHECKING:
-    from calstudy.regression.tables import Regression
+    from calstudy.regression.comparison import Regression
+
 
 EXIT_MOVED = 1
 
@@ -45,10 +47,9 @@ def regress(
     folder that does not exist becomes a new reference.
     """
     from calstudy.base.package_files import reference_folder
-    from calstudy.regression.reference import accept, find_references
-    from calstudy.regression.remake import remake
-    from calstudy.regression.tables import show, write_json
-    from calstudy.studies.study import Budget
+    from calstudy.regression.comparison import show, write_json
+    from calstudy.regression.reference import accept, find_references, remake
+    from calstudy.run.execution import Budget
 
     console = Console(soft_wrap=True, highlight=False)
     if against is not None:
@@ -77,11 +78,50 @@ def regress(
 
 
 def _compare(reference: Path, run: Path) -> Regression:
-    from calstudy.regression.comparison import compare_claims, compare_figures
+    from calstudy.regression.comparison import Regression, compare_claims, compare_figures
     from calstudy.regression.reference import read_reference, read_run
-    from calstudy.regression.tables import Regression
 
     old, new = read_reference(reference), read_run(run)
     claims = compare_claims(old.claims, new.claims, old.on_machines) if old.claims else []
     figures = compare_figures(old.figures, new.figures, old.tolerances)
     return Regression(str(reference), str(run), figures, claims)
+
+
+EXIT_FAILED = 1
+
+
+def validate(
+    steps: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[STEP]...", help="Numbers of steps, such as 0.1, or files of your own; all if none."),
+    ] = None,
+    scale: Annotated[str, typer.Option(help="'full', or 'small': the same in a minute or two.")] = "full",
+    workers: Workers = 1,
+    max_memory: MaxMemory = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where the run gets its folder: --set outputs.runs=FOLDER."),
+    ] = None,
+    overrides: Set = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run the validation ladder: experiments with limits for numbers; PASS or FAIL, measured value, threshold, why.
+
+    Exit status 0 if every step passes, 1 if one fails.
+    """
+    from calstudy.experiment.files import StudyFile
+    from calstudy.run.execution import Budget
+    from calstudy.validation.ladder import Ladder, passed, run_ladder, tally
+    from calstudy.verdicts.tables import show_verdicts, to_json
+
+    changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
+    ladder = Ladder.load(StudyFile(Path(), {"steps": steps or ()}, scale, changes))
+    console = Console(soft_wrap=True, highlight=False, stderr=as_json)
+    folder, verdicts = run_ladder(ladder, Budget(workers, max_memory), console)
+    if as_json:
+        typer.echo(to_json(verdicts))
+    else:
+        show_verdicts(verdicts, ladder.description, Console(highlight=False), "step", tally(verdicts))
+        console.print(f"results: {folder}", markup=False)
+    if not passed(verdicts):
+        raise typer.Exit(EXIT_FAILED)

@@ -1,0 +1,304 @@
+"""Comparisons of calibrators in worlds: spectra of k, curves from one calibrator to the next, and variants."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from calstudy.figures import CasesFigure
+from calstudy.figures.signal_loss import SIGMAS_95
+from calstudy.plotting import style
+from calstudy.products.comparison import Case
+from calstudy.products.tolerances import SIGMAS, upper_limit
+from calstudy.run.task import Job
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+LINEAR = {"recovered": 1.0, "bias": 0.1}
+"""Upper end of the linear part of an axis; larger values make it logarithmic beyond."""
+REFERENCE = {"recovered": 1.0, "bias": 0.0}
+"""Position of the line: all of the EoR, no bias."""
+DECADES = {"recovered": 1.5, "bias": 0.7}
+"""Length of the linear part of a logarithmic axis, in decades."""
+ROW_HEIGHT, LARGEST_K = 1.7, 1.0
+
+
+def look(place: int) -> dict[str, Any]:
+    """Return colour, marker and line of one of several calibrators or worlds."""
+    lines = ("-", "--", ":")
+    again, place = divmod(place, len(COLOURS))
+    return {
+        "color": COLOURS[place],
+        # A repeated colour has another marker.
+        "marker": MARKERS[(place + 3 * again) % len(MARKERS)],
+        "linestyle": lines[again % len(lines)],
+    }
+
+
+@style.journal_style()
+def draw_spectra(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, outside the wedge, with 95 % bars.
+
+    `cases` are by world and calibrator.
+    """
+    from matplotlib.lines import Line2D
+
+    figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(cases))
+    grid = figure.subplots(len(cases), 2, squeeze=False, sharex=True)
+    for (left, right), (world, found) in zip(grid, cases.items(), strict=True):
+        for name, case in found.items():
+            place = calibrators.index(name)
+            shift = 0.15 * (place - (len(calibrators) - 1) / 2) / len(calibrators)
+            _draw_points(left, case, "recovered", place, shift)
+            _draw_points(right, case, "bias", place, shift)
+        _scale(left, "recovered", found.values())
+        _scale(right, "bias", found.values())
+        left.axhline(REFERENCE["recovered"], color=style.GREY, linewidth=0.7, zorder=0)
+        right.axhline(REFERENCE["bias"], color=style.GREY, linewidth=0.7, zorder=0)
+        left.set_title(world, loc="left")
+        left.set_ylabel(r"$P^R / P^S$")
+        right.set_ylabel(r"$s^2 P^{R_0} / P^S$")
+    for axes in grid[-1]:
+        axes.set_xlabel(style.WAVENUMBER)
+    handles = [Line2D([], [], linewidth=0.6, markersize=2.5, **look(place)) for place in range(len(calibrators))]
+    figure.legend(handles, list(calibrators), loc="outside upper center", ncols=min(len(calibrators), 5))
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_points(axes: Axes, case: Case, name: str, place: int, shift: float) -> None:
+    bins = case.bins
+    values, errors = getattr(bins, name), getattr(bins, f"{name}_error")
+    used = _used(case, name)
+    k = bins.k + shift * np.diff(bins.bin_edges)
+    bars = SIGMAS_95 * np.nan_to_num(errors[used])
+    axes.errorbar(k[used], values[used], yerr=bars, elinewidth=0.5, linewidth=0.6, markersize=2.5, **look(place))
+
+
+def _used(case: Case, name: str) -> np.ndarray:
+    return np.isfinite(getattr(case.bins, name)) & (case.bins.k <= LARGEST_K)
+
+
+def _scale(axes: Axes, name: str, cases: Iterable[Case]) -> None:
+    """Make an axis logarithmic where its values are large, with limits just beyond them, zero and the reference.
+
+    Bars may reach beyond the limits: the largest ones would make the other points too small to read.
+    """
+    values = np.concatenate([getattr(case.bins, name)[_used(case, name)] for case in cases])
+    if not values.size:
+        return
+    low, high = min(values.min(), 0.0), max(values.max(), REFERENCE[name])
+    if max(-low, high) <= 2 * LINEAR[name]:
+        return
+    axes.set_yscale("symlog", linthresh=LINEAR[name], linscale=DECADES[name])
+    transform = axes.yaxis.get_transform()
+    bottom, top = transform.transform(np.array([low, high]))
+    margin = 0.05 * (top - bottom)
+    axes.set_ylim(*transform.inverted().transform(np.array([bottom - margin, top + margin])))
+
+
+class ComparisonSpectra(CasesFigure):
+    """P^R / P^S and s^2 P^R0 / P^S of every calibrator against k, a row for each world."""
+
+    kind: str = "comparison-spectra"
+
+    caption = "Recovered power (left) and bias (right) outside the wedge in units of the EoR, with 95 % bars."
+    scores = "bins"
+
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw all cases."""
+        return draw_spectra(cases, job.settings["calibrators"], job.settings["notes"])
+
+
+LINEAR_BIAS = 0.01
+"""Upper end of the linear part of the axis of the bias."""
+LABEL_WIDTH = 9
+
+
+@style.journal_style()
+def draw_curves(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw T above and the bias below for each band of k, calibrators from left to right, with 95 % bars.
+
+    The calibrators are values of one setting, in order. `cases` are by world and calibrator.
+    """
+    from matplotlib.lines import Line2D
+
+    worlds = list(cases)
+    edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
+    figure = style.new_figure(style.TWO_COLUMNS, 4.2)
+    grid = figure.subplots(2, edges.size - 1, squeeze=False, sharex=True, sharey="row")
+    for band, (upper, lower) in enumerate(grid.T):
+        for place, found in enumerate(cases.values()):
+            at = np.array([calibrators.index(name) for name in found])
+            at = at + 0.3 * (place - (len(worlds) - 1) / 2) / len(worlds)
+            for axes, name in ((upper, "transfer"), (lower, "bias")):
+                values, errors = (_in_band(found, column, band) for column in (name, f"{name}_error"))
+                bars = SIGMAS_95 * np.nan_to_num(errors)
+                axes.errorbar(at, values, yerr=bars, elinewidth=0.6, linewidth=0.7, **look(place))
+        upper.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
+        upper.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
+        lower.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
+        lower.set_yscale("symlog", linthresh=LINEAR_BIAS)
+        names = [textwrap.fill(name, LABEL_WIDTH) for name in calibrators]
+        lower.set_xticks(range(len(calibrators)), names, fontsize=style.SMALL_SIZE, rotation=90)
+    grid[0, 0].set_ylabel(r"$T$, free of the flux scale")
+    grid[1, 0].set_ylabel(r"bias $s^2 P^{R_0} / P^S$")
+    handles = [Line2D([], [], linewidth=0.7, **look(place)) for place in range(len(worlds))]
+    figure.legend(handles, worlds, loc="outside upper center", ncols=min(len(worlds), 5))
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _in_band(found: Mapping[str, Case], name: str, band: int) -> np.ndarray:
+    return np.array([getattr(case.bands, name)[band] for case in found.values()])
+
+
+class ComparisonCurves(CasesFigure):
+    """T and bias of calibrators that are values of one setting, in bands of k; a curve for each world."""
+
+    kind: str = "comparison-curves"
+
+    caption = "Transfer function and bias outside the wedge from one calibrator to the next, with 95 % bars."
+
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw all cases."""
+        return draw_curves(cases, job.settings["calibrators"], job.settings["notes"])
+
+
+BANDS = 2
+"""Number of drawn bands of k, from the lowest: next to the wedge, and beyond."""
+VARIANT_COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.MAGENTA, style.RED)
+VARIANT_MARKERS = ("o", "s", "^", "D", "v")
+VARIANT_HEIGHT, HEADING_HEIGHT = 0.21, 0.45
+SPREAD = 0.7
+"""Part of a row over which its symbols are spread."""
+LOWEST = 1e-2
+
+
+def variants(labels: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return labels by the text before their last comma, and by the text after it; both in order."""
+    found: dict[str, dict[str, str]] = {}
+    for label in labels:
+        name, comma, variant = label.rpartition(",")
+        found.setdefault(name.strip() if comma else label, {})[variant.strip() if comma else ""] = label
+    return found
+
+
+def _names(groups: Mapping[str, Mapping[str, str]]) -> list[str]:
+    return list(dict.fromkeys(variant for group in groups.values() for variant in group))
+
+
+@style.journal_style()
+def draw_variants(
+    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw a panel for each kind of world and band of k: calibrators from top to bottom, the bias from left to right.
+
+    Colours are variants of calibrators, symbols those of worlds: the text after the last comma of a label names the
+    variant. Open symbols are 95 % upper limits of a bias that is within two standard deviations of zero; crosses are
+    cases of which most solves stalled or failed. `cases` are by world and calibrator.
+    """
+    from matplotlib.lines import Line2D
+
+    worlds, rows = variants(list(cases)), variants(calibrators)
+    shown = {
+        world: [name for name, labels in rows.items() if _drawn(labels, [cases[label] for label in kinds.values()])]
+        for world, kinds in worlds.items()
+    }
+    heights = [HEADING_HEIGHT + VARIANT_HEIGHT * len(names) for names in shown.values()]
+    figure = style.new_figure(style.TWO_COLUMNS, 0.8 + sum(heights))
+    grid = figure.subplots(len(worlds), BANDS, squeeze=False, sharex="col", height_ratios=heights)
+    edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
+    colours = dict(zip(_names(rows), VARIANT_COLOURS, strict=False))
+    markers = dict(zip(_names(worlds), VARIANT_MARKERS, strict=False))
+    for panels, (world, kinds) in zip(grid, worlds.items(), strict=True):
+        for band, axes in enumerate(panels):
+            _draw_panel(axes, {kind: cases[label] for kind, label in kinds.items()}, rows, shown[world], band)
+            axes.set_title(world if band == 0 else "", loc="left")
+            axes.set_yticks(range(len(shown[world])), shown[world] if band == 0 else [])
+    for band, axes in enumerate(grid[-1]):
+        low, high = edges[band : band + 2]
+        axes.set_xlabel(rf"bias $s^2\,|P^{{R_0}}| / P^S$, $k = {low:g}$–${high:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
+    handles = [Line2D([], [], color=colour, marker="o", linestyle="", label=name) for name, colour in colours.items()]
+    handles += [
+        Line2D([], [], color=style.GREY, marker=marker, linestyle="", label=name) for name, marker in markers.items()
+    ]
+    handles += [
+        Line2D([], [], color=style.GREY, marker="o", markerfacecolor="white", linestyle="", label="95 % upper limit"),
+        Line2D([], [], color=style.GREY, marker="x", linestyle="", label="stalled"),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _drawn(labels: Mapping[str, str], worlds: Sequence[Mapping[str, Case]]) -> bool:
+    return any(label in world for label in labels.values() for world in worlds)
+
+
+def _stalled(case: Case) -> bool:
+    """Return True if most solves of a case stalled or failed."""
+    counts = case.summary["by_status"]
+    return 2 * (counts.get("stalled", 0) + counts.get("failed", 0)) > sum(counts.values())
+
+
+def _draw_panel(
+    axes: Axes,
+    kinds: Mapping[str, Mapping[str, Case]],
+    rows: Mapping[str, Mapping[str, str]],
+    shown: Sequence[str],
+    band: int,
+) -> None:
+    colours, count = dict(zip(_names(rows), VARIANT_COLOURS, strict=False)), len(_names(rows)) * len(kinds)
+    for row, name in enumerate(shown):
+        for place, (variant, label) in enumerate(rows[name].items()):
+            for number, (marker, cases) in enumerate(zip(VARIANT_MARKERS, kinds.values(), strict=False)):
+                if label not in cases:
+                    continue
+                bands = cases[label].bands
+                bias, error = float(bands.bias[band]), float(bands.bias_error[band])
+                limited = bool(np.isfinite(error)) and abs(bias) < SIGMAS * error
+                axes.plot(
+                    upper_limit(bias, error) if limited else abs(bias),
+                    row + SPREAD * ((place * len(kinds) + number + 0.5) / count - 0.5),
+                    marker="x" if _stalled(cases[label]) else marker,
+                    linestyle="",
+                    color=colours[variant],
+                    markerfacecolor="white" if limited else colours[variant],
+                )
+    axes.set_xscale("log")
+    axes.set_xlim(left=LOWEST)
+    axes.set_ylim(len(shown) - 0.5, -0.5)
+    axes.axvline(1, color=style.GREY, linewidth=0.7, linestyle="--", zorder=0)
+    for edge in np.arange(len(shown) - 1) + 0.5:
+        axes.axhline(edge, color=style.BAND, linewidth=0.4, zorder=0)
+    axes.tick_params(axis="y", length=0)
+
+
+class ComparisonVariants(CasesFigure):
+    """Bias of calibrators in variants and in variants of worlds: of labels such as ``sky-based, autos``."""
+
+    version: ClassVar[int] = 2
+
+    kind: str = "comparison-variants"
+    caption = (
+        "Bias of every calibrator, by its variants (colours) and those of the worlds (symbols), next to the wedge and "
+        "beyond. The dashed line is the EoR; open symbols are 95 % upper limits, crosses "
+        "cases of which most solves stalled."
+    )
+
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+        """Draw all cases."""
+        return draw_variants(cases, job.settings["calibrators"], job.settings["notes"])

@@ -1,0 +1,232 @@
+"""Figures of measured data: spherical and cylindrical power spectra, and the signal loss by injection."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
+from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
+from calstudy.figures.wedge import draw_panels
+from calstudy.plotting import style
+from calstudy.products.expected_loss import EXPECTED
+from calstudy.products.files import spectrum_file
+from calstudy.products.graph import required
+from calstudy.products.observed_injection import expected_loss, transfer
+from calstudy.products.observed_results import observed_spectra
+from calstudy.products.signal_loss import TRANSFER as FILE
+from calstudy.run.task import Job, Task
+from calstudy.verdicts.tolerances import Drawn, half
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from calstudy.power.expected import ExpectedBins
+    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.transfer import TransferFunction, TransferMap
+    from calstudy.products.graph import MeasuredGraph
+
+
+MARKINGS = {
+    "data": Marking("data as given", "D", style.RED, 2.5, -0.15),
+    "calibrated": Marking("calibrated", "o", style.BLACK, 2.8),
+    "residual": Marking("residual", "s", style.ORANGE, 2.8, 0.15),
+}
+COLUMNS = {"all-modes": "all modes", "outside-wedge": "outside wedge + {:.0f} ns"}
+
+
+@style.journal_style()
+def draw_observed(
+    columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer: float, stand_ins: Sequence[str] = ()
+) -> Figure:
+    """Draw |P| of measured data over all modes and outside the wedge, open where negative.
+
+    Bars are 95 % by the noise; the grey line is one standard deviation of the noise of the residual. The columns
+    "all-modes" and "outside-wedge" have the series of `MARKINGS`, in mK² h⁻³ Mpc³; the wedge ends at the horizon plus
+    `buffer`, s.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 3.4)
+    grid = figure.subplots(1, len(columns), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, (modes, series) in zip(grid, columns.items(), strict=True):
+        for place, (name, marking) in enumerate(MARKINGS.items()):
+            draw_points(axes, series[name], marking, name, 2 + place)
+        _draw_noise(axes, series["residual"])
+        axes.set_title(COLUMNS[modes].format(1e9 * buffer))
+        axes.set(xlabel=style.WAVENUMBER, xscale="log", yscale="log", ylim=_limits(columns))
+        style.label_one_two_five(axes.xaxis)
+    grid[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
+    handles = [
+        axes.plot([], [], linestyle="none", marker=mark.marker, color=mark.colour, label=mark.label)[0]
+        for mark in MARKINGS.values()
+    ]
+    handles.append(axes.plot([], [], color=style.GREY, label=r"noise of the residual, 1 $\sigma$")[0])
+    open_marker = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
+    handles.append(axes.plot([], [], linestyle="none", label=r"open: $P < 0$", **open_marker)[0])
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+def _draw_noise(axes: Axes, residual: SphericalSpectrum) -> None:
+    known = np.isfinite(residual.noise_error)
+    axes.plot(residual.k[known], residual.noise_error[known], color=style.GREY, linewidth=0.9, zorder=1)
+
+
+def _limits(columns: Mapping[str, Mapping[str, SphericalSpectrum]]) -> tuple[float, float]:
+    """Return limits that hold all powers, but the faintest few points, which are noise about zero."""
+    spectra = [spectrum for series in columns.values() for spectrum in series.values()]
+    values = np.abs(np.concatenate([spectrum.power.real for spectrum in spectra]))
+    values = values[np.isfinite(values) & (values > 0)]
+    errors = np.concatenate([series["residual"].noise_error for series in columns.values()])
+    return 0.3 * float(min(np.quantile(values, 0.03), np.nanmin(errors) * SIGMAS_95)), 4 * float(values.max())
+
+
+class ObservedSpherical(StudyFigure):
+    """Spherical power spectra of measured data."""
+
+    kind: str = "observed-spherical"
+
+    of = ("observed",)
+    caption = (
+        "Spherical power spectra of the measured data, even x odd, with 95 % bars of the noise alone; open where "
+        "negative."
+    )
+    tolerances = ((r".*\.(power|noise_error)", Drawn(half, "follows from fitted gains; half of it")),)
+
+    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
+        """Return the averaged spectra."""
+        return {"spectra": observed_spectra(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a column for each choice of modes."""
+        from calstudy.power.spectra import SphericalSpectrum
+        from calstudy.power.tables import load_spectrum
+
+        folder = job.inputs["spectra"]
+        columns = {
+            modes: {name: load_spectrum(folder / spectrum_file(name, modes), SphericalSpectrum) for name in MARKINGS}
+            for modes in COLUMNS
+        }
+        figure = draw_observed(columns, job.settings["wedge_buffer"], job.settings["notes"])
+        return Drawing(figure, {modes.replace("-", "_"): series for modes, series in columns.items()})
+
+
+TITLES = {
+    "data": "data as given",
+    "calibrated": "calibrated",
+    "residual": "residual",
+    "noise": r"noise, $P_N$",
+}
+MAX_DELAY = 2e-6
+
+
+class ObservedWedge(StudyFigure):
+    """Cylindrical power spectra of measured data."""
+
+    kind: str = "observed-wedge"
+
+    of = ("observed",)
+    caption = (
+        "Cylindrical power spectra of the measured data: as given, calibrated, the residual, and the power of their "
+        "noise from the difference of the two halves; negative values in blue."
+    )
+    tolerances = ((r".*\.power", Drawn(half, "follows from fitted gains; half of it")),)
+
+    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
+        """Return the averaged spectra."""
+        return {"spectra": observed_spectra(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw a panel for each spectrum."""
+        from calstudy.power.spectra import CylindricalSpectrum
+        from calstudy.power.tables import load_spectrum
+
+        folder = job.inputs["spectra"]
+        found = {name: load_spectrum(folder / spectrum_file(name, "wedge"), CylindricalSpectrum) for name in TITLES}
+        figure = draw_panels(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY, job.settings["notes"])
+        return Drawing(figure, found)
+
+
+LAST_K = 1.5
+
+
+@dataclass(frozen=True)
+class ObservedLoss:
+    """Transfer functions of a calibration of measured data.
+
+    `outside` and `inside` the wedge are per |k| and `map` per baseline length and delay, by injection; `expected` is
+    the prediction of the fit, None if not known.
+    """
+
+    outside: TransferFunction
+    inside: TransferFunction
+    map: TransferMap
+    expected: ExpectedBins | None
+
+
+@style.journal_style()
+def draw_observed_loss(loss: ObservedLoss, buffer: float, stand_ins: Sequence[str] = ()) -> Figure:
+    """Draw T per |k| on the left, with the expectation outside the wedge as a line, and per (|b|, tau) on the right.
+
+    Bars are 95 % (1.96 sigma). The dashed line is the horizon plus `buffer`, s.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 3.0)
+    left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
+    left.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
+    where = f"wedge + {1e9 * buffer:.0f} ns"
+    draw_transfer(left, loss.outside, f"injected, outside {where}", "o", style.BLUE)
+    draw_transfer(left, loss.inside, f"injected, inside {where}", "s", style.ORANGE)
+    if loss.expected is not None:
+        label = f"expected of the fit, outside {where}"
+        left.plot(loss.expected.k, loss.expected.outside, color=style.BLUE, linewidth=0.9, label=label)
+    filled = np.isfinite(loss.outside.transfer) | np.isfinite(loss.inside.transfer)
+    last = min(float(loss.outside.bin_edges[1:][filled].max(initial=0.1)), LAST_K)
+    left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, last), ylim=(-0.03, 1.15))
+    left.legend(loc="lower right")
+    draw_map(figure, right, loss.map, buffer, MAX_DELAY)
+    style.note_stand_ins(figure, stand_ins)
+    return figure
+
+
+class ObservedSignalLoss(StudyFigure):
+    """The transfer function of the calibration of measured data."""
+
+    kind: str = "observed-signal-loss"
+
+    of = ("observed",)
+    caption = (
+        "What the calibration of these data leaves of an EoR that is put into them: T per k, with what the fit "
+        "predicts, and per baseline length and delay."
+    )
+    needs_injection = True
+    shows_sky = False
+    tolerances = ((r".*\.(transfer|cross_transfer|squared_coherence)", Drawn(half, "half of it")),)
+
+    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
+        """Return measurement and expectation."""
+        prediction = expected_loss(graph)
+        return {"transfer": required(transfer(graph)), **({"expected": prediction} if prediction else {})}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw T per k and per (|b|, tau)."""
+        from calstudy.power.expected import ExpectedBins
+        from calstudy.power.tables import load_spectrum
+        from calstudy.power.transfer import TransferFunction, TransferMap
+
+        folder, prediction = job.inputs["transfer"], None
+        if "expected" in job.inputs:
+            prediction = load_spectrum(job.inputs["expected"] / EXPECTED, ExpectedBins)
+        outside, inside = (
+            load_spectrum(folder / spectrum_file(FILE, part), TransferFunction)
+            for part in ("outside-wedge", "inside-wedge")
+        )
+        by_length = load_spectrum(folder / spectrum_file(FILE, "wedge"), TransferMap)
+        loss = ObservedLoss(outside, inside, by_length, prediction)
+        figure = draw_observed_loss(loss, job.settings["wedge_buffer"], job.settings["notes"])
+        shown: dict[str, Any] = {"outside": outside, "inside": inside, "map": by_length}
+        return Drawing(figure, shown if prediction is None else {**shown, "expected": prediction})
