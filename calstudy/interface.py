@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import yaml
@@ -37,6 +38,8 @@ from calstudy.products.files import (
     read_json,
     read_visibilities,
 )
+from calstudy.products.gain_errors import ERRORS
+from calstudy.products.gain_errors import gain_errors as errors_of_gains
 from calstudy.report.headline import read_headline
 from calstudy.results.folder import EXPERIMENT, RunFolder
 from calstudy.results.reader import Tables
@@ -150,6 +153,13 @@ class CalibratedData:
         from pyuvdata import UVCal
 
         return UVCal.from_file(self.folder / GAINS)
+
+    @property
+    def gain_errors(self) -> xarray.Dataset:
+        """Standard deviations of gains by noise, `amplitude` and `phase`; InputError if the calibration has none."""
+        from calstudy.results.reader import gain_errors
+
+        return gain_errors(self.folder / GAINS)
 
     @property
     def model(self) -> UVData:
@@ -422,6 +432,34 @@ class OpenRun:
         study = self._experiment
         task = corruption.gains(study.graph) if variant == "true" else self._calibration(variant, half)
         return UVCal.from_file(self._product(task, study) / GAINS)
+
+    def gain_errors(self, variant: str = "residual", half: Half = "even") -> xarray.Dataset:
+        """Compute standard deviations of gains by noise, `amplitude` and `phase`, from the products in the store.
+
+        Parameters
+        ----------
+        variant
+            A calibrated variant.
+        half
+            Which of the two noise realizations.
+
+        Raises
+        ------
+        InputError
+            If they are not known for the calibrator or the size of the array, with the reason.
+        """
+        from calstudy.results.reader import gain_errors
+
+        self._calibration(variant, half)
+        study = self._experiment
+        task = errors_of_gains(study.graph, self._variant(variant), half)
+        task = task.given({name: self._product(needed, study) for name, needed in task.needs.items()})
+        with TemporaryDirectory() as folder:
+            task.make(Path(folder))
+            reasons = {record.get("reason") for record in read_json(Path(folder) / ERRORS)["records"]}
+            if None not in reasons:
+                raise InputError(f"{variant}: no errors of gains: {'; '.join(sorted(reasons))}")
+            return gain_errors(Path(folder) / GAINS)
 
     def visibilities(self, variant: str, half: Half = "even") -> UVData:
         """Return the visibilities of a variant: the residual if it is calibrated, else the simulated data.

@@ -100,6 +100,15 @@ def test_gains_and_visibilities_are_those_of_pyuvdata(run):
         run.gains("eor")
 
 
+def test_errors_of_gains_are_computed_from_the_products(run):
+    gains, errors = run.gains("residual"), run.gain_errors("residual")
+    assert errors.amplitude.dims == ("antenna", "frequency", "time", "feed")
+    assert np.array_equal(np.isfinite(errors.phase.values), ~gains.flag_array)
+    assert errors.phase.attrs["units"] == "rad"
+    with pytest.raises(InputError, match="'eor' is not calibrated"):
+        run.gain_errors("eor")
+
+
 def test_figures_are_drawn_again(run):
     assert run.figures == ["signal-loss", "wedge"]
     assert isinstance(run.plot("wedge"), Figure)

@@ -115,6 +115,33 @@ def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = N
     return cal
 
 
+ERRORS_GROUP = "GainErrors"
+"""Group of a CalH5 file, beside those of the format, with the standard deviations `amplitude` and `phase` (rad)."""
+
+
+def write_gain_errors(path: Path, amplitude: np.ndarray, phase: np.ndarray) -> None:
+    """Add standard deviations of |g| and of the phase of g to a CalH5 file, with the axes of its gains; NaN is none."""
+    import h5py
+
+    with h5py.File(path, "a") as file:
+        group = file.create_group(ERRORS_GROUP)
+        for name, values in (("amplitude", amplitude), ("phase", phase)):
+            group.create_dataset(name, data=values.astype(np.float32), compression="gzip")
+
+
+def read_gain_errors(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read what `write_gain_errors` added, (Nants, Nfreqs, Ntimes, Npols); raises InputError if there is none."""
+    import h5py
+
+    with h5py.File(path) as file:
+        if ERRORS_GROUP not in file:
+            raise InputError(
+                f"{path}: has no errors of gains, because none are known for its calibration, or it is of a version "
+                "that wrote none"
+            )
+        return tuple(file[ERRORS_GROUP][name][()] for name in ("amplitude", "phase"))
+
+
 def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return g_a g_b* of baselines (a, b), and where it is flagged, both (Ntimes, len(pairs), Nfreqs, Npols).
 

@@ -206,3 +206,25 @@ def _dataset(
         {name: value for name, value in variables.items() if name in coordinates},
         {name: value for name, value in single.items() if np.ndim(value) == 0},
     )
+
+
+def gain_errors(path: Path) -> xarray.Dataset:
+    """Return standard deviations `amplitude`, of |g|, and `phase`, rad, of a file of gains; raises InputError if none.
+
+    Coordinates are `antenna` (number), `frequency` (Hz), `time` (JD) and `feed` (AIPS number of the Jones element).
+    """
+    import xarray
+    from pyuvdata import UVCal
+
+    from calstudy.base.gains import read_gain_errors
+
+    amplitude, phase = read_gain_errors(path)
+    gains = UVCal.from_file(path)
+    places = {"antenna": gains.ant_array, "frequency": gains.freq_array, "time": gains.time_array}
+    coordinates = {**places, "feed": gains.jones_array}
+    found = xarray.Dataset(
+        {"amplitude": (tuple(coordinates), amplitude), "phase": (tuple(coordinates), phase)}, coordinates
+    )
+    for name, unit in (("phase", "rad"), ("frequency", "Hz"), ("time", "JD")):
+        found[name].attrs["units"] = unit
+    return found

@@ -27,6 +27,7 @@ from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, read_json
+from calstudy.products.gain_errors import ERRORS, observed_gain_errors
 from calstudy.products.graph import MeasuredGraph
 from calstudy.products.observed import calibrated, observed
 from calstudy.products.observed_injection import EXPECTED_TRANSFER, expected_transfer
@@ -178,9 +179,10 @@ class DataCalibration(DataStudy):
 
     @cached_property
     def tables(self) -> list[Task]:
-        """The calibration, its quality, and the signal loss if it is wanted."""
+        """The calibration, its gains again with their errors, its quality, and the signal loss if it is wanted."""
         expected = [expected_transfer(self.graph, WHOLE)] if self.file.expected_loss else []
-        return [calibrated(self.graph, WHOLE), quality(self.graph), *expected]
+        errors = observed_gain_errors(self.graph, WHOLE)
+        return [calibrated(self.graph, WHOLE), errors, quality(self.graph), *expected]
 
     def described(self) -> str:
         """Return a sentence on the data and the solves."""
@@ -235,7 +237,11 @@ class DataCalibration(DataStudy):
             work = Path(temporary)
             publish([made.products[task.key] for task in self.targets], work)
             solution = self._solution(made, read_json(work / SOLUTION), read_json(work / QUALITY)[WHOLE])
-            (work / QUALITY).unlink()
+            errors = read_json(work / ERRORS)["records"]
+            for record, found in zip(solution["records"], errors, strict=True):
+                record["gain_errors"] = found
+            for name in (QUALITY, ERRORS):
+                (work / name).unlink()
             (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
             if self.file.calfits:
                 from pyuvdata import UVCal

@@ -17,6 +17,7 @@ import calstudy
 from calstudy.base.errors import InputError
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
+from calstudy.interface import CalibratedData
 from calstudy.power.tables import load_spectrum
 from calstudy.realdata.settings import defaults
 from calstudy.studies.calibration import FIGURE_FILES
@@ -242,3 +243,24 @@ def test_python_calibrates_as_the_command_does(data, command, tmp_path, monkeypa
         calstudy.calibrate_data(data, "again")
     with pytest.raises(InputError, match=r"calibration\.bsis"):
         calstudy.calibrate_data(data, "other", **{"bsis.buffer": "50 ns"})
+
+
+def test_gains_have_their_errors_beside_what_other_readers_see(command, data, tmp_path):
+    code, _ = command(data, *OPTIONS, "--output", "out")
+    assert code == 0
+    gains = UVCal.from_file(str(tmp_path / "out" / "gains.calh5"))
+    found = CalibratedData(tmp_path / "out")
+    errors = found.gain_errors
+    assert errors.amplitude.shape == gains.gain_array.shape
+    # No errors where there are no gains.
+    assert np.array_equal(np.isfinite(errors.phase.values), ~gains.flag_array)
+    for record in found.solution["records"]:
+        summary = record["gain_errors"]
+        assert summary["left_out"] == ["phase", "scale", "smooth"]
+        assert summary["noise_from"] == "residual"
+        assert summary["median_signal_to_noise"] * summary["median_relative_amplitude"] == pytest.approx(1)
+    command(data, "--output", "smooth", *OPTIONS, "--set", "gain_delay=200 ns")
+    smooth = CalibratedData(tmp_path / "smooth")
+    assert "restricted to smooth functions" in smooth.solution["records"][0]["gain_errors"]["reason"]
+    with pytest.raises(InputError, match="has no errors of gains"):
+        _ = smooth.gain_errors

@@ -1,0 +1,119 @@
+"""Errors of the gains of a calibration by noise, in its file of gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.interface import Calibrator
+from calstudy.calibrate.settings import GainFit, UnityStart
+from calstudy.experiment.model import Variant
+from calstudy.products import calibration, observed
+from calstudy.products.calibration import Calibrated, prepared_fit, read_result
+from calstudy.products.files import GAINS, write_json
+from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
+from calstudy.run.task import Input, Task, called
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+    from calstudy.calibrate.gain_errors import GainErrors
+    from calstudy.calibrate.records import CalibrationResult
+
+ERRORS = "gain-errors.json"
+"""A record for each solve: what its errors mean and how large they are, or `reason`, why there are none."""
+LABEL = "errors of gains"
+
+
+@memoize
+def gain_errors(graph: Graph, variant: Variant, parity: str) -> Task:
+    """Return the task of the errors of the gains of a calibration of simulated data."""
+    inputs: dict[str, Any] = {**calibration.calibration_inputs(graph, variant, parity)}
+    return ErrorsOfGains(
+        LABEL,
+        calibration=calibration.calibration(graph, variant, parity),
+        calibrator=graph.experiment.calibration.with_defaults("assumed"),
+        **inputs,
+    )
+
+
+@memoize
+def observed_gain_errors(graph: MeasuredGraph, part: str) -> Task:
+    """Return the task of the errors of the gains of a part of measured data."""
+    data, section, calibrator = observed.observed(graph, part), graph.experiment.observed, graph.experiment.calibration
+    return ErrorsOfGains(
+        LABEL,
+        calibration=observed.calibrated(graph, part),
+        calibrator=calibrator.with_defaults("assumed"),
+        data=data,
+        sky_model=data if section.sky_model is not None else None,
+        levels=data if calibrator.needs_noise else None,
+    )
+
+
+class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
+    """The gains of a calibration with their errors."""
+
+    calibration: Input
+    calibrator: Calibrator = called("calibration")
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the gains with their errors, and a record for each solve."""
+        import numpy as np
+
+        from calstudy.base.gains import write_gain_errors
+
+        result = read_result(self.calibration)
+        errors = np.full((2, *result.gains.gain_array.shape), np.nan)
+        records = self.fill(errors, result)
+        result.gains.write_calh5(output / GAINS)
+        if np.isfinite(errors).any():
+            write_gain_errors(output / GAINS, *errors)
+        write_json(output / ERRORS, {"records": records})
+        return {}
+
+    def fill(self, errors: np.ndarray, result: CalibrationResult) -> list[dict[str, Any]]:
+        """Fill in errors of amplitudes and phases, (2, Nants, Nfreqs, Ntimes, Npols), and return a record by solve."""
+        import numpy as np
+
+        from calstudy.base.visibilities import to_cube
+        from calstudy.calibrate.gain_errors import gain_errors as errors_of
+        from calstudy.calibrate.preparation import problem_at
+
+        settings = self.calibrator
+        if not isinstance(settings, GainFit):
+            return [{"reason": f"{settings.label} is no fit by least squares"}] * len(result.solutions)
+        if settings.smooth_gains is not None:
+            return [{"reason": "the gains were smoothed after the fit"}] * len(result.solutions)
+        # The solution is known, and a start of its own would cost more than the errors.
+        settings = settings.model_copy(update={"initial_gains": UnityStart()})
+        prepared, cube, records = prepared_fit(settings, *self.read()), to_cube(result.model), []
+        order = np.argsort(result.gains.ant_array)
+        rows = order[np.searchsorted(result.gains.ant_array, prepared.data.numbers, sorter=order)]
+        for solve in result.solutions:
+            times = slice(solve.integration, solve.integration + solve.n_integrations)
+            place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
+            gains = result.gains.gain_array[rows, :, times.start, place]
+            problem = problem_at(prepared, settings, times, place, gains) if solve.usable else "the solve gave no gains"
+            found: GainErrors | str
+            if isinstance(problem, str):
+                found = problem
+            else:
+                model = cube[times, :, :, place].reshape(problem.visibilities.shape)
+                found = errors_of(problem, gains, model, prepared.data.frequencies)
+            if isinstance(found, str):
+                records.append({"reason": found})
+                continue
+            errors[..., place][:, rows, :, times] = np.stack([found.amplitude, found.phase])[..., None]
+            records.append(found.summary(gains))
+        return records
+
+    def _cost(self) -> Cost:
+        from calstudy.calibrate.gain_errors import MOST_UNKNOWNS
+
+        size = size_of(self)
+        matrix = min(2 * size.antennas * size.channels.count, MOST_UNKNOWNS) ** 2 * COMPLEX128
+        return Cost(5 + 1e-5 * size.samples, LIBRARIES_MEMORY + 3 * matrix + 4 * size.samples * COMPLEX128, 1e6)
