@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ERRORS = "gain-errors.json"
 """A record for each solve: what its errors mean and how large they are, or `reason`, why there are none."""
 LABEL = "errors of gains"
+LEAST_SIGNAL_TO_NOISE = 2.0
+"""Below it, fits run away: some of their gains become ten times too large."""
 
 
 @memoize
@@ -73,7 +75,7 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
         if np.isfinite(errors).any():
             write_gain_errors(output / GAINS, *errors)
         write_json(output / ERRORS, {"records": records})
-        return {}
+        return {"warnings": lost_in_noise(result.gains.gain_array, errors[0])}
 
     def fill(self, errors: np.ndarray, result: CalibrationResult) -> list[dict[str, Any]]:
         """Fill in errors of amplitudes and phases, (2, Nants, Nfreqs, Ntimes, Npols), and return a record by solve."""
@@ -117,3 +119,23 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
         size = size_of(self)
         matrix = min(2 * size.antennas * size.channels.count, MOST_UNKNOWNS) ** 2 * COMPLEX128
         return Cost(5 + 1e-5 * size.samples, LIBRARIES_MEMORY + 3 * matrix + 4 * size.samples * COMPLEX128, 1e6)
+
+
+def lost_in_noise(gains: np.ndarray, errors: np.ndarray) -> list[str]:
+    """Return a sentence that counts the channels whose gains are lost in noise; none without any.
+
+    Gains and the errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error. The signal to noise of
+    a channel is the median over antennas, integrations and polarizations.
+    """
+    import numpy as np
+
+    ratios = [values[np.isfinite(values)] for values in np.swapaxes(np.abs(gains) / errors, 0, 1)]
+    known = [float(np.median(values)) for values in ratios if values.size]
+    lost = sum(value < LEAST_SIGNAL_TO_NOISE for value in known)
+    if not lost:
+        return []
+    return [
+        f"the gains have a signal to noise below {LEAST_SIGNAL_TO_NOISE:g} in {lost} of {len(known)} channels (lowest "
+        f"{min(known):.2g}): noise alone makes some |g| far too large there; solve more integrations together "
+        "(integrations_per_solve), or smooth the gains (smooth_gains)"
+    ]

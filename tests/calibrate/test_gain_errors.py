@@ -22,6 +22,7 @@ from calstudy.calibrate.gain_errors import gain_errors
 from calstudy.calibrate.problem import FitStructure, flag_weights, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
+from calstudy.products.gain_errors import lost_in_noise
 
 REALIZATIONS = 40
 DEVIATION = 0.02
@@ -147,3 +148,22 @@ def test_what_has_no_errors_says_why():
     assert "smooth" in gain_errors(smooth, toy.gains, toy.foregrounds, FREQUENCIES)
     three = make_toy(scattered(3))
     assert "as many unknowns" in gain_errors(three.problem(), three.gains, three.foregrounds, FREQUENCIES)
+
+
+@pytest.mark.parametrize(("noise", "lost"), [(0.5, False), (4.0, True)])
+def test_gains_that_are_lost_in_noise_are_told_from_others(noise, lost):
+    """Noise relative to the visibilities of a known sky: 0.12 of the gains are noise, or most of them."""
+    toy = make_toy(HEX, noise=0.0)
+    sky, rng = toy.foregrounds, np.random.default_rng(1)
+    drawn = noise * np.sqrt(np.mean(np.abs(sky) ** 2)) * complex_normal(rng, sky.shape)
+    data = gain_products(toy.gains, toy.antennas) * sky + drawn
+    problem = toy.problem(
+        visibilities=data, weights=flag_weights(np.zeros(sky.shape, bool)), sky_model=sky, frozen=True
+    )
+    solution = solve(problem, GaussNewton())
+    size = np.abs(solution.gains)
+    assert (size.max() > 10 * np.median(size)) == lost
+    errors = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
+    warnings = lost_in_noise(solution.gains[..., None, None], errors.amplitude[..., None, None])
+    assert len(warnings) == lost
+    assert all("of 64 channels" in text and "integrations_per_solve" in text for text in warnings)
