@@ -30,7 +30,9 @@ def sections() -> dict[str, dict[str, str]]:
 
 def merged(base: dict | str, changes: dict) -> dict:
     """Return a block with changes, block by block; a name alone and a block of another kind are replaced."""
-    base = {} if isinstance(base, str) or base.get("kind") != changes.get("kind", base.get("kind")) else base
+    kinds = ("kind", "calibrator")
+    if isinstance(base, str) or any(base.get(kind) != changes.get(kind, base.get(kind)) for kind in kinds):
+        base = {}
     return {
         **base,
         **{
