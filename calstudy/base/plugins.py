@@ -74,8 +74,9 @@ class Plugin(Section):
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """Return the names of a built-in class; empty for one that is named after its module."""
-        return ()
+        """Return the names of a built-in class, its tag's default; empty for one that is named after its module."""
+        tag = cls.model_fields.get(cls.registry.tag)
+        return (tag.default,) if tag is not None and isinstance(tag.default, str) and tag.default else ()
 
     @property
     def is_built_in(self) -> bool:

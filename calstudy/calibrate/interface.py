@@ -211,11 +211,6 @@ class Calibrator(Plugin):
         None, description="Smooth the gains once they are found, and calibrate with those; the model stays as it is."
     )
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the name of a built-in calibrator."""
-        return (cls.model_fields["calibrator"].default,)
-
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return in one sentence why data cannot be calibrated, or None if they can.
 

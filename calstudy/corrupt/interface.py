@@ -46,11 +46,6 @@ class Effect(Plugin, ABC):
 
     kind: str = Field("", description="Name of an effect, or a file.py.")
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the name of a built-in effect."""
-        return (cls.model_fields["kind"].default,)
-
     def refusal(self, size: Size) -> str | None:
         """Return in one sentence why the effect cannot be applied to data of this size, or None if it can.
 

@@ -97,11 +97,6 @@ class StudyFigure(Plugin):
 
     kind: str
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the name of a built-in figure."""
-        return (cls.model_fields["kind"].default,)
-
     def refusal(self, experiment: Experiment) -> str | None:
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
         if "experiment" not in self.of:

@@ -109,11 +109,6 @@ class ArrayLayout(Plugin, ABC):
 
     kind: str = Field("", description="Name of a layout, or a file.py.")
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the names of a built-in layout."""
-        return (cls.model_fields["kind"].default,)
-
     @property
     def origin(self) -> str:
         """The field and name of the layout in messages."""

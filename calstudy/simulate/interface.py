@@ -71,11 +71,6 @@ class Engine(Plugin, ABC):
 
     kind: str = Field("", description="Name of an engine, or a file.py.")
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the name of a built-in engine."""
-        return (cls.model_fields["kind"].default,)
-
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does.
 

@@ -9,6 +9,9 @@ import yaml
 from plugin_files import TEXT
 from tiny import tiny
 
+from calstudy.base.plugins import Registry
+from calstudy.figures import StudyFigure
+from calstudy.instrument.layouts import ArrayLayout
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import plugin_reference
@@ -64,3 +67,17 @@ def test_an_example_is_short_and_runs(title, tmp_path, shared_store):
     # Seven antennas determine their gains so badly that single precision may not reach the minimum; solves say so.
     said = ("did not converge", "where solves stall")
     assert [warning for warning in run.warnings if not any(text in warning for text in said)] == []
+
+
+@pytest.mark.parametrize(("title", "base"), [("A layout", ArrayLayout), ("A figure", StudyFigure)])
+def test_an_example_that_is_copied_into_the_package_has_the_name_of_its_module(title, base, tmp_path, monkeypatch):
+    """It needs no second name in its class."""
+    code = sections()[title]["python"]
+    module = re.match(r"# (\w+)\.py\n", code)[1]
+    package = f"built_in_{title.split()[-1]}s"
+    (tmp_path / package).mkdir()
+    (tmp_path / package / "__init__.py").touch()
+    (tmp_path / package / f"{module}.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    registry = Registry("thing", package, f"{base.__module__}:{base.__name__}", families=True)
+    assert registry.built_in() == [module.replace("_", "-")]
