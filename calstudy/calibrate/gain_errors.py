@@ -69,11 +69,15 @@ class GainErrors:
     noise_from
         Whether the variance of the noise is that of the weights, or from the residual of this solve.
     degrees
-        Degrees of freedom of the residual.
+        Degrees of freedom of the residual; None where they do not enter.
     left_out
         Names of the directions that are no part of the errors.
     smooth_delay
         Largest delay of ``smooth`` directions; zero if there are none.
+    smooth_fraction
+        Fraction of the numbers in the gains that are ``smooth``.
+    unevenness
+        Mean over median of the residual's power in channels: about one for noise, more for interference.
     determined
         Function that takes these directions out of a relative change of the gains, complex, (Nants, Nfreqs).
     """
@@ -81,9 +85,11 @@ class GainErrors:
     amplitude: np.ndarray = field(metadata={"unit": ""})
     phase: np.ndarray = field(metadata={"unit": "rad"})
     noise_from: NoiseFrom
-    degrees: int
+    degrees: int | None
     left_out: tuple[str, ...]
     smooth_delay: float = field(metadata={"unit": "s"})
+    smooth_fraction: float
+    unevenness: float
     determined: Callable[[np.ndarray], np.ndarray]
 
     def summary(self, gains: np.ndarray) -> dict[str, Any]:
@@ -97,6 +103,8 @@ class GainErrors:
             "degrees_of_freedom": self.degrees,
             "left_out": list(self.left_out),
             "smooth_delay": self.smooth_delay,
+            "smooth_fraction": self.smooth_fraction,
+            "unevenness": self.unevenness,
         }
 
 
@@ -139,7 +147,8 @@ def gain_errors(
     else:
         variances = _with_foregrounds(tangent, structure.antennas, alignment, spans)
     residual = problem.visibilities - gain_products(gains, structure.antennas) * model
-    loss = float(np.sum(problem.weights * np.abs(residual) ** 2))
+    powers = np.sum(problem.weights * np.abs(residual) ** 2, axis=0)
+    loss, powers = float(np.sum(powers)), powers[has_data.any(axis=0)]
     sigma = np.where(has_data, np.sqrt(variances * (0.5 if tangent.finite else loss / degrees)), np.nan)
 
     def determined(change: np.ndarray) -> np.ndarray:
@@ -150,9 +159,11 @@ def gain_errors(
         np.abs(gains) * sigma[0],
         sigma[1],
         "weights" if tangent.finite else "residual",
-        int(degrees),
+        None if tangent.finite else int(degrees),
         ("phase", *(["scale"] if alignment.of_all is not None else []), *(["smooth"] if free else [])),
         delay,
+        1 - unknowns / (2 * np.count_nonzero(has_data)),
+        float(np.mean(powers) / np.median(powers)) if loss > 0 else 1.0,
         determined,
     )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.interface import Calibrator
-from calstudy.calibrate.settings import GainFit, UnityStart
+from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
 from calstudy.products import calibration, observed
 from calstudy.products.calibration import Calibrated, prepared_fit, read_result
@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 ERRORS = "gain-errors.json"
 """A record for each solve: what its errors mean and how large they are, or `reason`, why there are none."""
 LABEL = "errors of gains"
-LEAST_SIGNAL_TO_NOISE = 2.0
-"""Below it, fits run away: some of their gains become ten times too large."""
+FAR_ABOVE, MODERATE, EVEN = 5.0, 20.0, 2.0
+"""|g| over the median of its antenna, the signal to noise below which noise alone can make it, and the unevenness of
+the residual above which something else does."""
+RAN_AWAY = "the weights, from the gains, do not settle: the gains are lost in noise"
+REMEDY = "solve more integrations together (integrations_per_solve), or smooth the gains (smooth_gains)"
 
 
 @memoize
@@ -75,7 +78,10 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
         if np.isfinite(errors).any():
             write_gain_errors(output / GAINS, *errors)
         write_json(output / ERRORS, {"records": records})
-        return {"warnings": lost_in_noise(result.gains.gain_array, errors[0])}
+        lost = sum(record.get("reason") == RAN_AWAY for record in records)
+        warnings = [f"{lost} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if lost else []
+        unevenness = max((record["unevenness"] for record in records if "reason" not in record), default=1.0)
+        return {"warnings": warnings + lost_in_noise(result.gains.gain_array, errors[0], unevenness)}
 
     def fill(self, errors: np.ndarray, result: CalibrationResult) -> list[dict[str, Any]]:
         """Fill in errors of amplitudes and phases, (2, Nants, Nfreqs, Ntimes, Npols), and return a record by solve."""
@@ -103,6 +109,9 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
             found: GainErrors | str
             if isinstance(problem, str):
                 found = problem
+            elif solve.diagnostics.get("weight_change", 0) > RUNAWAY:
+                # The gains are those of an earlier pass, whose weights are not known.
+                found = RAN_AWAY
             else:
                 model = cube[times, :, :, place].reshape(problem.visibilities.shape)
                 found = errors_of(problem, gains, model, prepared.data.frequencies)
@@ -121,21 +130,23 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
         return Cost(5 + 1e-5 * size.samples, LIBRARIES_MEMORY + 3 * matrix + 4 * size.samples * COMPLEX128, 1e6)
 
 
-def lost_in_noise(gains: np.ndarray, errors: np.ndarray) -> list[str]:
-    """Return a sentence that counts the channels whose gains are lost in noise; none without any.
+def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> list[str]:
+    """Return a sentence if noise alone makes gains that are far above the others of their antenna; none otherwise.
 
-    Gains and the errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error. The signal to noise of
-    a channel is the median over antennas, integrations and polarizations.
+    Gains and the errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error. The unevenness is the
+    largest of all solves.
     """
     import numpy as np
 
-    ratios = [values[np.isfinite(values)] for values in np.swapaxes(np.abs(gains) / errors, 0, 1)]
-    known = [float(np.median(values)) for values in ratios if values.size]
-    lost = sum(value < LEAST_SIGNAL_TO_NOISE for value in known)
-    if not lost:
+    sizes = np.where(np.isfinite(errors), np.abs(gains), np.nan)
+    known = np.isfinite(sizes).any(axis=(1, 2, 3))
+    if not known.any():
+        return []
+    largest = np.nanmax(sizes[known] / np.nanmedian(sizes[known], axis=(1, 2, 3), keepdims=True))
+    signal_to_noise = np.nanmedian(sizes / errors)
+    if largest < FAR_ABOVE or signal_to_noise > MODERATE or unevenness > EVEN:
         return []
     return [
-        f"the gains have a signal to noise below {LEAST_SIGNAL_TO_NOISE:g} in {lost} of {len(known)} channels (lowest "
-        f"{min(known):.2g}): noise alone makes some |g| far too large there; solve more integrations together "
-        "(integrations_per_solve), or smooth the gains (smooth_gains)"
+        f"|g| is up to {largest:.2g} times the median of its antenna, and the median signal to noise of the gains is "
+        f"{signal_to_noise:.2g}: noise alone does this; {REMEDY}"
     ]

@@ -258,6 +258,7 @@ def test_gains_have_their_errors_beside_what_other_readers_see(command, data, tm
         summary = record["gain_errors"]
         assert summary["left_out"] == ["phase", "scale", "smooth"]
         assert summary["noise_from"] == "residual"
+        assert 0 < summary["smooth_fraction"] < 1
         assert summary["median_signal_to_noise"] * summary["median_relative_amplitude"] == pytest.approx(1)
     command(data, "--output", "smooth", *OPTIONS, "--set", "gain_delay=200 ns")
     smooth = CalibratedData(tmp_path / "smooth")

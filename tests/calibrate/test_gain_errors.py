@@ -96,7 +96,7 @@ def pulls(kind="sky", noise=0.01, flagged=False, received=False, wrong=1.0):
             errors = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
         aligned = fix_degeneracies(solution.gains, solution.model, replace(problem, initial_gains=toy.gains))[0]
         change = errors.determined(np.log(aligned / toy.gains))
-        found.append([change.real * np.abs(toy.gains) / errors.amplitude, change.imag / errors.phase])
+        found.append([change.real * np.abs(solution.gains) / errors.amplitude, change.imag / errors.phase])
     return np.array(found)
 
 
@@ -150,20 +150,20 @@ def test_what_has_no_errors_says_why():
     assert "as many unknowns" in gain_errors(three.problem(), three.gains, three.foregrounds, FREQUENCIES)
 
 
-@pytest.mark.parametrize(("noise", "lost"), [(0.5, False), (4.0, True)])
-def test_gains_that_are_lost_in_noise_are_told_from_others(noise, lost):
-    """Noise relative to the visibilities of a known sky: 0.12 of the gains are noise, or most of them."""
+@pytest.mark.parametrize(("noise", "interference", "lost"), [(0.5, 0, False), (4.0, 0, True), (0.01, 100, False)])
+def test_gains_that_are_lost_in_noise_are_told_from_others(noise, interference, lost):
+    """Noise relative to the visibilities of a known sky; interference in a channel drives its gains as far as noise."""
     toy = make_toy(HEX, noise=0.0)
     sky, rng = toy.foregrounds, np.random.default_rng(1)
-    drawn = noise * np.sqrt(np.mean(np.abs(sky) ** 2)) * complex_normal(rng, sky.shape)
-    data = gain_products(toy.gains, toy.antennas) * sky + drawn
-    problem = toy.problem(
-        visibilities=data, weights=flag_weights(np.zeros(sky.shape, bool)), sky_model=sky, frozen=True
-    )
+    rms = np.sqrt(np.mean(np.abs(sky) ** 2))
+    data = gain_products(toy.gains, toy.antennas) * sky + noise * rms * complex_normal(rng, sky.shape)
+    data[:, 30] += interference * rms
+    weights = flag_weights(np.zeros(sky.shape, bool))
+    problem = toy.problem(visibilities=data, weights=weights, sky_model=sky, frozen=True)
     solution = solve(problem, GaussNewton())
     size = np.abs(solution.gains)
-    assert (size.max() > 10 * np.median(size)) == lost
+    assert (size.max() > 5 * np.median(size)) == (lost or interference > 0)
     errors = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
-    warnings = lost_in_noise(solution.gains[..., None, None], errors.amplitude[..., None, None])
+    warnings = lost_in_noise(solution.gains[..., None, None], errors.amplitude[..., None, None], errors.unevenness)
     assert len(warnings) == lost
-    assert all("of 64 channels" in text and "integrations_per_solve" in text for text in warnings)
+    assert all("integrations_per_solve" in text for text in warnings)
