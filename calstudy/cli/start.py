@@ -21,13 +21,6 @@ List = Annotated[
     bool, typer.Option("--list", help="List the published experiments, which other commands take by name.")
 ]
 Beam = Annotated[str, typer.Option(help="The beam of measured data: hera, airy, gaussian, ..., or a file.py.")]
-KINDS = {
-    "experiments": "collection",
-    "runtime": "run times",
-    "calibrators": "comparison",
-    "observed": "measured data",
-}
-"""Kinds of files that are not one experiment, by their key."""
 
 
 def init(
@@ -62,11 +55,12 @@ def _list_examples() -> None:
     from calstudy.base.package_files import experiment_names, published
     from calstudy.base.table import Table
     from calstudy.experiment.yaml_files import read_mapping
+    from calstudy.studies.study import kind_of
 
     rows = []
     for name in experiment_names():
         content = read_mapping(published("experiments") / f"{name}.yaml")
-        kind = next((kind for key, kind in KINDS.items() if key in content), "experiment")
+        kind = kind_of(content, published("experiments")).__module__.rpartition(".")[2]
         rows.append((name, kind, " ".join(str(content.get("description", "")).split())))
     Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False), numbers=False)
 
