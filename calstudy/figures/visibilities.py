@@ -27,6 +27,8 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, rms_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -95,6 +97,18 @@ def draw_model(comparison: VisibilityComparison, stand_ins: Sequence[str] = ()) 
     return draw_comparison(comparison, (r"true foregrounds $F$", r"fitted model $\widehat{F}$"), stand_ins)
 
 
+def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[int, int], float, Visibilities]:
+    """Return the shown baseline, its length and, in fitted channels, its reference, fitted model and noise."""
+    from calstudy.products.selection import baseline, layout_of, read_spectra, read_used, require_used
+
+    integration = job.settings["integration"]
+    pair, length = baseline(layout_of(job.settings["layout"]), job.settings["antennas"])
+    paths = (reference, job.inputs["calibration"] / MODEL, job.inputs["noise"] / DATA)
+    used = read_used(paths[1], [pair])[0, integration]
+    require_used(used, pair, integration)
+    return pair, length, Visibilities(*(used * read_spectra(path, [pair])[0, integration] for path in paths))
+
+
 class Model(StudyFigure):
     """True and fitted foregrounds of one baseline in one integration."""
 
@@ -120,26 +134,10 @@ class Model(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the true foregrounds of a baseline and the fitted ones, on the scale of the true gains."""
-        from calstudy.products.selection import (
-            baseline,
-            layout_of,
-            read_aligned_gains,
-            read_spectra,
-            read_used,
-            require_used,
-        )
+        from calstudy.products.selection import read_aligned_gains
 
-        integration = job.settings["integration"]
-        pair, length = baseline(layout_of(job.settings["layout"]), job.settings["antennas"])
-        gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], integration)
-        paths = (
-            job.inputs["foregrounds"] / VISIBILITIES,
-            job.inputs["calibration"] / MODEL,
-            job.inputs["noise"] / DATA,
-        )
-        used = read_used(paths[1], [pair])[0, integration]
-        require_used(used, pair, integration)
-        foregrounds, model, noise = (used * read_spectra(path, [pair])[0, integration] for path in paths)
+        pair, length, (foregrounds, model, noise) = _inspected_spectra(job, job.inputs["foregrounds"] / VISIBILITIES)
+        gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], job.settings["integration"])
         shown = Visibilities(foregrounds, model / gains.scale**2, noise)
         comparison = compare_visibilities(pair, length, gains.frequency, shown)
         return Drawing(draw_model(comparison, stand_ins=job.settings["notes"]), comparison)
@@ -176,16 +174,11 @@ class Data(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the data of a baseline with fitted gains times model, and with the noise in them."""
-        from calstudy.products.selection import baseline, layout_of, read_gains, read_spectra, read_used, require_used
+        from calstudy.products.selection import read_gains
 
-        integration = job.settings["integration"]
-        pair, length = baseline(layout_of(job.settings["layout"]), job.settings["antennas"])
-        paths = (job.inputs["data"] / DATA, job.inputs["calibration"] / MODEL, job.inputs["noise"] / DATA)
-        used = read_used(paths[1], [pair])[0, integration]
-        require_used(used, pair, integration)
-        data, model, noise = (used * read_spectra(path, [pair])[0, integration] for path in paths)
+        pair, length, (data, model, noise) = _inspected_spectra(job, job.inputs["data"] / DATA)
         true, fitted = read_gains(job.inputs["gains"]), read_gains(job.inputs["calibration"])
-        both = (true.at(integration, pair), fitted.at(integration, pair))
+        both = (gains.at(job.settings["integration"], pair) for gains in (true, fitted))
         corruption_factor, correction = (gains[0] * gains[1].conj() for gains in both)
         shown = Visibilities(data, correction * model, corruption_factor * noise)
         comparison = compare_visibilities(pair, length, fitted.frequency, shown)

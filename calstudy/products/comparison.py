@@ -16,7 +16,7 @@ from calstudy.products.files import json_number, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
-from calstudy.verdicts.measured import is_measured, why_not_measured
+from calstudy.verdicts.measured import is_measured, marked
 from calstudy.verdicts.standing import answers, standing_table, standings
 
 if TYPE_CHECKING:
@@ -340,10 +340,10 @@ def _transfer_cell(band: Mapping[str, Any]) -> str:
     """Write T and, if it differs from the linear response by more than its error, this as well."""
     transfer, error, linear = band["transfer"], band["transfer_error"], band.get("linear_transfer")
     cell = _cell(transfer, error)
-    if transfer is not None and why_not_measured(transfer, error):
-        return f"not measured ({cell})"
-    if linear is None or transfer is None or abs(transfer - linear) <= error:
+    if transfer is None:
         return cell
+    if linear is None or not is_measured(transfer, error) or abs(transfer - linear) <= error:
+        return marked(cell, transfer, error)
     return f"{cell} (linear {linear:.2f})"
 
 

@@ -25,7 +25,7 @@ from calstudy.products.files import (
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
 from calstudy.run.task import Input, Inputs, Task
-from calstudy.verdicts.measured import why_not_measured
+from calstudy.verdicts.measured import marked, why_not_measured
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -271,8 +271,7 @@ def _transfer(found: TransferFunction, band: int) -> str:
     value, error = found.transfer[band], found.transfer_error[band]
     if not math.isfinite(value):
         return "not measured" if math.isfinite(found.signal[band]) else "no modes"
-    text = _with_error(value, error)
-    return f"not measured ({text})" if why_not_measured(value, error) else text
+    return marked(_with_error(value, error), value, error)
 
 
 def _json(value: float) -> float | None:

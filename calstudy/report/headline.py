@@ -12,7 +12,7 @@ from calstudy.base.errors import InputError
 from calstudy.products.score import SUMMARY
 from calstudy.results.folder import RunFolder
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.measured import why_not_measured
+from calstudy.verdicts.measured import marked, why_not_measured
 from calstudy.verdicts.sentences import counts, outcomes_of_sentences
 
 BAND = (0.2, 0.5)
@@ -54,14 +54,14 @@ class Signal:
     def numbers(self) -> list[Number]:
         """The same numbers as text."""
         pair = (self.transfer, self.transfer_error)
-        transfer = _with_error(*pair)
+        transfer = marked(_with_error(*pair), *pair)
         left = f"part of the EoR's power that is left, {PLACE}"
         if self.linear_transfer is not None:
             transfer += f" (linear response of the fit {self.linear_transfer:.3f})"
-            left += "; the linear response is what a fit of so many unknowns to these data must leave"
+            left += "; the linear response of the fit says what must be left"
         bias = f"power of the residual without EoR over that of the EoR, {PLACE}; errors by leaving out antennas"
         return [
-            Number("T", f"not measured ({transfer})" if why_not_measured(*pair) else transfer, left),
+            Number("T", transfer, left),
             Number("bias", _with_error(self.bias, self.bias_error), bias),
             Number("flux scale", f"{self.scale:.4f}", "of the calibrated data; T and bias are free of it"),
         ]
@@ -114,7 +114,8 @@ def measured_numbers(run: RunFolder) -> list[Number]:
     numbers = [Number("χ² per degree of freedom", ", ".join(known), "1 for a fit to the noise")] if known else []
     for band in notes.get("observed-transfer", {}).get("transfer", {}).get("outside-wedge", ()):
         if tuple(band["k"]) == MEASURED_BAND and band["error"] is not None:
-            why = band.get("not_measured")
+            # Runs of earlier versions have no reason.
+            why = band.get("not_measured") or why_not_measured(band["transfer"], band["error"])
             text = f"not measured ({why})" if why else _with_error(band["transfer"], band["error"])
             low, high = MEASURED_BAND
             left = f"part of an injected EoR's power that is left, outside the wedge, k of {low:g} to {high:g} h/Mpc"

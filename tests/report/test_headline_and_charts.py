@@ -88,6 +88,12 @@ def test_a_transfer_that_is_not_measured_is_no_result(tmp_path):
     assert number.text == "not measured (6178.000 ± 0.012)"
 
 
+def test_the_transfer_of_an_earlier_version_that_was_not_given_is_not_measured(tmp_path):
+    band = {"k": [0.3, 0.5], "transfer": None, "error": 3.4}
+    products = [{"stage": "observed-transfer", "notes": {"transfer": {"outside-wedge": [band]}}}]
+    assert read_headline(run_of(tmp_path, products=products))[0].text == "not measured (error 3.4)"
+
+
 @pytest.mark.parametrize(("not_measured", "text"), [(None, "0.874 ± 0.040"), ("error 5.4", "not measured (error 5.4)")])
 def test_measured_data_have_their_fit_and_their_transfer(not_measured, text, tmp_path):
     band = {"k": [0.3, 0.5], "transfer": 0.874, "error": 0.04, "not_measured": not_measured}
