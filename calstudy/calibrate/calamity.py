@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calstudy.base.observation import Observation
 from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import sky_model_slope
+from calstudy.calibrate.deviation import PASSES, Estimate, estimate
 from calstudy.calibrate.interface import Assumed, Calibration, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, repeat_structure, weight_change
@@ -24,6 +26,8 @@ from calstudy.calibrate.settings import (
 from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, solve_warm
+
+UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
 
 
 def make_solver(settings: GainFit) -> Solver:
@@ -94,7 +98,7 @@ def _solve_all(
     n_polarizations = prepared.data.n_polarizations
     for p in range(n_polarizations):
         warm: WarmStart | None = None
-        anew = True
+        anew, deviations = True, None
         for index, times in enumerate(groups):
             with Usage() as usage:
                 problem = make_problem(prepared, settings, times, p)
@@ -102,8 +106,8 @@ def _solve_all(
                     solution = _skipped(repeat_structure(prepared.structure, times.stop - times.start), problem)
                 else:
                     start = warm if settings.solver.warm_start else None
-                    if isinstance(settings.weights, GainWeights):
-                        solution, warm = _solve_in_passes(problem, solver, start, settings.weights)
+                    if settings.estimates_deviation or isinstance(settings.weights, GainWeights):
+                        solution, warm, deviations = _Passes(settings, solver).solve(problem, start, deviations)
                     else:
                         solution, warm, anew = _solve(problem, solver, start, anew)
                     solution = _noted(solution, **_scale(solution, problem))
@@ -132,38 +136,77 @@ def _solve(
     return again, again_warm, anew
 
 
-def _solve_in_passes(
-    problem: CalibrationProblem, solver: Solver, warm: WarmStart | None, settings: GainWeights
-) -> tuple[Solution, WarmStart | None]:
-    """Solve with the weights of the gains of the previous pass, until the weights settle.
+class _Pass(NamedTuple):
+    """A solve with the fractional deviations of the foregrounds (own, shared) that it used, None if they are fixed."""
 
-    The problem has the weights of unity gains. The first weights are from the gains of the warm start, or of the
-    problem if it is None. Returns the last solution, whose record has the times of all passes, their number and the
-    last relative change of the weights, and the warm start of the next solve.
+    solution: Solution
+    warm: WarmStart | None
+    deviations: tuple[float, float] | None
+
+
+class _Passes:
+    """Solves with weights from the gains, and deviations of the foregrounds, of the pass before, until both settle.
+
+    Settings ask for one of the two, or both.
     """
-    weighted = problem.weighted_by(problem.initial_gains if warm is None else warm.gains)
-    solutions: list[Solution] = []
-    starts: list[WarmStart | None] = []
-    change, anew = 0.0, True
-    while len(solutions) < settings.passes:
-        solution, warm, anew = _solve(weighted, solver, warm, anew)
-        if solutions and not solution.record.usable:
-            break
-        solutions.append(solution)
-        starts.append(warm)
-        if not solution.record.usable:
-            break
-        before, weighted = weighted.weights, problem.weighted_by(solution.gains)
-        change = weight_change(weighted.weights, before)
-        # Weights of gains that are far from the solution lead away from it.
-        if change < settings.tolerance or solution.record.status == "max-steps":
-            break
-    kept = 0 if settings.passes > 1 and change > RUNAWAY else -1
-    record = _together([solution.record for solution in solutions])
-    if settings.unsettled(change) and record.status == "converged":
-        record = replace(record, status="max-steps", message=unsettled_message(change, len(solutions)))
-    found = solutions[kept]._replace(record=record)
-    return _noted(found, passes=len(solutions), weight_change=change), starts[kept]
+
+    def __init__(self, settings: GainFit, solver: Solver) -> None:
+        self._weights = settings.weights if isinstance(settings.weights, GainWeights) else None
+        self._estimated, self._solver = settings.estimates_deviation, solver
+        self._most = PASSES if self._weights is None else self._weights.passes
+
+    def solve(
+        self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
+    ) -> _Pass:
+        """Solve a problem, whose weights are those of unity gains, and return the last pass.
+
+        The first weights are from the gains of the warm start, or of the problem if it is None, and the first
+        deviations are those given, or of the problem. The record has the times of all passes, their number, the last
+        relative change of the weights, and the deviations with their errors.
+        """
+        gains = problem.initial_gains if warm is None else warm.gains
+        current = self._for_pass(problem, gains, deviations)
+        done: list[_Pass] = []
+        found: Estimate | None = None
+        change, anew = 0.0, True
+        while len(done) < self._most:
+            solution, warm, anew = _solve(current, self._solver, warm, anew)
+            if done and not solution.record.usable:
+                break
+            done.append(_Pass(solution, warm, current.fractions if self._estimated else None))
+            if not solution.record.usable:
+                break
+            # Weights that settle further hardly change an estimate that has settled.
+            if self._estimated and (found is None or not found.settled):
+                found = estimate(current, solution.gains, solution.model)
+            before, current = current, self._for_pass(problem, solution.gains, found and found.deviations)
+            change = 0.0 if self._weights is None else weight_change(current.weights, before.weights)
+            settled = (self._weights is None or change < self._weights.tolerance) and (found is None or found.settled)
+            # What follows from gains that are far from the solution leads away from it.
+            if settled or solution.record.status == "max-steps":
+                break
+        return self._kept(done, change, found)
+
+    def _for_pass(
+        self, problem: CalibrationProblem, gains: np.ndarray, deviations: tuple[float, float] | None
+    ) -> CalibrationProblem:
+        found = problem if self._weights is None else problem.weighted_by(gains)
+        return found if deviations is None else found.with_fractions(deviations)
+
+    def _kept(self, done: Sequence[_Pass], change: float, found: Estimate | None) -> _Pass:
+        """Return the last pass, or the first where weights run away, with what all passes say in its record."""
+        kept = done[0 if len(done) > 1 and change > RUNAWAY else -1]
+        record = _together([one.solution.record for one in done])
+        if self._weights is not None and self._weights.unsettled(change) and record.status == "converged":
+            record = replace(record, status="max-steps", message=unsettled_message(change, len(done)))
+        notes: dict[str, Any] = {"passes": len(done)}
+        if self._weights is not None:
+            notes["weight_change"] = change
+        if found is not None and kept.deviations is not None:
+            notes |= {"deviation": list(kept.deviations), "deviation_error": list(found.error)}
+            if not found.settled and record.status == "converged":
+                record = replace(record, status="max-steps", message=f"{UNSETTLED_DEVIATION} {len(done)} passes")
+        return kept._replace(solution=_noted(kept.solution._replace(record=record), **notes))
 
 
 def _together(records: Sequence[Solve]) -> Solve:
@@ -184,7 +227,7 @@ def _skipped(structure: FitStructure, message: str) -> Solution:
     return Solution(gains, model, Solve("skipped", message, steps=0, seconds=0.0, cpu_seconds=0.0))
 
 
-def _noted(solution: Solution, **diagnostics: float) -> Solution:
+def _noted(solution: Solution, **diagnostics: Any) -> Solution:
     """Return a solution with further diagnostics in its record."""
     record = solution.record
     return solution._replace(record=replace(record, diagnostics={**record.diagnostics, **diagnostics}))

@@ -9,6 +9,7 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import (
     MOST_COUPLED,
+    START_DEVIATION,
     BasisSettings,
     ForegroundFit,
     GainFit,
@@ -167,7 +168,8 @@ def _warm_seconds(settings: GainFit, tolerance: float) -> float:
         return FROZEN_SECONDS
     prior = settings.foreground_prior
     if prior.finite:
-        widest = max(float(prior.deviation), float(prior.shared_deviation))
+        given = (prior.deviation, prior.shared_deviation)
+        widest = max(START_DEVIATION if value == "estimated" else float(value) for value in given)
         return FINITE_SECONDS * max(1.0, widest / FINITE_DEVIATION)
     # No solve takes more than some hundred steps.
     return FREE_SECONDS * max(1.0, (max(tolerance, 1e-6) / FREE_TOLERANCE) ** FREE_POWER)

@@ -225,13 +225,17 @@ def _jacobian(problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSp
 
 
 class GainResponse:
-    """The linear response of the gains to a change of the data, at a solution, (Nants, Nfreqs), complex."""
+    """The linear response of the gains to a change of the data, at a solution, (Nants, Nfreqs), complex.
 
-    def __init__(self, problem: CalibrationProblem, gains: np.ndarray) -> None:
+    `tolerance` is the relative residual of the normal equations.
+    """
+
+    def __init__(self, problem: CalibrationProblem, gains: np.ndarray, tolerance: float = CG_TOLERANCE) -> None:
+        self._tolerance = tolerance
         self._kernels = kernels = compiled(problem.structure, problem.frozen)
         self._antennas, self._shape = problem.structure.antennas.T, gains.shape
         reduced = kernels.reduce(problem, gains)
-        self._unit = reduced.loss_unit
+        self._unit, self._total = reduced.loss_unit, float(np.sum(problem.weights))
         projection = kernels.project(reduced.gains, *reduced.data)
         stronger = kernels.scalar(kernels.dampings.preconditioner)
         if kernels.by_channel:
@@ -240,7 +244,6 @@ class GainResponse:
             inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
         damping = kernels.scalar(kernels.dampings.least)
         self._equations = NormalEquations(projection, reduced.gains, damping, inverse)
-        self._compiled = tf.function(self._solve, autograph=False)
 
     def solve(self, change: np.ndarray) -> np.ndarray:
         """Return the relative change eta of the gains, complex, (Nants, Nfreqs), for a change y of the whitened data.
@@ -248,11 +251,19 @@ class GainResponse:
         `change` is J_g* y, in the unit of the square root of the loss, complex, (Nants, Nfreqs).
         """
         # Inside the kernels the loss has the weighted square of the data for a unit.
-        return pairs.to_complex(self._compiled(pairs.to_pair(change / self._unit, tf.float32)))
+        descent = pairs.to_pair(change / self._unit, tf.float32)
+        eta, _ = self._kernels.solve_graph(self._equations, descent, self._tolerance, CG_ITERATIONS)
+        return pairs.to_complex(eta)
 
-    def _solve(self, descent: tf.Tensor) -> tf.Tensor:
-        eta, _ = self._kernels.solve(self._equations, descent, CG_TOLERANCE, CG_ITERATIONS)
-        return eta
+    def left_of(self, difference: np.ndarray) -> np.ndarray:
+        """Return what a fit of gains and foregrounds leaves of a difference of calibrated data, times D.
+
+        Both are complex, (Nbls, Nfreqs).
+        """
+        tensors = self._kernels.tensors
+        loaded = tensors.load_model(difference, 1.0, tf.float32)
+        left = self._kernels.left_of(self._equations, loaded, self._tolerance, CG_ITERATIONS)
+        return tensors.unload(left, self._total)
 
     def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
         """Return the part of W y that gains absorb, less the foregrounds' response to it, (Nbls, Nfreqs)."""

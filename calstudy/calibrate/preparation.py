@@ -19,10 +19,11 @@ from calstudy.calibrate.problem import (
     FitStructure,
     fitted_baselines,
     make_structure,
+    model_rms,
     repeat_structure,
 )
-from calstudy.calibrate.records import require_parallel_hands
-from calstudy.calibrate.settings import ForegroundFit, GainFit, GainWeights, RedundantStart
+from calstudy.calibrate.records import Solve, require_parallel_hands
+from calstudy.calibrate.settings import START_DEVIATION, ForegroundFit, GainFit, GainWeights, RedundantStart
 from calstudy.calibrate.weights import inverse_variances, make_weights
 from calstudy.instrument.layouts import redundant_groups
 
@@ -93,13 +94,24 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
 
 
 def problem_at(
-    prepared: PreparedFit, settings: GainFit, times: slice, polarization: int, gains: np.ndarray
+    prepared: PreparedFit,
+    settings: GainFit,
+    times: slice,
+    polarization: int,
+    gains: np.ndarray,
+    record: Solve | None = None,
 ) -> CalibrationProblem | str:
-    """Return the problem whose solution are gains (Nants, Nfreqs), with the weights from them, or why there is none."""
+    """Return the problem whose solution are gains (Nants, Nfreqs), or why there is none.
+
+    Weights that come from the gains are those of these gains. Deviations of the foregrounds that were estimated are
+    those in the record of the solve.
+    """
     problem = make_problem(prepared, settings, times, polarization)
-    if isinstance(problem, str) or not isinstance(settings.weights, GainWeights):
+    if isinstance(problem, str):
         return problem
-    return problem.weighted_by(gains)
+    if record is not None and "deviation" in record.diagnostics:
+        problem = problem.with_fractions(record.diagnostics["deviation"])
+    return problem.weighted_by(gains) if isinstance(settings.weights, GainWeights) else problem
 
 
 def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polarization: int) -> CalibrationProblem | str:
@@ -140,10 +152,11 @@ def _deviations(sky: np.ndarray | None, weights: np.ndarray, settings: GainFit) 
     """
     if not isinstance(settings, ForegroundFit) or not settings.foreground_prior.finite or sky is None:
         return math.inf, math.inf
-    prior = settings.foreground_prior
-    rms = float(np.sqrt(np.mean(np.abs(sky[weights > 0]) ** 2)))
-    own, shared = (float(value) * rms for value in (prior.deviation, prior.shared_deviation))
-    return own, shared
+    prior, rms = settings.foreground_prior, model_rms(sky, weights)
+    given = [
+        START_DEVIATION if value == "estimated" else float(value) for value in (prior.deviation, prior.shared_deviation)
+    ]
+    return given[0] * rms, given[1] * rms
 
 
 def _require_finite(data: Observation) -> None:

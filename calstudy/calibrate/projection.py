@@ -341,6 +341,29 @@ class Projector:
             answer = self._answer(stretch, change, part)
         return self._products.pull(change, answer, stretch.ends, part.curvature, part.model)
 
+    def descent_by(self, difference: tf.Tensor, projection: Projection) -> tf.Tensor:
+        """Return half of what the negative gradient gains where data differ by G times `difference`, (2, Nbls, Nfreqs).
+
+        Foregrounds respond. The shape is (2, Nants, Nfreqs).
+        """
+
+        def of_stretch(rows: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+            return self._pulled(part.curvature * rows[:, slice(*stretch.baselines)], stretch, part)
+
+        return self._over_stretches(of_stretch, difference, projection)
+
+    def left_of(self, difference: tf.Tensor, eta: tf.Tensor, projection: Projection) -> tuple[tf.Tensor, ...]:
+        """Return what remains of a difference of the data after gains change by eta and foregrounds respond, times D.
+
+        The difference is (2, Nbls, Nfreqs), in the unit of the foregrounds. Results are those of consecutive stretches.
+        """
+        found = []
+        for stretch, part in zip(self.stretches, projection.parts, strict=True):
+            change = part.curvature * difference[:, slice(*stretch.baselines)]
+            change -= self._products.change(eta, stretch.ends, part.curvature, part.model)
+            found.append(change - part.curvature * self._answer(stretch, change, part))
+        return tuple(found)
+
     def curvature_descent(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return minus the product of the Jacobian with the second derivative of the residual along eta.
 

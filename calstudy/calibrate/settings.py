@@ -213,12 +213,16 @@ def _deviation(value: Any) -> Any:
     """Refuse an invalid deviation in one sentence, where a union of types would have one for each."""
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
         return float(value)
-    if value != "infinite":
-        raise fault("", f"{value!r} is neither a number of at least 0 nor 'infinite'")
+    if value not in ("infinite", "estimated"):
+        raise fault("", f"{value!r} is neither a number of at least 0, nor 'infinite', nor 'estimated'")
     return value
 
 
-Deviation = Annotated[Annotated[float, Field(ge=0)] | Literal["infinite"], BeforeValidator(_deviation)]
+Deviation = Annotated[Annotated[float, Field(ge=0)] | Literal["infinite", "estimated"], BeforeValidator(_deviation)]
+
+
+START_DEVIATION = 0.01
+"""Of the first pass where deviations are estimated, over the rms of the sky model."""
 
 
 class ForegroundPrior(Section):
@@ -228,7 +232,8 @@ class ForegroundPrior(Section):
     deviation: Deviation = Field(
         "infinite",
         description="Standard deviation of what each baseline may have beside the mean, over the rms of the sky model; "
-        "`infinite`: foregrounds are free within the modelled delays; 0: none.",
+        "`infinite`: foregrounds are free within the modelled delays; 0: none; `estimated`: the most likely one, from "
+        "the data of each solve.",
     )
     shared_deviation: Deviation = Field(
         0.0, description="The same for what redundant baselines have in common beside the mean."
@@ -247,6 +252,8 @@ class ForegroundPrior(Section):
             raise fault("shared_deviation", "must be 0 where deviation is infinite, which leaves nothing to share")
         if shared == "infinite" and own != 0:
             raise fault("deviation", "must be 0 where shared_deviation is infinite, or both must be finite")
+        if self.estimated and {own, shared} - {"estimated", 0}:
+            raise fault("shared_deviation", "must be 'estimated' or 0 where deviation is, and the other way round")
         if self.mean == "sky-model" and "infinite" in (own, shared):
             raise fault("mean", "must be none beside an infinite deviation, which leaves it without meaning")
         if self.mean == "none" and "infinite" not in (own, shared):
@@ -256,6 +263,11 @@ class ForegroundPrior(Section):
                 "the gains ever larger",
             )
         return self
+
+    @property
+    def estimated(self) -> bool:
+        """Whether any deviation is estimated from the data."""
+        return "estimated" in (self.deviation, self.shared_deviation)
 
     @property
     def finite(self) -> bool:
@@ -330,6 +342,11 @@ class GainFit(WeightedFit):
         """Whether the foregrounds are the sky model, so that only gains are fitted."""
         return True
 
+    @property
+    def estimates_deviation(self) -> bool:
+        """Whether a deviation of the foregrounds' prior is estimated from the data."""
+        return False
+
 
 ScalePrior = Annotated[
     Literal["sum", "post-hoc", "gains", "sky-model", "none"],
@@ -374,6 +391,11 @@ class ForegroundFit(GainFit):
     def frozen(self) -> bool:
         """Whether the foregrounds are the sky model, because all deviations of the prior are zero."""
         return self.foreground_prior.deviation == 0 and self.foreground_prior.shared_deviation == 0
+
+    @property
+    def estimates_deviation(self) -> bool:
+        """Whether a deviation of the foregrounds' prior is estimated from the data."""
+        return self.foreground_prior.estimated
 
     @property
     def grouped(self) -> bool:

@@ -16,7 +16,16 @@ from calstudy.instrument.size import Size
 from calstudy.power.settings import PowerSettings
 from calstudy.products import calibration, corruption
 from calstudy.products.calibration import Calibrated, prepared_fit
-from calstudy.products.files import DATA, MODEL, integration_times, json_number, read_visibilities, write_json
+from calstudy.products.files import (
+    DATA,
+    MODEL,
+    SOLUTION,
+    integration_times,
+    json_number,
+    read_json,
+    read_visibilities,
+    write_json,
+)
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
@@ -106,13 +115,21 @@ class _Solved(Calibrated):
 
         from calstudy.base.visibilities import antenna_pairs, to_cube
         from calstudy.calibrate.preparation import problem_at
+        from calstudy.calibrate.records import Solve
         from calstudy.products.selection import read_gains
 
         data, sky, noise = self.read(self.times)
         prepared = prepared_fit(self.calibrator, data, sky, noise)
         fitted = read_gains(self.calibration)
         gains = fitted.at(self.integration, prepared.data.numbers)
-        problem = problem_at(prepared, self.calibrator, slice(0, 1), 0, gains)
+        records = map(Solve.from_json, read_json(self.calibration / SOLUTION)["records"])
+        record = next(
+            found
+            for found in records
+            if found.polarization == data.polarization_array[0]
+            and found.integration <= self.integration < found.integration + found.n_integrations
+        )
+        problem = problem_at(prepared, self.calibrator, slice(0, 1), 0, gains, record)
         if isinstance(problem, str) or fitted.flags[self.integration].any():
             return None
         model = read_visibilities(self.calibration / MODEL, self.times)

@@ -105,9 +105,11 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
             times = slice(solve.integration, solve.integration + solve.n_integrations)
             place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
             gains = result.gains.gain_array[rows, :, times.start, place]
-            problem = problem_at(prepared, settings, times, place, gains) if solve.usable else "the solve gave no gains"
+            problem = problem_at(prepared, settings, times, place, gains, solve)
             found: GainErrors | str
-            if isinstance(problem, str):
+            if not solve.usable:
+                found = "the solve gave no gains"
+            elif isinstance(problem, str):
                 found = problem
             elif solve.diagnostics.get("weight_change", 0) > RUNAWAY:
                 # The gains are those of an earlier pass, whose weights are not known.

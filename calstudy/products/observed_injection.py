@@ -335,7 +335,7 @@ class _OfData(Task):
         order = np.argsort(result.gains.ant_array)
         rows = order[np.searchsorted(result.gains.ant_array, prepared.data.numbers, sorter=order)]
         gains = result.gains.gain_array[rows, :, times.start, polarization]
-        problem = problem_at(prepared, self.calibrator, times, polarization, gains)
+        problem = problem_at(prepared, self.calibrator, times, polarization, gains, record)
         if isinstance(problem, str):
             return None
         model = to_cube(result.model)[times, :, :, polarization].reshape(problem.visibilities.shape)

@@ -121,8 +121,9 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors, of known size, fill the modelled delays of each baseline."""
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
-    # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    version: ClassVar[int] = 3
+    # Weights are inverse variances since 3 where some samples have no weight and are not flagged. Those from the gains
+    # are since 4: the mean variance is that of the noise.
+    version: ClassVar[int] = 4
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -134,8 +135,9 @@ class Unified(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors are common to redundant baselines, but for a smaller part."""
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
-    # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    version: ClassVar[int] = 3
+    # Weights are inverse variances since 3 where some samples have no weight and are not flagged. Those from the gains
+    # are since 4: the mean variance is that of the noise.
+    version: ClassVar[int] = 4
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"

@@ -202,6 +202,8 @@ class ReducedKernels:
         self.blocks = as_graph(self._blocks)
         self._antenna_inverse = as_graph(self._inverse)
         self.accelerate = as_graph(self._accelerate)
+        self.solve_graph = as_graph(self.solve)
+        self.left_of = as_graph(self._left_of)
         self.predicted_decrease = as_graph(self._predicted_decrease)
 
     def _can_couple(self) -> bool:
@@ -296,6 +298,15 @@ class ReducedKernels:
             tf.constant(iterations),
         )
         return self.space.expand_relative(coordinates, gains), count
+
+    def _left_of(
+        self, equations: NormalEquations, difference: tf.Tensor, tolerance: float, iterations: int
+    ) -> tuple[tf.Tensor, ...]:
+        """Return what a fit leaves of a difference of the data, times D (`Projector.left_of`)."""
+        projection = equations.projection
+        descent = self.projector.descent_by(difference, projection)
+        eta, _ = self.solve(equations, descent, tolerance, iterations)
+        return self.projector.left_of(difference, eta, projection)
 
     def _blocks(self, projection: Projection) -> AntennaBlocks | CoupledBlocks:
         if isinstance(self.projector, FrozenForegrounds):

@@ -1,0 +1,131 @@
+"""The deviation of the foregrounds' prior from the data themselves, by restricted maximum likelihood.
+
+In units in which the noise is white, data that are linearized about the best gains are
+
+    y = J eta + sum_k B_k x_k + n,
+
+where J is the Jacobian of the gains, B_k x_k are errors of the sky model with coefficients x_k of unit variance, of
+each baseline by itself and common to redundant ones, and n is the noise. Gains are free, so that the likelihood of the
+variances is that of what gains cannot follow (Patterson & Thompson 1971, Biometrika 58, 545). With M as in
+`calstudy.calibrate.expected_loss`, its derivative in a factor f_k on the variance of x_k is, at f_k = 1,
+
+    |B_k^T M y|^2 - tr(B_k^T M B_k),
+
+and the Fisher matrix is F_kl = tr(B_k^T M B_l B_l^T M B_k). The residual of the fit is M y, and B_k^T M y are the
+fitted coefficients. So a fit estimates its own prior: coefficients that are larger than their expectation ask for a
+larger deviation. Where data determine all coefficients, the best factor is the ratio of both terms; where they
+determine few, it is further away. A step
+
+    ln f = F^-1 diag(t) ln(|B_k^T M y|^2 / t_k),   t_k = tr(B_k^T M B_k),
+
+is exact in the first case and a step of Fisher scoring near the maximum. F^-1 is the covariance of ln f there. Traces
+are from random x (Hutchinson 1990, Commun. Stat. Simul. Comput. 19, 433), of which two add little to that error.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from calstudy.calibrate.expected_loss import GainResponse
+from calstudy.calibrate.problem import CalibrationProblem, gain_products
+
+LEAST, MOST = 1e-6, 1.0
+"""Limits of the deviation, over the rms of the sky model: where it has no effect, and where the sky model has none."""
+FURTHEST = math.log(100)
+"""Largest change of the logarithm of a variance in a step."""
+FAR_BELOW = -0.7
+"""Steps down to noise are short of it, and are doubled from here on."""
+PROBES = 2
+SEED = 0
+TOLERANCE = 1e-2
+"""Of the gains' response to a probe: traces have an error of some percent in any case."""
+SETTLED = 0.05
+"""Increase of the logarithm of the likelihood from which on another pass is made: that of a step of 0.3 errors."""
+PASSES = 10
+"""Largest number of passes where weights need none."""
+
+
+class Estimate(NamedTuple):
+    """Deviations of the prior, (own, shared), over the rms of the sky model.
+
+    `error` is that of the logarithm of each, and `settled` says whether another pass would not change them.
+    """
+
+    deviations: tuple[float, float]
+    error: tuple[float, float]
+    settled: bool
+
+
+def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) -> Estimate:
+    """Make one step from the deviations of a problem towards the most likely ones, at its solution.
+
+    Parameters
+    ----------
+    problem
+        The fitted problem, whose foregrounds have a finite prior.
+    gains, model
+        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
+    """
+    response, sequences = GainResponse(problem, gains, TOLERANCE), _Sequences(problem)
+    products, rng = gain_products(gains, problem.structure.antennas), np.random.default_rng(SEED)
+    residual = problem.weights * np.abs(products) ** 2 * (problem.visibilities / products - model)
+    powers = np.array([_power(found) for found in sequences.coefficients(residual)])
+    traces, fisher = np.zeros(len(powers)), np.zeros((len(powers), len(powers)))
+    for _ in range(PROBES):
+        for level in range(len(powers)):
+            drawn = sequences.draw(level, rng)
+            left = response.left_of(drawn)
+            traces[level] += np.vdot(drawn, left).real / PROBES
+            fisher[level] += [_power(found) / PROBES for found in sequences.coefficients(left)]
+    covariance = np.linalg.pinv((fisher + fisher.T) / 2)
+    change = covariance @ (traces * np.log(powers / traces))
+    change = np.clip(np.where(change < FAR_BELOW, 2 * change, change), -FURTHEST, FURTHEST)
+    deviations, errors = [0.0, 0.0], [0.0, 0.0]
+    for place, level in enumerate(sequences.levels):
+        deviations[level] = min(max(problem.fractions[level] * math.exp(change[place] / 2), LEAST), MOST)
+        errors[level] = math.sqrt(covariance[place, place]) / 2
+    # Where the most likely variance is below zero, it shrinks forever, to less and less effect.
+    gained = float((powers - traces) @ change) / 2
+    return Estimate((deviations[0], deviations[1]), (errors[0], errors[1]), gained < SETTLED)
+
+
+def _power(values: list[np.ndarray]) -> float:
+    return float(sum(np.sum(np.abs(part) ** 2) for part in values))
+
+
+class _Sequences:
+    """The sequences A_k of errors of the sky model, where B_k = sqrt(D) A_k, in the unit of the data.
+
+    They are (0) of each baseline by itself, (1) common to those of a model. `levels` are those that the prior has.
+    """
+
+    def __init__(self, problem: CalibrationProblem) -> None:
+        structure = problem.structure
+        self.levels = {"own": [0], "shared": [1], "both": [0, 1]}[structure.prior]
+        self._deviations, self._conjugated = problem.deviations, structure.conjugated[:, None]
+        self._models = [
+            (np.flatnonzero(structure.groups == index), bucket.vectors)
+            for bucket in structure.basis.buckets
+            for index in bucket.members
+        ]
+
+    def coefficients(self, weighted: np.ndarray) -> list[list[np.ndarray]]:
+        """Return A_k^T of values times D, (Nbls, Nfreqs), for each level k: an array for each model."""
+        turned = np.where(self._conjugated, weighted.conj(), weighted)
+        own = [turned[members] @ vectors for members, vectors in self._models]
+        return [
+            [self._deviations[level] * (part.sum(axis=0) if level else part) for part in own] for level in self.levels
+        ]
+
+    def draw(self, place: int, rng: np.random.Generator) -> np.ndarray:
+        """Return A_k x of white x, E|x|^2 = 1, complex, (Nbls, Nfreqs), for the k at a place in `levels`."""
+        level = self.levels[place]
+        found = np.zeros((len(self._conjugated), len(self._models[0][1])), complex)
+        for members, vectors in self._models:
+            shape = (2, 1 if level else members.size, vectors.shape[1])
+            real, imaginary = rng.standard_normal(shape) * (self._deviations[level] / math.sqrt(2))
+            found[members] = (real + 1j * imaginary) @ vectors.T
+        return np.where(self._conjugated, found.conj(), found)
