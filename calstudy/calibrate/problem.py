@@ -205,19 +205,13 @@ class CalibrationProblem:
         return None if self.structure.prior == "none" else self.sky_model
 
     def weighted_by(self, gains: np.ndarray) -> CalibrationProblem:
-        """Divide the weights by |g_a g_b|^2 of gains (Nants, Nfreqs).
-
-        Their sum is kept, or, where they are inverse variances, for a finite prior, the mean variance: the level of the
-        noise is known, and that of single samples is not.
-        """
+        """Divide the weights by |g_a g_b|^2 of gains (Nants, Nfreqs), and keep their sum."""
         weights = gain_weights(self.weights, gain_products(gains, self.structure.antennas))
-        if self.structure.prior != "none":
-            weights *= _mean_variance(weights) / _mean_variance(self.weights)
         return replace(self, weights=weights, scale_weights=self.summing)
 
     @property
     def _sky_rms(self) -> float:
-        return model_rms(self.sky_model, self.weights)
+        return 0.0 if self.sky_model is None else model_rms(self.sky_model, self.weights)
 
     @property
     def fractions(self) -> tuple[float, float]:
@@ -255,10 +249,6 @@ class CalibrationProblem:
 def model_rms(model: np.ndarray, weights: np.ndarray) -> float:
     """Return the rms of a model over samples with weight."""
     return float(np.sqrt(np.mean(np.abs(model[weights > 0]) ** 2)))
-
-
-def _mean_variance(weights: np.ndarray) -> float:
-    return float(np.mean(1 / weights[weights > 0]))
 
 
 def fitted_baselines(frame: Frame, autos: bool) -> np.ndarray:

@@ -121,9 +121,8 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors, of known size, fill the modelled delays of each baseline."""
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
-    # Weights are inverse variances since 3 where some samples have no weight and are not flagged. Those from the gains
-    # are since 4: the mean variance is that of the noise.
-    version: ClassVar[int] = 4
+    # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
+    version: ClassVar[int] = 3
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -135,11 +134,20 @@ class Unified(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors are common to redundant baselines, but for a smaller part."""
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
-    # Weights are inverse variances since 3 where some samples have no weight and are not flagged. Those from the gains
-    # are since 4: the mean variance is that of the noise.
-    version: ClassVar[int] = 4
+    # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
+    version: ClassVar[int] = 3
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
     # At the default tolerance the foreground residual exceeds the EoR near the wedge.
+    solver: Solver = GaussNewtonSettings(tolerance=1e-5)
+
+
+class EmpiricalBayes(_LeastSquares, ForegroundFit):
+    """Gains are fitted with a sky model whose errors fill the modelled delays; their size is estimated from the data."""
+
+    calibrator: str = "empirical-bayes"
+    foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
+    prior: ScalePrior = "sky-model"
+    # As for a given deviation.
     solver: Solver = GaussNewtonSettings(tolerance=1e-5)

@@ -302,7 +302,9 @@ class ReducedKernels:
     def _left_of(
         self, equations: NormalEquations, difference: tf.Tensor, tolerance: float, iterations: int
     ) -> tuple[tf.Tensor, ...]:
-        """Return what a fit leaves of a difference of the data, times D (`Projector.left_of`)."""
+        """Return what a fit with foregrounds leaves of a difference of the data, times D (`Projector.left_of`)."""
+        if isinstance(self.projector, FrozenForegrounds):
+            raise TypeError("known foregrounds have no prior")
         projection = equations.projection
         descent = self.projector.descent_by(difference, projection)
         eta, _ = self.solve(equations, descent, tolerance, iterations)
