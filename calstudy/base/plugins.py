@@ -111,8 +111,8 @@ class Registry(Kinds[P]):
     tag
         The field of an experiment file that contains the name.
     families
-        Whether a module may have several classes, and a class several names (`Plugin.names`). The modules are then
-        imported to know them.
+        Whether a module may have several classes or none, and a class several names (`Plugin.names`). Names that are
+        defaults of the tag are read from the text of the modules, without importing them.
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:
@@ -142,15 +142,31 @@ class Registry(Kinds[P]):
     @cached_property
     def _modules(self) -> dict[str, str]:
         """The modules of the built-in plug-ins, by name."""
-        found = [module.name for module in pkgutil.iter_modules(import_module(self.package).__path__)]
-        names = {name.replace("_", "-"): f"{self.package}.{name}" for name in found if not name.startswith("_")}
         if not self.families:
-            return dict(sorted(names.items()))
-        for own, module in names.items():
-            for thing in self._things(import_module(module)).values():
-                self._found |= dict.fromkeys(thing.names() or (own,), thing)
-        ordered = sorted(self._found, key=lambda name: next(iter(self._found[name].names()), name))
-        return {name: self._found[name].__module__ for name in ordered}
+            return {named_after(module): module for module in sorted(self._texts)}
+        declared = self.declared(self.tag)
+        found: list[tuple[tuple[str, ...], str]] = [((name,), module) for name, module in declared.items()]
+        for module, text in self._texts.items():
+            # Without the module of the base class there is none of its subclasses.
+            if module not in declared.values() and self.base_path.partition(":")[0] in text:
+                things = self._things(import_module(module)).values()
+                found += [(thing.names() or (named_after(module),), module) for thing in things]
+        return {name: module for names, module in sorted(found) for name in names}
+
+    @cached_property
+    def _texts(self) -> dict[str, str]:
+        """The source of each module that may have built-in plug-ins."""
+        found = {}
+        for _, name, is_package in pkgutil.iter_modules(import_module(self.package).__path__):
+            if not name.startswith("_"):
+                source = pkgutil.get_data(self.package, f"{name}/__init__.py" if is_package else f"{name}.py") or b""
+                found[f"{self.package}.{name}"] = source.decode()
+        return found
+
+    def declared(self, field: str) -> dict[str, str]:
+        """Return the modules of built-in classes that give a field a text, by this text; none of them is imported."""
+        line = re.compile(rf'^    {field}(?:: .+)? = "([^"]+)"$', flags=re.MULTILINE)
+        return {value: module for module, text in self._texts.items() for value in line.findall(text)}
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""
@@ -169,7 +185,7 @@ class Registry(Kinds[P]):
             return self._in(load_file(Path(file["path"])), reference, file["name"])
         if reference in self._modules:
             if reference not in self._found:
-                self._found[reference] = self._in(import_module(self._modules[reference]), reference)
+                self._found[reference] = self._built_in(reference)
             return self._found[reference]
         if reference in (installed := self.installed()):
             with user_code(reference):
@@ -181,9 +197,8 @@ class Registry(Kinds[P]):
 
     def reference_of(self, thing: type[P]) -> str:
         """Return the name or path by which `find` finds a class, or its bare name if it is in no file."""
-        package, _, name = thing.__module__.rpartition(".")
-        if package == self.package:
-            return next(iter(thing.names()), name.replace("_", "-"))
+        if thing.__module__.rpartition(".")[0] == self.package:
+            return next(iter(thing.names()), named_after(thing.__module__))
         for point in self.installed().values():
             if point.module == thing.__module__ and point.attr in ("", thing.__name__):
                 return point.name
@@ -191,6 +206,13 @@ class Registry(Kinds[P]):
             return f"{inspect.getfile(thing)}:{thing.__name__}"
         except (TypeError, OSError):
             return thing.__name__
+
+    def _built_in(self, name: str) -> type[P]:
+        module = import_module(self._modules[name])
+        if not self.families:
+            return self._in(module, name)
+        things = self._things(module).values()
+        return next(thing for thing in things if name in (thing.names() or (named_after(module.__name__),)))
 
     def _in(self, module: ModuleType, reference: str, name: str | None = None) -> type[P]:
         """Return the only class that a module defines, or the one of this name."""
@@ -251,6 +273,11 @@ class Registry(Kinds[P]):
         if point is None or point.dist is None:
             return reference
         return f"{point.dist.name}=={point.dist.version}:{reference}"
+
+
+def named_after(module: str) -> str:
+    """Return the name of a plug-in that has the name of its module."""
+    return module.rpartition(".")[2].replace("_", "-")
 
 
 def digest_file(path: Path) -> str:

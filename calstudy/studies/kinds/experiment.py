@@ -30,7 +30,7 @@ from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit, require_data_fit
 from calstudy.studies.preflight import frame_of, notes_of, require_possible
-from calstudy.studies.study import Study, built_in_kinds
+from calstudy.studies.study import Study, kinds_marked_by
 
 SKY_MODEL_TABLE = "sky-model.csv"
 AS_BUILT_TABLE = "as-built.csv"
@@ -239,8 +239,8 @@ def content_of(experiment: Experiment) -> Any:
 
 def study_of(experiment: Experiment) -> Study:
     """Return the study of an experiment: of the kind whose key it has, such as `sweep`."""
-    special: list[Any] = [kind for kind in built_in_kinds() if kind.model is Experiment and kind.key]
-    return next((kind for kind in special if getattr(experiment, kind.key)), ExperimentStudy).of(experiment)
+    special: list[Any] = kinds_marked_by([name for name, value in experiment if value])
+    return (special[0] if special else ExperimentStudy).of(experiment)
 
 
 def describe_setup(experiment: Experiment) -> str:
