@@ -16,7 +16,7 @@ import pkgutil
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cached_property, lru_cache
@@ -143,14 +143,14 @@ class Registry(Kinds[P]):
     def _modules(self) -> dict[str, str]:
         """The modules of the built-in plug-ins, by name."""
         if not self.families:
-            return {named_after(module): module for module in sorted(self._texts)}
-        declared = self.declared(self.tag)
-        found: list[tuple[tuple[str, ...], str]] = [((name,), module) for name, module in declared.items()]
+            return {_named_after(module): module for module in sorted(self._texts)}
+        found: list[tuple[tuple[str, ...], str]] = [((name,), module) for name, module in self._declared(self.tag)]
+        known = {module for _, module in found}
         for module, text in self._texts.items():
             # Without the module of the base class there is none of its subclasses.
-            if module not in declared.values() and self.base_path.partition(":")[0] in text:
+            if module not in known and self.base_path.partition(":")[0] in text:
                 things = self._things(import_module(module)).values()
-                found += [(thing.names() or (named_after(module),), module) for thing in things]
+                found += [(thing.names() or (_named_after(module),), module) for thing in things]
         return {name: module for names, module in sorted(found) for name in names}
 
     @cached_property
@@ -163,10 +163,16 @@ class Registry(Kinds[P]):
                 found[f"{self.package}.{name}"] = source.decode()
         return found
 
-    def declared(self, field: str) -> dict[str, str]:
-        """Return the modules of built-in classes that give a field a text, by this text; none of them is imported."""
+    def _declared(self, field: str) -> list[tuple[str, str]]:
+        """Return the texts that built-in classes give a field, each with the module."""
         line = re.compile(rf'^    {field}(?:: .+)? = "([^"]+)"$', flags=re.MULTILINE)
-        return {value: module for module, text in self._texts.items() for value in line.findall(text)}
+        return [(value, module) for module, text in self._texts.items() for value in line.findall(text)]
+
+    def marked(self, field: str, texts: Container[str]) -> list[type[P]]:
+        """Return the built-in classes that give a field one of these texts; modules of others are not imported."""
+        modules = dict.fromkeys(module for text, module in self._declared(field) if text in texts)
+        things = [thing for module in modules for thing in self._things(import_module(module)).values()]
+        return [thing for thing in things if getattr(thing, field) in texts]
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""
@@ -198,7 +204,7 @@ class Registry(Kinds[P]):
     def reference_of(self, thing: type[P]) -> str:
         """Return the name or path by which `find` finds a class, or its bare name if it is in no file."""
         if thing.__module__.rpartition(".")[0] == self.package:
-            return next(iter(thing.names()), named_after(thing.__module__))
+            return next(iter(thing.names()), _named_after(thing.__module__))
         for point in self.installed().values():
             if point.module == thing.__module__ and point.attr in ("", thing.__name__):
                 return point.name
@@ -212,7 +218,7 @@ class Registry(Kinds[P]):
         if not self.families:
             return self._in(module, name)
         things = self._things(module).values()
-        return next(thing for thing in things if name in (thing.names() or (named_after(module.__name__),)))
+        return next(thing for thing in things if name in (thing.names() or (_named_after(module.__name__),)))
 
     def _in(self, module: ModuleType, reference: str, name: str | None = None) -> type[P]:
         """Return the only class that a module defines, or the one of this name."""
@@ -231,7 +237,7 @@ class Registry(Kinds[P]):
     def _is_thing(self, value: Any, module: ModuleType) -> bool:
         if not (inspect.isclass(value) and issubclass(value, self.base)) or inspect.isabstract(value):
             return False
-        return value.__module__ == module.__name__ and not value.__name__.startswith("_")
+        return value is not self.base and value.__module__ == module.__name__ and not value.__name__.startswith("_")
 
     def _checked(self, found: type, reference: str) -> type[P]:
         if not issubclass(found, self.base):
@@ -275,8 +281,7 @@ class Registry(Kinds[P]):
         return f"{point.dist.name}=={point.dist.version}:{reference}"
 
 
-def named_after(module: str) -> str:
-    """Return the name of a plug-in that has the name of its module."""
+def _named_after(module: str) -> str:
     return module.rpartition(".")[2].replace("_", "-")
 
 

@@ -24,6 +24,7 @@ from calstudy.products.files import (
 )
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.measured import marked, why_not_measured
 
@@ -81,6 +82,17 @@ def _flux_scale(graph: Graph) -> Task:
     even, odd = (calibration.calibration(graph, residual, parity) for parity in PARITIES)
     gains = corruption.gains(graph) if residual.effects else None
     return FluxScale("flux scale", taper=graph.experiment.power.taper, even=even, odd=odd, gains=gains)
+
+
+class TransferTable(StudyTable):
+    """The signal loss."""
+
+    of = "experiment"
+    place = 3
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [transfer(graph)]
 
 
 class Difference(Task, stage="difference", version=2):

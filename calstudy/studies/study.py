@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 from rich.console import Console
 
 from calstudy.base.files import digest_json
-from calstudy.base.plugins import Registry, named_after
+from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
 from calstudy.base.table import to_json
 from calstudy.experiment.files import StudyFile, dump
@@ -281,13 +281,8 @@ def kind_of(content: Mapping[str, Any], folder: Path | None = None) -> type[Stud
     """Return the kind of study of a file; a path of the key `study` starts at `folder`. InputError if there is none."""
     if KINDS.tag in content:
         return KINDS.class_of(content, None, folder)[0]
-    marked = [kind for kind in kinds_marked_by(content) if kind.model is not Experiment]
+    marked = [kind for kind in KINDS.marked("key", content) if kind.model is not Experiment]
     return marked[0] if marked else KINDS.find("experiment")
-
-
-def kinds_marked_by(keys: Container[str]) -> list[type[Study]]:
-    """Return the built-in kinds of study that are marked by one of these keys; others are not imported."""
-    return [KINDS.find(named_after(module)) for key, module in KINDS.declared("key").items() if key in keys]
 
 
 def make(
