@@ -12,7 +12,6 @@ import ast
 import hashlib
 import importlib.util
 import inspect
-import pkgutil
 import re
 import sys
 import traceback
@@ -156,12 +155,10 @@ class Registry(Kinds[P]):
     @cached_property
     def _texts(self) -> dict[str, str]:
         """The source of each module that may have built-in plug-ins."""
-        found = {}
-        for _, name, is_package in pkgutil.iter_modules(import_module(self.package).__path__):
-            if not name.startswith("_"):
-                source = pkgutil.get_data(self.package, f"{name}/__init__.py" if is_package else f"{name}.py") or b""
-                found[f"{self.package}.{name}"] = source.decode()
-        return found
+        folder = Path(import_module(self.package).__path__[0])
+        paths = sorted([*folder.glob("[!_]*.py"), *folder.glob("[!_]*/__init__.py")])
+        names = [path.parent.name if path.stem == "__init__" else path.stem for path in paths]
+        return {f"{self.package}.{name}": path.read_text("utf-8") for name, path in zip(names, paths, strict=True)}
 
     def _declared(self, field: str) -> list[tuple[str, str]]:
         """Return the texts that built-in classes give a field, each with the module."""

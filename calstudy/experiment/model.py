@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
@@ -38,13 +38,6 @@ VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 Figures = Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)]
 StudyTables = Annotated[tuple[Annotated[SerializeAsAny[Plugin], TABLES.field()], ...], Field(strict=False)]
 Papers = Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)]
-
-
-class Refusing(Protocol):
-    """The interface of an experiment to its figures and tables: `calstudy.figures.StudyFigure` and `StudyTable`."""
-
-    def refusal(self, experiment: Experiment) -> str | None:
-        """Return why an experiment cannot have the figure or table, to follow its name, or None."""
 
 
 class Variant(Section):
@@ -309,7 +302,7 @@ class Experiment(Section):
             labels.append(thing.label)
             try:
                 with guarded(thing):
-                    refusal = cast(Refusing, thing).refusal(self)
+                    refusal = thing.refusal(self)
             except InputError as error:
                 raise fault(path, str(error)) from None
             if refusal is not None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
+from calstudy.power.score import BANDS, CalibratedSpectra, Score, difference
 from calstudy.products import score, spectra
 from calstudy.products.files import json_number, read_json
 from calstudy.products.graph import size_of
@@ -18,9 +19,6 @@ from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance,
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.measured import is_measured, marked
 from calstudy.verdicts.standing import answers, standing_table, standings
-
-if TYPE_CHECKING:
-    from calstudy.power.score import CalibratedSpectra, Score
 
 CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
@@ -93,7 +91,6 @@ def read_cases(
 
 
 def _read(folder: Path) -> Case:
-    from calstudy.power.score import Score
     from calstudy.power.tables import load_spectrum
 
     bins, bands = (load_spectrum(folder / name, Score) for name in (score.BINS, score.BANDS))
@@ -157,8 +154,6 @@ class Comparison(Task, stage="comparison", version=4):
         calibrator of the cases `found` in a world, there is for each band what ``best`` is called, and ``transfer``
         and ``bias`` with errors; None if not known.
         """
-        from calstudy.power.score import BANDS, difference
-
         row = self.worlds.index(world)
         names = {name: case_name(row, place) for place, name in enumerate(self.calibrators) if name in found}
         scales = {name: float(case.bands.flux_scale) for name, case in found.items()}
@@ -178,7 +173,6 @@ class Comparison(Task, stage="comparison", version=4):
         return result
 
     def _spectra(self, case: str) -> CalibratedSpectra:
-        from calstudy.power.score import CalibratedSpectra
 
         folders = {name: self.cases[f"{case}:{name}"] for name in score.SPECTRA}
         return CalibratedSpectra(**{name: spectra.read_delay_spectra(folder) for name, folder in folders.items()})

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube, rows_of, to_cube
 from calstudy.calibrate.settings import GainFit
+from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products.calibration import prepared_fit, read_result
 from calstudy.products.expected_loss import EXPECTED, LABEL, NOT_OF_THE_FIT, PROBES, binned
 from calstudy.products.files import (
@@ -150,7 +152,6 @@ class SimulateEor(Task, stage="observed-eor", version=3):
         """Write the EoR to visibilities.uvh5."""
         import numpy as np
 
-        from calstudy.base.visibilities import antenna_pairs, from_cube
         from calstudy.instrument.beams import make_beam
         from calstudy.instrument.interface import model_of
         from calstudy.instrument.telescope import subset_template
@@ -240,7 +241,6 @@ class Inject(Added, stage="inject", version=1):
         from pyuvdata import UVCal
 
         from calstudy.base.gains import gain_products
-        from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 
         data, sky = read_visibilities(self.data / DATA), self.signal()
         pairs = antenna_pairs(sky)
@@ -259,7 +259,6 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the average to average.uvh5."""
-        from calstudy.base.visibilities import antenna_pairs, from_cube, rows_of, to_cube
         from calstudy.power.average import average_in_blocks
 
         residual, sky = crosses_of(read_visibilities(self.calibration / RESIDUAL)), self.signal()
@@ -279,7 +278,6 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=4, cost=Cost
         from calstudy.power.binned import spherical_average
         from calstudy.power.errors import with_errors
         from calstudy.power.spectra import SphericalSpectrum
-        from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 
         found = self.read()
         # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
@@ -332,7 +330,6 @@ class _OfData(Task):
         """
         import numpy as np
 
-        from calstudy.base.visibilities import to_cube
         from calstudy.calibrate.expected_loss import DENSE, DelayModes, jacobian_size
         from calstudy.calibrate.expected_loss import expected_transfer as expected_of
         from calstudy.calibrate.preparation import problem_at
@@ -367,9 +364,6 @@ class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=2):
         """Write the expected T in bins of k and of length and delay."""
         import numpy as np
 
-        from calstudy.base.visibilities import baseline_vectors
-        from calstudy.power.tables import save_spectrum
-
         result = read_result(self.calibration)
         found = self.expect(result, 0, self.power.taper)
         if found is None:
@@ -386,7 +380,6 @@ class ExpectedTransfers(_OfData, stage="expected-transfer", version=1):
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the transfer function of every polarization that has solutions to a file of its own."""
         from calstudy.calibrate.expected_loss import TAPER
-        from calstudy.power.tables import save_spectrum
 
         result = read_result(self.calibration)
         for index, name in enumerate(result.model.get_pols()):

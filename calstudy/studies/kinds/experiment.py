@@ -37,6 +37,7 @@ class ExperimentStudy(Study):
     """One validated experiment; `folder` is its run folder if another study decides it."""
 
     model = Experiment
+    keeps_tables = True
 
     def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
         self.file = self.experiment = experiment
@@ -99,11 +100,6 @@ class ExperimentStudy(Study):
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
         return tables_of("experiment", self.graph, self.experiment.outputs.tables)
-
-    @property
-    def kept_tables(self) -> list[Task]:
-        """All tables: a collection needs no more of a member."""
-        return self.tables
 
     @cached_property
     def claims(self) -> Task | None:
