@@ -13,14 +13,14 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
 from calstudy.power.score import BANDS, CalibratedSpectra, Score, difference
 from calstudy.products import score, spectra
-from calstudy.products.files import json_number, read_json
+from calstudy.products.files import COMPARISON, json_number, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.measured import is_measured, marked
 from calstudy.verdicts.standing import answers, standing_table, standings
 
-CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
+CSV, MARKDOWN = "comparison.csv", "comparison.md"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
 """What is compared in bands of k, and how it is headed."""
 NOTE = (
@@ -138,13 +138,13 @@ class Comparison(Task, stage="comparison", version=4):
             for world, found in cases.items()
         }
         text = json.dumps(summaries, indent=1, ensure_ascii=False, allow_nan=False)
-        (output / JSON).write_text(text + "\n", encoding="utf-8")
+        (output / COMPARISON).write_text(text + "\n", encoding="utf-8")
         (output / MARKDOWN).write_text(_markdown(self, cases, less, summaries), encoding="utf-8")
         return {}
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return the scores of all calibrators, a table for each world."""
-        found = {world: cases for world, cases in read_json(folder / JSON).items() if cases}
+        found = {world: cases for world, cases in read_json(folder / COMPARISON).items() if cases}
         return [replace(score_table(cases), title=f"Scores: {world}", note=NOTE) for world, cases in found.items()]
 
     def differences(self, world: str, found: Mapping[str, Case]) -> dict[str, list[dict[str, Any]]]:
