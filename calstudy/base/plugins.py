@@ -12,11 +12,10 @@ import ast
 import hashlib
 import importlib.util
 import inspect
-import pkgutil
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cached_property, lru_cache
@@ -111,8 +110,8 @@ class Registry(Kinds[P]):
     tag
         The field of an experiment file that contains the name.
     families
-        Whether a module may have several classes, and a class several names (`Plugin.names`). The modules are then
-        imported to know them.
+        Whether a module may have several classes or none, and a class several names (`Plugin.names`). Names that are
+        defaults of the tag are read from the text of the modules, without importing them.
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:
@@ -142,15 +141,35 @@ class Registry(Kinds[P]):
     @cached_property
     def _modules(self) -> dict[str, str]:
         """The modules of the built-in plug-ins, by name."""
-        found = [module.name for module in pkgutil.iter_modules(import_module(self.package).__path__)]
-        names = {name.replace("_", "-"): f"{self.package}.{name}" for name in found if not name.startswith("_")}
         if not self.families:
-            return dict(sorted(names.items()))
-        for own, module in names.items():
-            for thing in self._things(import_module(module)).values():
-                self._found |= dict.fromkeys(thing.names() or (own,), thing)
-        ordered = sorted(self._found, key=lambda name: next(iter(self._found[name].names()), name))
-        return {name: self._found[name].__module__ for name in ordered}
+            return {_named_after(module): module for module in sorted(self._texts)}
+        found: list[tuple[tuple[str, ...], str]] = [((name,), module) for name, module in self._declared(self.tag)]
+        known = {module for _, module in found}
+        for module, text in self._texts.items():
+            # Without the module of the base class there is none of its subclasses.
+            if module not in known and self.base_path.partition(":")[0] in text:
+                things = self._things(import_module(module)).values()
+                found += [(thing.names() or (_named_after(module),), module) for thing in things]
+        return {name: module for names, module in sorted(found) for name in names}
+
+    @cached_property
+    def _texts(self) -> dict[str, str]:
+        """The source of each module that may have built-in plug-ins."""
+        folder = Path(import_module(self.package).__path__[0])
+        paths = sorted([*folder.glob("[!_]*.py"), *folder.glob("[!_]*/__init__.py")])
+        names = [path.parent.name if path.stem == "__init__" else path.stem for path in paths]
+        return {f"{self.package}.{name}": path.read_text("utf-8") for name, path in zip(names, paths, strict=True)}
+
+    def _declared(self, field: str) -> list[tuple[str, str]]:
+        """Return the texts that built-in classes give a field, each with the module."""
+        line = re.compile(rf'^    {field}(?:: .+)? = "([^"]+)"$', flags=re.MULTILINE)
+        return [(value, module) for module, text in self._texts.items() for value in line.findall(text)]
+
+    def marked(self, field: str, texts: Container[str]) -> list[type[P]]:
+        """Return the built-in classes that give a field one of these texts; modules of others are not imported."""
+        modules = dict.fromkeys(module for text, module in self._declared(field) if text in texts)
+        things = [thing for module in modules for thing in self._things(import_module(module)).values()]
+        return [thing for thing in things if getattr(thing, field) in texts]
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""
@@ -169,7 +188,7 @@ class Registry(Kinds[P]):
             return self._in(load_file(Path(file["path"])), reference, file["name"])
         if reference in self._modules:
             if reference not in self._found:
-                self._found[reference] = self._in(import_module(self._modules[reference]), reference)
+                self._found[reference] = self._built_in(reference)
             return self._found[reference]
         if reference in (installed := self.installed()):
             with user_code(reference):
@@ -181,9 +200,8 @@ class Registry(Kinds[P]):
 
     def reference_of(self, thing: type[P]) -> str:
         """Return the name or path by which `find` finds a class, or its bare name if it is in no file."""
-        package, _, name = thing.__module__.rpartition(".")
-        if package == self.package:
-            return next(iter(thing.names()), name.replace("_", "-"))
+        if thing.__module__.rpartition(".")[0] == self.package:
+            return next(iter(thing.names()), _named_after(thing.__module__))
         for point in self.installed().values():
             if point.module == thing.__module__ and point.attr in ("", thing.__name__):
                 return point.name
@@ -191,6 +209,13 @@ class Registry(Kinds[P]):
             return f"{inspect.getfile(thing)}:{thing.__name__}"
         except (TypeError, OSError):
             return thing.__name__
+
+    def _built_in(self, name: str) -> type[P]:
+        module = import_module(self._modules[name])
+        if not self.families:
+            return self._in(module, name)
+        things = self._things(module).values()
+        return next(thing for thing in things if name in (thing.names() or (_named_after(module.__name__),)))
 
     def _in(self, module: ModuleType, reference: str, name: str | None = None) -> type[P]:
         """Return the only class that a module defines, or the one of this name."""
@@ -209,7 +234,7 @@ class Registry(Kinds[P]):
     def _is_thing(self, value: Any, module: ModuleType) -> bool:
         if not (inspect.isclass(value) and issubclass(value, self.base)) or inspect.isabstract(value):
             return False
-        return value.__module__ == module.__name__ and not value.__name__.startswith("_")
+        return value is not self.base and value.__module__ == module.__name__ and not value.__name__.startswith("_")
 
     def _checked(self, found: type, reference: str) -> type[P]:
         if not issubclass(found, self.base):
@@ -251,6 +276,10 @@ class Registry(Kinds[P]):
         if point is None or point.dist is None:
             return reference
         return f"{point.dist.name}=={point.dist.version}:{reference}"
+
+
+def _named_after(module: str) -> str:
+    return module.rpartition(".")[2].replace("_", "-")
 
 
 def digest_file(path: Path) -> str:

@@ -11,14 +11,15 @@ from calstudy.experiment.model import FIGURES, Experiment
 from calstudy.figures import figure_task
 from calstudy.products import agreement, score, signal_loss, sky_model, spectra
 from calstudy.products.graph import Graph
+from calstudy.results.reader import Results, Tables
 from calstudy.run.task import Input, Inputs, Task
+from calstudy.verdicts.tables import tally, write_claims, write_claims_by_solver
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from calstudy.claims.evaluation import Evaluation
     from calstudy.claims.realizations import PooledResults
-    from calstudy.results.reader import Results
 
 REALIZATIONS = "realizations"
 """Figure with the measurements on all realizations of an experiment."""
@@ -104,7 +105,6 @@ class Claims(Task, stage="claims", version=12, cost=Cost(1, disk=1e5)):
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the claims, and those by solver."""
         from calstudy.claims.evaluation import evaluate_by_solver, evaluate_members, evaluate_run
-        from calstudy.verdicts.tables import write_claims_by_solver
 
         results = {name: self._results(name, experiment) for name, experiment in self.experiments.items()}
         if self.roles is None:
@@ -116,7 +116,6 @@ class Claims(Task, stage="claims", version=12, cost=Cost(1, disk=1e5)):
 
     def _results(self, name: str, experiment: Experiment) -> Results | PooledResults:
         from calstudy.claims.realizations import PooledResults
-        from calstudy.results.reader import Results
 
         if experiment.realizations:
             return PooledResults.of(experiment, self.tables[f"{REALIZATIONS}:{name}"])
@@ -135,14 +134,12 @@ class RunTimeClaims(Task, stage="runtime-claims", version=4, cost=Cost(1, disk=1
         """Write claims.json and claims.md."""
         from calstudy.claims import evaluation
         from calstudy.claims.run_times import RunTimes
-        from calstudy.results.reader import Tables
 
         times = RunTimes.of(self.title, Tables((self.runtime,)))
         return _write(output, evaluation.evaluate_run_times(self.papers, times), self.title)
 
 
 def _write(output: Path, found: Evaluation, title: str, notes: Sequence[str] = ()) -> dict[str, Any]:
-    from calstudy.verdicts.tables import tally, write_claims
 
     write_claims(found.verdicts, output, title, notes, found.without_role)
     contradicted = [claim.name for claim in found.verdicts if claim.verdict == "contradicted"]

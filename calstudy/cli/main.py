@@ -101,7 +101,6 @@ def run(
     Products that are in the store are not made again; the same command resumes an interrupted run.
     """
     from calstudy.run.execution import Budget
-    from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import show_run
     from calstudy.studies.study import run_study
@@ -110,6 +109,8 @@ def run(
     changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
     study = load_study(file, scale, changes)
     if finished:
+        from calstudy.studies.finished import with_finished
+
         study = with_finished(study, finished, console)
     show_run(run_study(study, Budget(workers, max_memory, scheduler), console, strict), console)
 
@@ -127,12 +128,13 @@ def plan(
 ) -> None:
     """Show what a run would do: stages, products in the store, estimated time, memory and disk."""
     from calstudy.run.execution import Budget
-    from calstudy.studies.finished import with_finished
     from calstudy.studies.load import load_study
     from calstudy.studies.show import describe_plan, show_plan
 
     study = load_study(file, scale, overrides or ())
     if finished:
+        from calstudy.studies.finished import with_finished
+
         # With JSON, nothing else is on standard output.
         study = with_finished(study, finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
     found = describe_plan(study, Budget(workers, max_memory), strict)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
@@ -24,23 +24,20 @@ from calstudy.sky.settings import SkySettings
 Component = Literal["foregrounds", "eor", "noise"]
 SIGNAL_LOSS_VARIANTS = ("residual", "residual_without_eor", "eor")
 FIGURES: Registry[Any] = Registry("figure", "calstudy.figures", "calstudy.figures:StudyFigure", families=True)
+TABLES: Registry[Any] = Registry("table", "calstudy.products", "calstudy.products.table:StudyTable", families=True)
 PAPERS: Registry[Any] = Registry("paper", "calstudy.papers", "calstudy.claims.paper:Paper")
 DEFAULT_FIGURES = ("layout", "gains", "model", "data", "baselines", "wedge", "spherical", "signal-loss")
 
 FIGURE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 STUDY_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+TABLE_NAME = re.compile(r"(?!(as-built|sky-model)$)[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Of a table of one's own: built-in ones have all names with dots and these two."""
 VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 Figures = Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)]
+StudyTables = Annotated[tuple[Annotated[SerializeAsAny[Plugin], TABLES.field()], ...], Field(strict=False)]
 Papers = Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)]
-
-
-class Refusing(Protocol):
-    """The interface of an experiment to its figures, which are `calstudy.figures.StudyFigure`."""
-
-    def refusal(self, experiment: Experiment) -> str | None:
-        """Return why the figure cannot be drawn for an experiment, to follow its name, or None."""
 
 
 class Variant(Section):
@@ -133,12 +130,13 @@ class Folders(Section):
 
 
 class Outputs(Folders):
-    """Figures, and the folders of products and runs."""
+    """Figures, tables, and the folders of products and runs."""
 
     figures: Figures = Field(
         default_factory=lambda: tuple(FIGURES.make(name) for name in DEFAULT_FIGURES),
         description="What is drawn: names of figures, or files of your own.",
     )
+    tables: StudyTables = Field((), description="Tables besides those of every run: files of your own.")
     inspect: Inspection = Inspection()
     convergence: Convergence = Convergence()
 
@@ -264,6 +262,11 @@ class Experiment(Section):
         return self
 
     @property
+    def calibrates(self) -> bool:
+        """Whether any variant is calibrated."""
+        return any(variant.calibrate for variant in self.variants.values())
+
+    @property
     def measures_signal_loss(self) -> bool:
         """Whether data are calibrated with and without the EoR, all else equal, so that its loss can be measured."""
         residual, without, eor = (self.variants.get(name) for name in SIGNAL_LOSS_VARIANTS)
@@ -278,19 +281,9 @@ class Experiment(Section):
         )
 
     @model_validator(mode="after")
-    def _figures_can_be_drawn(self) -> Experiment:
-        labels = [figure.label for figure in self.outputs.figures]
-        for index, figure in enumerate(self.outputs.figures):
-            path = f"outputs.figures.{index}"
-            if not FIGURE_NAME.fullmatch(figure.label) or figure.label in labels[:index]:
-                raise fault(path, f"{figure.label!r} cannot name a picture, or does so already: use another file name")
-            try:
-                with guarded(figure):
-                    refusal = cast(Refusing, figure).refusal(self)
-            except InputError as error:
-                raise fault(path, str(error)) from None
-            if refusal is not None:
-                raise fault("outputs.figures", f"asks for {figure.label!r}, which {refusal}")
+    def _figures_and_tables_can_be_made(self) -> Experiment:
+        self._require_possible("figures", "picture", FIGURE_NAME)
+        self._require_possible("tables", "table", TABLE_NAME)
         count = self.instrument.times.count
         if self.outputs.inspect.integration >= count:
             raise fault(
@@ -298,6 +291,22 @@ class Experiment(Section):
                 f"{self.outputs.inspect.integration} is not among the {count} integrations, counted from 0",
             )
         return self
+
+    def _require_possible(self, field: str, what: str, names: re.Pattern[str]) -> None:
+        """Raise a fault if a figure or table that is asked for has no usable name, or refuses the experiment."""
+        labels: list[str] = []
+        for index, thing in enumerate(getattr(self.outputs, field)):
+            path = f"outputs.{field}.{index}"
+            if not names.fullmatch(thing.label) or thing.label in labels:
+                raise fault(path, f"{thing.label!r} cannot name a {what}, or does so already: use another file name")
+            labels.append(thing.label)
+            try:
+                with guarded(thing):
+                    refusal = thing.refusal(self)
+            except InputError as error:
+                raise fault(path, str(error)) from None
+            if refusal is not None:
+                raise fault(f"outputs.{field}", f"asks for {thing.label!r}, which {refusal}")
 
     @model_validator(mode="after")
     def _levels_have_their_reference(self) -> Experiment:
@@ -329,7 +338,7 @@ class Experiment(Section):
     @model_validator(mode="after")
     def _solves_fit_in_the_run(self) -> Experiment:
         together, count = self.calibration.integrations_per_solve, self.instrument.times.count
-        if together > count and any(variant.calibrate for variant in self.variants.values()):
+        if together > count and self.calibrates:
             raise fault(
                 "calibration.integrations_per_solve",
                 f"{together} integrations cannot be solved together, for instrument.times.count is {count}; use at "

@@ -99,6 +99,8 @@ def _faults(experiment: Experiment) -> list[str]:
     drawn = [part for block in experiment.realizations for part in block.draw]
     if experiment.sweep:
         faults.append("realizations: cannot be asked for together with a sweep; use two files")
+    if experiment.outputs.tables:
+        faults.append("outputs.tables: are tables of single runs, and there are realizations; leave them out")
     if not experiment.measures_signal_loss:
         names = ", ".join(SIGNAL_LOSS_VARIANTS)
         faults.append(f"realizations: pool the signal loss, which needs the variants {names}")

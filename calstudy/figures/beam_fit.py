@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pyuvdata import UVData
 
     from calstudy.instrument.beams import GriddedBeam
-    from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.floor import DelayFloor
     from calstudy.simulate.settings import SimulationSettings
     from calstudy.sky.settings import SkySettings

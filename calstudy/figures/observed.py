@@ -13,6 +13,8 @@ from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
 from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
 from calstudy.figures.wedge import draw_panels
 from calstudy.plotting import style
+from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
+from calstudy.power.tables import load_spectrum
 from calstudy.products.expected_loss import EXPECTED
 from calstudy.products.files import spectrum_file
 from calstudy.products.graph import required
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calstudy.power.expected import ExpectedBins
-    from calstudy.power.spectra import SphericalSpectrum
     from calstudy.power.transfer import TransferFunction, TransferMap
     from calstudy.products.graph import MeasuredGraph
 
@@ -104,9 +105,6 @@ class ObservedSpherical(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw a column for each choice of modes."""
-        from calstudy.power.spectra import SphericalSpectrum
-        from calstudy.power.tables import load_spectrum
-
         folder = job.inputs["spectra"]
         columns = {
             modes: {name: load_spectrum(folder / spectrum_file(name, modes), SphericalSpectrum) for name in MARKINGS}
@@ -143,9 +141,6 @@ class ObservedWedge(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw a panel for each spectrum."""
-        from calstudy.power.spectra import CylindricalSpectrum
-        from calstudy.power.tables import load_spectrum
-
         folder = job.inputs["spectra"]
         found = {name: load_spectrum(folder / spectrum_file(name, "wedge"), CylindricalSpectrum) for name in TITLES}
         figure = draw_panels(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY, job.settings["notes"])
@@ -215,7 +210,6 @@ class ObservedSignalLoss(StudyFigure):
     def draw(self, job: Job) -> Drawing:
         """Draw T per k and per (|b|, tau)."""
         from calstudy.power.expected import ExpectedBins
-        from calstudy.power.tables import load_spectrum
         from calstudy.power.transfer import TransferFunction, TransferMap
 
         folder, prediction = job.inputs["transfer"], None

@@ -15,7 +15,7 @@ from calstudy.experiment.realizations import described
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure, members_of
 from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
 from calstudy.plotting import style
-from calstudy.power.realizations import mean_over_bins
+from calstudy.power.realizations import Design, Pooled, PooledRegion, mean_over_bins, pool_region, together
 from calstudy.products import realizations
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.power.realizations import Pooled, PooledRegion
     from calstudy.products.realizations import RegionResults
 
 OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"
@@ -279,8 +278,6 @@ class RealizationsComparison(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Write the table, and draw both arrays and their difference."""
-        from calstudy.power.realizations import Design, pool_region
-
         regions, inputs = {}, members_of(job)
         members = job.settings["members"]
         if len({str(settings) for settings in members.values()}) > 1:
@@ -303,8 +300,6 @@ class RealizationsComparison(StudyFigure):
 
 def _differences(first: PooledRegion, second: PooledRegion) -> dict[str, Pooled]:
     """Return the difference of every quantity, realization by realization, pooled over all blocks."""
-    from calstudy.power.realizations import together
-
     found = {}
     for name in first.values:
         values = first.values[name] - second.values[name]

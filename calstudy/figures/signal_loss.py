@@ -14,6 +14,7 @@ from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
 from calstudy.products import expected_loss, signal_loss
 from calstudy.products.graph import Graph, required
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import (
     ERROR_OF_ERROR,
@@ -163,8 +164,6 @@ class SignalLossFigure(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw T per k and per (|b|, tau)."""
-        from calstudy.results.reader import Tables
-
         tables = Tables((job.inputs["transfer"],))
         outside, inside = (tables.transfer(region) for region in signal_loss.REGIONS)
         loss = SignalLoss(outside, inside, tables.transfer_map())
@@ -274,8 +273,6 @@ class ExpectedLossFigure(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw expected and measured T side by side."""
-        from calstudy.results.reader import Tables
-
         tables = Tables((job.inputs["transfer"], job.inputs["expected"]))
         found = ExpectedLoss(tables.expected_transfer, tables.transfer("outside-wedge"), tables.transfer_map())
         figure = draw_expected_loss(found, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])

@@ -83,11 +83,6 @@ class BeamModel(Plugin, ABC):
 
     kind: str = Field("", description="Name of a beam, or a file.py.")
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the name of a built-in beam."""
-        return (cls.model_fields["kind"].default,)
-
     @property
     def smooth(self) -> bool:
         """Whether the beam is smooth in frequency, so that simulations may be interpolated between nodes."""

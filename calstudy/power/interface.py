@@ -11,13 +11,12 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.power.settings import ESTIMATORS, PowerSettings
+from calstudy.power.spectra import DelaySpectra, average_times
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pyuvdata import UVData
-
-    from calstudy.power.spectra import DelaySpectra
 
 
 class PowerBeam(Protocol):
@@ -76,7 +75,6 @@ def estimate_spectra(
         data have different numbers of integrations.
     """
     from calstudy.power.errors import independent_times
-    from calstudy.power.spectra import average_times
 
     estimator = cast(Estimator, settings.estimator)
     found = []
@@ -136,7 +134,6 @@ def _integration(uvd: UVData, number: int) -> UVData:
 def _fault(found: object) -> str | None:
     """Return the fault of the result of an estimator, or None."""
     from calstudy.power.delay import TAPERS
-    from calstudy.power.spectra import DelaySpectra
 
     if not isinstance(found, DelaySpectra):
         return f"returned a {type(found).__name__}, expected DelaySpectra"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
@@ -10,6 +10,7 @@ from calstudy.instrument.size import Size
 from calstudy.products import calibration, corruption, simulation
 from calstudy.products.files import DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
 from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
@@ -47,6 +48,17 @@ def agreement(graph: Graph) -> Task | None:
         gains=corruption.gains(graph),
         calibration=calibration.calibration(graph, residual, "even"),
     )
+
+
+class AgreementTable(StudyTable):
+    """How gains, model and residual agree with the truth."""
+
+    of = "experiment"
+    place = 2
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [agreement(graph)]
 
 
 class Agreement(Task, stage="agreement", version=3):

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
+from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.calibrate.execution import cost_of
-from calstudy.calibrate.interface import Calibrator
-from calstudy.calibrate.records import SETTLED
+from calstudy.calibrate.execution import cost_of, run_calibrator
+from calstudy.calibrate.interface import Assumed, Calibrator
+from calstudy.calibrate.records import SETTLED, CalibrationResult, Solve
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import LEVELS
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from pyuvdata import UVData
 
     from calstudy.calibrate.preparation import PreparedFit
-    from calstudy.calibrate.records import CalibrationResult
     from calstudy.calibrate.settings import GainFit
 
 
@@ -106,8 +106,6 @@ def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
 
 def prepared_fit(calibrator: GainFit, data: UVData, sky: UVData | None, noise: float | None) -> PreparedFit:
     """Return the fit of data with a sky model and the level of the noise, if they are known."""
-    from calstudy.base.observation import Observation
-    from calstudy.calibrate.interface import Assumed
     from calstudy.calibrate.preparation import prepare
 
     assumed = Assumed(None if sky is None else Observation(sky), noise=noise)
@@ -117,8 +115,6 @@ def prepared_fit(calibrator: GainFit, data: UVData, sky: UVData | None, noise: f
 def read_result(folder: Path) -> CalibrationResult:
     """Read a product of stage `calibrate`."""
     from pyuvdata import UVCal
-
-    from calstudy.calibrate.records import CalibrationResult, Solve
 
     model, residual = (read_visibilities(folder / name) for name in (MODEL, RESIDUAL))
     records = tuple(map(Solve.from_json, read_json(folder / SOLUTION)["records"]))
@@ -160,8 +156,6 @@ class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Calibrate, and write gains, model, residual and the records of the solves."""
-        from calstudy.base.observation import Observation
-        from calstudy.calibrate.execution import run_calibrator
         from calstudy.calibrate.weights import conspicuous
 
         together = self.calibration.integrations_per_solve

@@ -5,24 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
+from calstudy.power.score import BANDS, CalibratedSpectra, Score, difference
 from calstudy.products import score, spectra
-from calstudy.products.files import json_number, read_json
+from calstudy.products.files import COMPARISON, json_number, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.measured import is_measured, marked
 from calstudy.verdicts.standing import answers, standing_table, standings
 
-if TYPE_CHECKING:
-    from calstudy.power.score import CalibratedSpectra, Score
-
-CSV, MARKDOWN, JSON = "comparison.csv", "comparison.md", "comparison.json"
+CSV, MARKDOWN = "comparison.csv", "comparison.md"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
 """What is compared in bands of k, and how it is headed."""
 NOTE = (
@@ -93,7 +91,6 @@ def read_cases(
 
 
 def _read(folder: Path) -> Case:
-    from calstudy.power.score import Score
     from calstudy.power.tables import load_spectrum
 
     bins, bands = (load_spectrum(folder / name, Score) for name in (score.BINS, score.BANDS))
@@ -141,13 +138,13 @@ class Comparison(Task, stage="comparison", version=4):
             for world, found in cases.items()
         }
         text = json.dumps(summaries, indent=1, ensure_ascii=False, allow_nan=False)
-        (output / JSON).write_text(text + "\n", encoding="utf-8")
+        (output / COMPARISON).write_text(text + "\n", encoding="utf-8")
         (output / MARKDOWN).write_text(_markdown(self, cases, less, summaries), encoding="utf-8")
         return {}
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return the scores of all calibrators, a table for each world."""
-        found = {world: cases for world, cases in read_json(folder / JSON).items() if cases}
+        found = {world: cases for world, cases in read_json(folder / COMPARISON).items() if cases}
         return [replace(score_table(cases), title=f"Scores: {world}", note=NOTE) for world, cases in found.items()]
 
     def differences(self, world: str, found: Mapping[str, Case]) -> dict[str, list[dict[str, Any]]]:
@@ -157,8 +154,6 @@ class Comparison(Task, stage="comparison", version=4):
         calibrator of the cases `found` in a world, there is for each band what ``best`` is called, and ``transfer``
         and ``bias`` with errors; None if not known.
         """
-        from calstudy.power.score import BANDS, difference
-
         row = self.worlds.index(world)
         names = {name: case_name(row, place) for place, name in enumerate(self.calibrators) if name in found}
         scales = {name: float(case.bands.flux_scale) for name, case in found.items()}
@@ -178,7 +173,6 @@ class Comparison(Task, stage="comparison", version=4):
         return result
 
     def _spectra(self, case: str) -> CalibratedSpectra:
-        from calstudy.power.score import CalibratedSpectra
 
         folders = {name: self.cases[f"{case}:{name}"] for name in score.SPECTRA}
         return CalibratedSpectra(**{name: spectra.read_delay_spectra(folder) for name, folder in folders.items()})

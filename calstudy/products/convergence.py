@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
+from calstudy.calibrate.agreement import Baselines, Realization, cross_power
 from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES
+from calstudy.calibrate.problem import gain_products
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import PARITIES
@@ -20,7 +22,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from calstudy.calibrate.agreement import Baselines, Realization
     from calstudy.calibrate.settings import Solver
     from calstudy.calibrate.solvers.interface import Checkpoint
 
@@ -70,9 +71,6 @@ class Convergence(Task, stage="convergence", version=4):
         """
         import numpy as np
 
-        from calstudy.calibrate.agreement import cross_power
-        from calstudy.calibrate.problem import gain_products
-
         paths, realizations = {}, {}
         for parity in PARITIES:
             realizations[parity], paths[parity], baselines = self._solved(parity)
@@ -114,11 +112,9 @@ class Convergence(Task, stage="convergence", version=4):
         import numpy as np
 
         from calstudy.base.observation import Observation
-        from calstudy.calibrate.agreement import Baselines, Realization
         from calstudy.calibrate.calamity import make_solver
         from calstudy.calibrate.interface import Assumed
         from calstudy.calibrate.preparation import make_problem, prepare
-        from calstudy.calibrate.problem import gain_products
         from calstudy.calibrate.solvers.interface import trace
         from calstudy.products.selection import read_gains
 

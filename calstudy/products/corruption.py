@@ -6,8 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from calstudy.base.gains import make_uvcal, read_gains
+from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.corrupt.interface import Effect, GainEffect
+from calstudy.base.visibilities import antenna_rows, flag_cube, from_cube, to_cube
+from calstudy.corrupt.interface import Effect, GainEffect, apply_effect, draw_flags, draw_truth
 from calstudy.corrupt.noise import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Variant
 from calstudy.instrument.as_built import AsBuilt
@@ -139,8 +142,6 @@ class DrawEffect(Task, stage="effect", version=1):
         """Write the arrays drawn by the effect to truth.h5, one data set each."""
         import h5py
 
-        from calstudy.base.observation import Observation
-        from calstudy.corrupt.interface import draw_flags, draw_truth
         from calstudy.instrument.telescope import make_template
 
         effect, observation = self.effect, Observation(make_template(self.instrument, as_built=True))
@@ -180,8 +181,6 @@ class MultiplyGains(Task, stage="gains", version=2):
         """Write the gains to gains.calh5."""
         import numpy as np
 
-        from calstudy.base.gains import make_uvcal
-        from calstudy.base.visibilities import antenna_rows
         from calstudy.instrument.telescope import make_template
 
         template = make_template(self.instrument)
@@ -209,7 +208,6 @@ class MeasureLevels(Task, stage="levels", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scales to levels.json."""
-        from calstudy.base.visibilities import to_cube
         from calstudy.corrupt.levels import rms, set_levels
         from calstudy.corrupt.noise import radiometer_std
 
@@ -264,9 +262,6 @@ class Corrupt(Task, stage="corrupt", version=2):
         """Write the data to data.uvh5."""
         import numpy as np
 
-        from calstudy.base.observation import Observation
-        from calstudy.base.visibilities import flag_cube, from_cube, to_cube
-        from calstudy.corrupt.interface import apply_effect, draw_flags
         from calstudy.corrupt.levels import Levels, rms
         from calstudy.corrupt.noise import thermal_noise
         from calstudy.instrument.telescope import make_template
@@ -316,9 +311,6 @@ class Autocorrelate(Task, stage="autocorrelations", version=1):
         """Write the autocorrelations to data.uvh5."""
         import numpy as np
 
-        from calstudy.base.gains import read_gains
-        from calstudy.base.observation import Observation
-        from calstudy.base.visibilities import from_cube
         from calstudy.corrupt.levels import Levels
         from calstudy.corrupt.noise import autocorrelations as draw
         from calstudy.instrument.telescope import make_template

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
 from calstudy.instrument.size import Size
+from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
 from calstudy.power.settings import PowerSettings
 from calstudy.products import calibration, corruption
 from calstudy.products.calibration import Calibrated, prepared_fit
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
 
     from calstudy.calibrate.expected_loss import ExpectedTransfer
     from calstudy.calibrate.problem import CalibrationProblem
-    from calstudy.power.expected import ExpectedBins
     from calstudy.power.spectra import BaselineModes
 
 EXPECTED, RESPONSE = "expected-loss.h5", "linear-response.json"
@@ -113,7 +114,6 @@ class _Solved(Calibrated):
         """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
         import numpy as np
 
-        from calstudy.base.visibilities import antenna_pairs, to_cube
         from calstudy.calibrate.preparation import problem_at
         from calstudy.calibrate.records import Solve
         from calstudy.products.selection import read_gains
@@ -184,10 +184,8 @@ class LinearResponse(_Solved, stage="linear-response", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T and C in the bands of scores; null if flagged."""
-        from calstudy.base.visibilities import antenna_pairs, to_cube
         from calstudy.calibrate.expected_loss import DelayModes
         from calstudy.calibrate.expected_loss import linear_response as response_to
-        from calstudy.power.expected import bin_response
         from calstudy.power.score import BANDS
 
         power, solution = self.power, self.solution()
@@ -226,7 +224,6 @@ def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSe
 def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power: PowerSettings) -> ExpectedBins:
     """Return an expected T of baselines (lengths in m, band centre in Hz) in bins of k and of length and delay."""
     from calstudy.power.binned import make_bin_edges
-    from calstudy.power.expected import bin_expected
 
     modes = _modes(expected.delay, lengths, centre, power)
     edges = make_bin_edges(power.bins)

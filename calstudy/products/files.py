@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 VISIBILITIES, DATA, GAINS, AVERAGE = "visibilities.uvh5", "data.uvh5", "gains.calh5", "average.uvh5"
 MODEL, RESIDUAL, SOLUTION = "model.uvh5", "residual.uvh5", "solution.json"
 """Files of simulated components, measurements, gains, averages and calibrations."""
+COMPARISON, REALIZATIONS = "comparison.json", "realizations.json"
+"""Scores of a comparison, and verdicts on the criteria for realizations, which reports read."""
 
 
 def spectrum_file(name: str, kind: str) -> str:

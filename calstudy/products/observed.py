@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, rows_of, to_cube
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import GainFit
 from calstudy.products.calibration import calibration_of
@@ -25,7 +26,7 @@ from calstudy.products.files import (
 )
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
 from calstudy.products.spectra import InBlocks, blocks_in, cross_power
-from calstudy.realdata.halves import PARITIES, WHOLE
+from calstudy.realdata.halves import PARITIES, WHOLE, east_and_north, flag_channels, interleaved
 from calstudy.realdata.settings import Factor, FromAutocorrelations, ObservedSettings, Select
 from calstudy.run.task import Input, Task
 
@@ -161,7 +162,6 @@ class Observe(Task, stage="observe", version=2):
         Raises InputError if the data or the model cannot be used.
         """
         from calstudy.calibrate.sky_model import common_baselines
-        from calstudy.realdata.halves import interleaved
         from calstudy.realdata.interference import flag_interference
         from calstudy.realdata.reading import place_antennas, read_visibilities
         from calstudy.realdata.selection import Selection
@@ -185,7 +185,6 @@ class Observe(Task, stage="observe", version=2):
 
     def _prepared(self, data: UVData, selection: Selection, flag: Sequence[str] = ()) -> tuple[UVData, list[str]]:
         """Return visibilities as calibration needs them, and sentences on what was changed."""
-        from calstudy.realdata.halves import east_and_north, flag_channels
         from calstudy.realdata.reading import prepare
 
         try:
@@ -202,7 +201,6 @@ class Observe(Task, stage="observe", version=2):
         """Return the value of one unit of the data in Jy."""
         import numpy as np
 
-        from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
         from calstudy.corrupt.noise import effective_area
         from calstudy.instrument.beams import make_beam
 
@@ -252,7 +250,6 @@ class ObservedAverage(InBlocks, stage="observed-average", version=1):
         from pyuvdata import UVCal
 
         from calstudy.base.gains import gain_products
-        from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, rows_of, to_cube
         from calstudy.power.average import average_in_blocks
         from calstudy.realdata.noise import noise_of_average
 

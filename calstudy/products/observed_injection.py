@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube, rows_of, to_cube
 from calstudy.calibrate.settings import GainFit
+from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products.calibration import prepared_fit, read_result
 from calstudy.products.expected_loss import EXPECTED, LABEL, NOT_OF_THE_FIT, PROBES, binned
 from calstudy.products.files import (
@@ -28,6 +30,7 @@ from calstudy.products.observed import average, calibrated, crosses_of, observed
 from calstudy.products.observed_results import observed_spectra
 from calstudy.products.signal_loss import Difference, Injected, write_corrected, write_transfer
 from calstudy.products.spectra import EXCISION, InBlocks, cross_power
+from calstudy.products.table import StudyTable
 from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Task, called
 from calstudy.simulate.interface import SimulationSize
@@ -124,6 +127,17 @@ def _of_data(graph: MeasuredGraph, part: str) -> dict[str, Any]:
     }
 
 
+class ObservedLossTable(StudyTable):
+    """The signal loss and its prediction, if there is an injection."""
+
+    of = "observed"
+    place = 2
+
+    def products(self, graph: MeasuredGraph) -> Sequence[Task | None]:
+        """Return the products."""
+        return [transfer(graph), expected_loss(graph)] if graph.experiment.injection else []
+
+
 class SimulateEor(Task, stage="observed-eor", version=3):
     """The EoR of one half, in Jy and with the power of its P(k)."""
 
@@ -138,7 +152,6 @@ class SimulateEor(Task, stage="observed-eor", version=3):
         """Write the EoR to visibilities.uvh5."""
         import numpy as np
 
-        from calstudy.base.visibilities import antenna_pairs, from_cube
         from calstudy.instrument.beams import make_beam
         from calstudy.instrument.interface import model_of
         from calstudy.instrument.telescope import subset_template
@@ -228,7 +241,6 @@ class Inject(Added, stage="inject", version=1):
         from pyuvdata import UVCal
 
         from calstudy.base.gains import gain_products
-        from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 
         data, sky = read_visibilities(self.data / DATA), self.signal()
         pairs = antenna_pairs(sky)
@@ -247,7 +259,6 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the average to average.uvh5."""
-        from calstudy.base.visibilities import antenna_pairs, from_cube, rows_of, to_cube
         from calstudy.power.average import average_in_blocks
 
         residual, sky = crosses_of(read_visibilities(self.calibration / RESIDUAL)), self.signal()
@@ -267,7 +278,6 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=4, cost=Cost
         from calstudy.power.binned import spherical_average
         from calstudy.power.errors import with_errors
         from calstudy.power.spectra import SphericalSpectrum
-        from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 
         found = self.read()
         # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
@@ -320,7 +330,6 @@ class _OfData(Task):
         """
         import numpy as np
 
-        from calstudy.base.visibilities import to_cube
         from calstudy.calibrate.expected_loss import DENSE, DelayModes, jacobian_size
         from calstudy.calibrate.expected_loss import expected_transfer as expected_of
         from calstudy.calibrate.preparation import problem_at
@@ -355,9 +364,6 @@ class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=2):
         """Write the expected T in bins of k and of length and delay."""
         import numpy as np
 
-        from calstudy.base.visibilities import baseline_vectors
-        from calstudy.power.tables import save_spectrum
-
         result = read_result(self.calibration)
         found = self.expect(result, 0, self.power.taper)
         if found is None:
@@ -374,7 +380,6 @@ class ExpectedTransfers(_OfData, stage="expected-transfer", version=1):
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the transfer function of every polarization that has solutions to a file of its own."""
         from calstudy.calibrate.expected_loss import TAPER
-        from calstudy.power.tables import save_spectrum
 
         result = read_result(self.calibration)
         for index, name in enumerate(result.model.get_pols()):

@@ -14,13 +14,14 @@ from calstudy.experiment.realizations import described
 from calstudy.power.corrected import Corrected
 from calstudy.power.realizations import QUANTITIES, TRANSFER_QUANTITIES, PooledRegion, error_ratio, mean_over_bins
 from calstudy.products import realizations
+from calstudy.products.files import REALIZATIONS
 from calstudy.products.graph import Graph, memoize
 from calstudy.products.realizations import JUDGED_K, JUDGED_REGION, RegionResults, judge, read_results
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.criterion import Finding, Verdict
 from calstudy.verdicts.tables import from_json, tally, to_json, to_markdown, verdict_table
 
-CSV, MARKDOWN, VERDICTS = "realizations.csv", "realizations.md", "realizations.json"
+CSV, MARKDOWN = "realizations.csv", "realizations.md"
 PULLS = ("pull_eor", "pull_input", "pull_without_eor")
 BANDS = ((0.1, 0.2), (0.2, 0.3), (0.3, 0.5), (0.5, 1.0), (JUDGED_K, np.inf))
 """Bands of k, h/Mpc, of the summary; the last is that of the verdicts."""
@@ -48,12 +49,12 @@ class Pooled(Task, stage="pooled-realizations", version=4, cost=Cost(5, disk=1e6
         rows = [row for region, found in results.items() for row in _csv_rows(region, found, self.blocks)]
         Table.of_records(rows).write_csv(output / CSV)
         (output / MARKDOWN).write_text(_markdown(results, verdicts, self.title, self.blocks), encoding="utf-8")
-        (output / VERDICTS).write_text(to_json(verdicts) + "\n", encoding="utf-8")
+        (output / REALIZATIONS).write_text(to_json(verdicts) + "\n", encoding="utf-8")
         return {"verdicts": tally(verdicts), "failed": [item.name for item in verdicts if item.verdict == "FAIL"]}
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return the verdicts."""
-        verdicts = from_json((folder / VERDICTS).read_text(encoding="utf-8"))
+        verdicts = from_json((folder / REALIZATIONS).read_text(encoding="utf-8"))
         return [verdict_table(verdicts, "Realizations", "All numbers are in realizations.md and realizations.csv.")]
 
 

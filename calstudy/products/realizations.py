@@ -16,11 +16,13 @@ from calstudy.power.corrected import Corrected, correct_realizations
 from calstudy.power.realizations import (
     Design,
     PooledRegion,
+    Sample,
     coverage,
     inside_bars,
     mean_over_bins,
     pool_region,
 )
+from calstudy.power.tables import load_spectrum, save_spectrum
 from calstudy.products import corruption, signal_loss, spectra
 from calstudy.products.corruption import LEVELS
 from calstudy.products.files import read_json, spectrum_file, write_json
@@ -29,7 +31,6 @@ from calstudy.run.task import Input, Task, called
 from calstudy.verdicts.criterion import Criterion, Finding, Verdict, Within
 
 if TYPE_CHECKING:
-    from calstudy.power.realizations import Sample
     from calstudy.power.settings import PowerSettings
     from calstudy.sky.settings import Eor
 
@@ -161,7 +162,6 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
         from calstudy.power.binned import make_bin_edges, spherical_average
         from calstudy.power.cosmology import input_power
         from calstudy.power.errors import noise_level, with_errors
-        from calstudy.power.tables import save_spectrum
 
         power = self.power
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SIGNAL_LOSS_VARIANTS}
@@ -188,9 +188,7 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
 
 def read_samples(folders: Mapping[str, Path], count: int, region: str) -> Sequence[Sample]:
     """Read the samples of the first `count` realizations in one of `REGIONS` from the products of `inputs`."""
-    from calstudy.power.realizations import Sample
     from calstudy.power.spectra import SphericalSpectrum
-    from calstudy.power.tables import load_spectrum
     from calstudy.power.transfer import TransferFunction
 
     samples = []

@@ -11,6 +11,20 @@ from typing import TYPE_CHECKING, Any
 from calstudy.base.resources import Cost
 from calstudy.base.table import Table
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.power.spectra import SphericalSpectrum, of_common_units
+from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_transfer_csv
+from calstudy.power.transfer import (
+    BANDS,
+    Injection,
+    TransferFunction,
+    correct,
+    cylindrical_transfer,
+    flux_scale,
+    gain_ratio,
+    signal_response,
+    spherical_transfer,
+    where_measured,
+)
 from calstudy.products import calibration, corruption, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
@@ -24,6 +38,7 @@ from calstudy.products.files import (
 )
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.measured import marked, why_not_measured
 
@@ -31,8 +46,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from calstudy.power.settings import PowerSettings
-    from calstudy.power.spectra import SphericalSpectrum
-    from calstudy.power.transfer import Injection, TransferFunction
 
 REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Parts of Fourier space; true for the part inside the wedge."""
@@ -83,6 +96,17 @@ def _flux_scale(graph: Graph) -> Task:
     return FluxScale("flux scale", taper=graph.experiment.power.taper, even=even, odd=odd, gains=gains)
 
 
+class TransferTable(StudyTable):
+    """The signal loss."""
+
+    of = "experiment"
+    place = 3
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [transfer(graph)]
+
+
 class Difference(Task, stage="difference", version=2):
     """The response of an averaged residual to the signal."""
 
@@ -91,8 +115,6 @@ class Difference(Task, stage="difference", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the response to average.uvh5."""
-        from calstudy.power.transfer import signal_response
-
         found = (read_visibilities(folder / AVERAGE) for folder in (self.with_signal, self.without_signal))
         write_visibilities(signal_response(*found), output / AVERAGE)
         return {}
@@ -113,18 +135,12 @@ class Injected(Task):
 
     def read(self) -> Injection:
         """Read the delay spectra, in common units."""
-        from calstudy.power.spectra import of_common_units
-        from calstudy.power.transfer import Injection
-
         folders = {"signal": self.signal, "response": self.response, "cross": self.cross}
         delays = {name: spectra.read_delay_spectra(folder) for name, folder in folders.items()}
         return Injection(**of_common_units(delays))
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return T and the squared coherence in bands of k."""
-        from calstudy.power.tables import load_spectrum
-        from calstudy.power.transfer import TransferFunction
-
         outside, inside = (load_spectrum(folder / spectrum_file(BAND, part), TransferFunction) for part in REGIONS)
         columns = ("k (h/Mpc)", "T outside the wedge", "squared coherence outside", "T inside the wedge")
         rows = [
@@ -146,9 +162,6 @@ class Transfer(Injected, stage="transfer", version=4, cost=Cost(1, disk=1e6)):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T, and the residual's power corrected by T."""
-        from calstudy.power.spectra import SphericalSpectrum
-        from calstudy.power.tables import load_spectrum
-
         known = read_json(self.scale / SCALE)["flux_scale"]
         scale = math.nan if known is None else known
         summary = write_transfer(output, self.read(), self.power, scale)
@@ -170,8 +183,6 @@ def write_transfer(
     it is not measured.
     """
     from calstudy.power.binned import make_bin_edges
-    from calstudy.power.tables import save_spectrum, write_transfer_csv
-    from calstudy.power.transfer import BANDS, cylindrical_transfer, spherical_transfer, where_measured
 
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     summary: dict[str, Any] = {}
@@ -202,9 +213,6 @@ class SweepSummary(Task, stage="sweep-summary", version=1, cost=Cost(1, disk=1e5
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write summary.csv: a row for each point, region and band of k."""
-        from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum
-        from calstudy.power.transfer import TransferFunction
-
         rows: list[list[Any]] = []
         for point in self.points:
             changes = "; ".join(f"{field} = {text}" for field, text in point["changes"].items())
@@ -244,7 +252,6 @@ class FluxScale(Task, stage="flux-scale", version=1):
         import numpy as np
 
         from calstudy.power.delay import make_taper
-        from calstudy.power.transfer import flux_scale, gain_ratio
         from calstudy.products.selection import read_gains
 
         ratios = []
@@ -283,9 +290,6 @@ def write_corrected(folder: Path, residual: SphericalSpectrum, signal: Spherical
 
     T is read from `folder`, as written by `write_transfer`.
     """
-    from calstudy.power.tables import load_spectrum, write_columns
-    from calstudy.power.transfer import TransferFunction, correct
-
     found = load_spectrum(folder / spectrum_file(TRANSFER, "outside-wedge"), TransferFunction)
     power, error = correct(residual, found)
     unit = "[mK2 h-3 Mpc3]"

@@ -10,6 +10,7 @@ import numpy as np
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.instrument.layouts import layout_of
 from calstudy.instrument.settings import beam_count
 from calstudy.instrument.size import Size
@@ -20,9 +21,11 @@ from calstudy.simulate.interface import SimulationSize
 from calstudy.simulate.nodes import (
     EARTH_ROTATION_RATE,
     SECONDS_PER_DAY,
+    Accuracy,
     chebyshev_count,
     frequency_bandwidth,
     frequency_blocks,
+    integration_times,
     patch_nside,
     time_bandwidth,
 )
@@ -37,7 +40,6 @@ if TYPE_CHECKING:
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.chunks import Component
     from calstudy.simulate.floor import DelayFloor
-    from calstudy.simulate.nodes import Accuracy
     from calstudy.simulate.settings import SimulationSettings
     from calstudy.sky.settings import SkySettings
 
@@ -127,10 +129,8 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the visibilities to chunk.uvh5; a chunk beyond the last node stays empty."""
-        from calstudy.base.visibilities import from_cube
         from calstudy.instrument.telescope import subset_template
         from calstudy.simulate.chunks import simulate_chunk as simulate
-        from calstudy.simulate.nodes import integration_times
 
         component = self.component
         if self.index >= len(component.chunks):
@@ -186,7 +186,6 @@ class Simulate(_Simulated, stage="simulate", version=3):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the visibilities to visibilities.uvh5, and measures of their quality to quality.json."""
-        from calstudy.base.visibilities import from_cube, to_cube
         from calstudy.simulate.chunks import assemble
 
         component = self.component

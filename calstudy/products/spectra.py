@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import Component, Variant
+from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import AVERAGE, DATA, RESIDUAL, read_visibilities, spectrum_file, write_visibilities
 from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
@@ -82,6 +84,17 @@ def _reference(graph: Graph, component: Component) -> Task:
     return variant_power(graph, component, Variant(components=(component,)))
 
 
+class SpectraTable(StudyTable):
+    """The power spectra of all variants."""
+
+    of = "experiment"
+    place = 1
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [spectra(graph)]
+
+
 class InBlocks(Task):
     """An average in the `kept` ones of `blocks` blocks within `span`, or in one with the phase centre `centre`."""
 
@@ -142,7 +155,6 @@ class Power(Task, stage="power", version=4):
 
         from calstudy.instrument.beams import make_beam
         from calstudy.power.interface import estimate_spectra
-        from calstudy.power.tables import save_spectrum
 
         even, odd = averages = [read_visibilities(folder / AVERAGE) for folder in (self.even, self.odd)]
         empty = any(uvd.flag_array.all() for uvd in averages)
@@ -168,7 +180,6 @@ class Power(Task, stage="power", version=4):
 def read_delay_spectra(folder: Path) -> DelaySpectra:
     """Read a product of the stage `power`."""
     from calstudy.power.spectra import DelaySpectra
-    from calstudy.power.tables import load_spectrum
 
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
 
@@ -191,7 +202,6 @@ class Spectra(Task, stage="spectra", version=3, cost=Cost(2, disk=5e6)):
 
         from calstudy.power.binned import cylindrical_average, spherical_average
         from calstudy.power.errors import noise_level, with_errors
-        from calstudy.power.tables import save_spectrum, write_csv
 
         reference = {name: read_delay_spectra(folder) for name, folder in self.reference.items()}
         sigma_noise = noise_level(reference["noise"]) if "noise" in reference else 0.0

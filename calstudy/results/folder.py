@@ -17,7 +17,7 @@ from calstudy.base.table import Table, from_json
 from calstudy.experiment.files import validate
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import read_mapping
-from calstudy.products import comparison
+from calstudy.products.files import COMPARISON
 from calstudy.results.reader import Tables
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.standing import LIMIT, InBand, standings
@@ -137,7 +137,7 @@ class RunFolder:
     @property
     def _scores(self) -> Mapping[str, Mapping[str, Any]]:
         """The scores of a comparison by world and calibrator; empty for other runs."""
-        path = self.path / "tables" / comparison.JSON
+        path = self.path / "tables" / COMPARISON
         if not path.is_file():
             return {}
         try:

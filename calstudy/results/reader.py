@@ -33,10 +33,6 @@ from calstudy.verdicts.statement import Unevaluated
 if TYPE_CHECKING:
     import xarray
 
-    from calstudy.power.score import Score
-    from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
-    from calstudy.power.transfer import TransferFunction, TransferMap
-
 
 Spectrum = TypeVar("Spectrum", SphericalSpectrum, CylindricalSpectrum)
 NO_SCORES = "the run has no scores of its calibration, or is of a version that wrote none"

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeGuard
 
 from pydantic import BaseModel
@@ -73,15 +74,21 @@ class _Definition:
     files: frozenset[PackageFile]
 
 
+# Some releases of Python 3.11 fail where two threads parse at once: "AST constructor recursion depth mismatch".
+_PARSING = Lock()
+
+
 def source_of(make: Callable[..., Any], settings: Mapping[str, Any]) -> Source:
     """Return the source of what `make` makes with these settings."""
-    return _source(_roots(make, settings))
+    with _PARSING:
+        return _source(_roots(make, settings))
 
 
 def reached(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[Address, str]:
     """Return by address the digests of all definitions that affect what `make` makes, or a plug-in."""
-    found = frozenset().union(*map(_reach, _roots(make, settings)))
-    return {address: _definition(address).digest for address in found}
+    with _PARSING:
+        found = frozenset().union(*map(_reach, _roots(make, settings)))
+        return {address: _definition(address).digest for address in found}
 
 
 def _roots(make: Callable[..., Any], settings: Mapping[str, Any]) -> frozenset[Address]:

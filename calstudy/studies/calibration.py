@@ -16,7 +16,7 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
-from calstudy.base.observation import Frame
+from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.given_gains import ByFile
@@ -202,7 +202,6 @@ class DataCalibration(DataStudy):
         Raises InputError if a file cannot be used.
         """
         from calstudy.base.gains import read_gains
-        from calstudy.base.observation import Observation
         from calstudy.calibrate.weights import conspicuous
 
         data, _, notes = observed(self.graph, WHOLE).read()

@@ -137,9 +137,9 @@ def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], cons
 
 def _needs_more(collection: Collection, name: str, study: ExperimentStudy) -> str | None:
     """Return the reason why a collection needs more of a member than its tables, or None."""
-    if not study.kept_tables:
+    if not study.keeps_tables:
         return "it has realizations; such members are always run"
-    tables = {task.key for task in study.kept_tables}
+    tables = {task.key for task in study.tables}
     others = {task.key for task in study.tasks} - tables
     for task in collection.own:
         for needed in task.needs.values():

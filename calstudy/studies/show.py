@@ -11,7 +11,7 @@ from rich.console import Console
 
 from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory, total_memory
 from calstudy.base.table import Table
-from calstudy.products.pooled_realizations import MARKDOWN, VERDICTS
+from calstudy.products.files import REALIZATIONS
 from calstudy.report.headline import PLACE, measured_numbers, read_signal
 from calstudy.report.page import REPORT
 from calstudy.results.folder import MANIFEST, RunFolder
@@ -204,12 +204,12 @@ def _show_answer(folder: Path, console: Console) -> None:
 
 def _show_criteria(folder: Path, console: Console) -> None:
     """Print the verdicts on the criteria for the realizations of an experiment; nothing for other runs."""
-    path = folder / "tables" / VERDICTS
+    path = folder / "tables" / REALIZATIONS
     if verdicts := RunFolder(folder).verdicts(path):
         for verdict in verdicts:
             text = f"{verdict.name}: {verdict.verdict}: {measured(verdict)}, must be {verdict.threshold}"
             console.print(text, markup=False)
-        console.print(f"criteria: {tally(verdicts)}: {path.with_name(MARKDOWN)}", markup=False)
+        console.print(f"criteria: {tally(verdicts)}: {path.with_suffix('.md')}", markup=False)
 
 
 def _show_claims(folder: Path, console: Console) -> None:

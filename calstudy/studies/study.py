@@ -108,6 +108,8 @@ class Study(ABC):
         Of the kind in the reference of all fields, and what is written there about its files.
     subfolders
         Folders in the run folder besides figures and tables.
+    keeps_tables
+        True if the manifest lists the files of the tables with digests, so that a collection can take them from there.
     has_reference
         True if figures and claims of a run may be a reference for `calstudy regress`.
     """
@@ -117,6 +119,7 @@ class Study(ABC):
     heading: ClassVar[str] = ""
     guide: ClassVar[str] = ""
     subfolders: ClassVar[tuple[str, ...]] = ()
+    keeps_tables: ClassVar[bool] = False
     has_reference: ClassVar[bool] = True
 
     file: Any
@@ -224,11 +227,6 @@ class Study(ABC):
         return self.own if self.parts else self.tasks
 
     @property
-    def kept_tables(self) -> Sequence[Task]:
-        """Tables that the manifest lists with digests, so that another study can take them from the run folder."""
-        return ()
-
-    @property
     def external_keys(self) -> frozenset[str]:
         """Keys of products that a run of this study needs but does not make."""
         return frozenset()
@@ -264,7 +262,9 @@ class Study(ABC):
             "captions": {task.label: task.settings["figure"].caption for task in self.figures},
             **({"parts": places} if places else {}),
             **self.entries,
-            "products": product_entries(self.recorded, made.products, made.tasks, self.kept_tables),
+            "products": product_entries(
+                self.recorded, made.products, made.tasks, self.tables if self.keeps_tables else ()
+            ),
         }
         write_manifest(self.folder, self.name, entries)
 
@@ -281,7 +281,7 @@ def kind_of(content: Mapping[str, Any], folder: Path | None = None) -> type[Stud
     """Return the kind of study of a file; a path of the key `study` starts at `folder`. InputError if there is none."""
     if KINDS.tag in content:
         return KINDS.class_of(content, None, folder)[0]
-    marked = [kind for kind in built_in_kinds() if kind.key in content and kind.model is not Experiment]
+    marked = [kind for kind in KINDS.marked("key", content) if kind.model is not Experiment]
     return marked[0] if marked else KINDS.find("experiment")
 
 

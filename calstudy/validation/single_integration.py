@@ -18,7 +18,7 @@ from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.execution import run_calibrator
-from calstudy.calibrate.problem import FitStructure, gain_products
+from calstudy.calibrate.problem import FitStructure, gain_products, make_structure
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import ForegroundFit
 from calstudy.products import corruption, simulation
@@ -52,8 +52,6 @@ class SingleIntegration:
     @classmethod
     def of(cls, run: StepInput) -> SingleIntegration:
         """Return the first integration of an experiment, from its products "foregrounds", "gains" and "levels"."""
-        from calstudy.calibrate.problem import make_structure
-
         foregrounds = first_integrations(read_visibilities(run.products["foregrounds"] / VISIBILITIES))
         settings, frame = run.experiment.calibration, Observation(foregrounds)
         if not isinstance(settings, ForegroundFit):
@@ -70,8 +68,6 @@ class SingleIntegration:
 
     def first(self, antennas: int | None, channels: int | None) -> SingleIntegration:
         """Return the first antennas and channels only; all if None."""
-        from calstudy.calibrate.problem import make_structure
-
         if antennas is None and channels is None:
             return self
         numbers = self.numbers[:antennas]

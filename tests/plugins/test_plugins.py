@@ -1,8 +1,11 @@
-"""The code of the notebook on one's own calibrator and sky, and skies that are functions of a file."""
+"""Names of plug-ins; the code of the notebook on one's own calibrator and sky; skies that are functions of a file."""
 
 from __future__ import annotations
 
+import inspect
 import json
+import pkgutil
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +17,16 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
+from calstudy.corrupt.interface import Effect
 from calstudy.experiment.files import load
-from calstudy.instrument.settings import InstrumentSettings
+from calstudy.experiment.model import FIGURES
+from calstudy.instrument.settings import BEAMS, LAYOUTS, InstrumentSettings
 from calstudy.instrument.telescope import make_template
 from calstudy.products import calibration, corruption
 from calstudy.products.files import read_visibilities
 from calstudy.run.execution import Budget
 from calstudy.run.store import Store
+from calstudy.simulate.interface import Engine
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import CodeSources
 from calstudy.studies.load import load_study
@@ -33,6 +39,23 @@ OWN_CODE = Path(__file__).parents[2] / "notebooks" / "own_code.py"
 def template():
     instrument = {**tiny(Path())["instrument"], "channels": {"first": "170 MHz", "width": "400 kHz", "count": 8}}
     return make_template(InstrumentSettings.model_validate(instrument))
+
+
+@pytest.mark.parametrize(
+    "registry", [CALIBRATORS, FIGURES, BEAMS, LAYOUTS, Effect.registry, Engine.registry], ids=lambda found: found.noun
+)
+def test_names_that_are_read_from_the_text_of_modules_are_those_of_their_classes(registry):
+    package = import_module(registry.package)
+    modules = [import_module(f"{registry.package}.{item.name}") for item in pkgutil.iter_modules(package.__path__)]
+    classes = [
+        value
+        for module in modules
+        for name, value in vars(module).items()
+        if inspect.isclass(value) and issubclass(value, registry.base) and not inspect.isabstract(value)
+        if value.__module__ == module.__name__ and not name.startswith("_")
+    ]
+    found = {name: cls for cls in classes for name in cls.names()}
+    assert {name: registry.find(name) for name in registry.built_in()} == found
 
 
 def test_a_sky_of_ones_own(tmp_path):

@@ -63,6 +63,7 @@ OTHER: dict[str, list[Any]] = {
     "Inspection.antennas": [[0, 2]],
     "Inspection.baselines": [[[0, 1]]],
     "Convergence.steps": [[1, 2]],
+    "Outputs.tables": [["spectra"]],
 }
 """Other values of fields whose types do not tell any."""
 FOLLOWED = {**BASE, "calibration": {"weights": "flags"}, "outputs": {"figures": ["convergence"]}}
@@ -73,6 +74,7 @@ SAME: dict[str, str] = {
     "Experiment.sweep": "makes other experiments of this one",
     "Folders.store": "where products go",
     "Folders.runs": "where products go",
+    "Outputs.tables": "adds to the tables of every run; one's own counts by its content (plugins/test_tables)",
     "GainFit.models_at_once": "how much is worked on at a time",
     "PyuvsimEngine.precision": "has one value",
     "Eor.path": "a file, which counts by its content",

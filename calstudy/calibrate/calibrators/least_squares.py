@@ -10,6 +10,7 @@ from calstudy.base.quiet import require_tensorflow
 from calstudy.base.resources import Cost
 from calstudy.calibrate.cost import LEAST_MODELS, Dimensions, solve_cost, solve_memory
 from calstudy.calibrate.interface import Assumed, Calibration, Progress, SolvePlan
+from calstudy.calibrate.problem import fitted_baselines, make_structure, repeat_structure
 from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, GainFit, GaussNewtonSettings, ScalePrior, Solver
 from calstudy.instrument.size import Size
 
@@ -43,7 +44,6 @@ class _LeastSquares(GainFit):
             for field, value in (("foreground_prior.mean", self.foreground_prior.mean), ("prior", self.prior)):
                 if value == "sky-model":
                     return f"{field}: 'sky-model' needs a sky model, and there is none"
-        from calstudy.calibrate.problem import fitted_baselines
 
         try:
             require_tensorflow()
@@ -56,8 +56,6 @@ class _LeastSquares(GainFit):
 
     def plan(self, frame: Frame) -> SolvePlan:
         """Return the cost of a solve of these baselines, with a note if it has too many unknowns."""
-        from calstudy.calibrate.problem import fitted_baselines, make_structure, repeat_structure
-
         frame = frame.baselines(fitted_baselines(frame, self.autos))
         structure = make_structure(frame, self)
         together = min(self.integrations_per_solve, frame.n_times)
@@ -144,7 +142,7 @@ class Unified(_LeastSquares, ForegroundFit):
 
 
 class EmpiricalBayes(_LeastSquares, ForegroundFit):
-    """Gains are fitted with a sky model whose errors fill the modelled delays; their size is estimated from the data."""
+    """Gains are fitted with a sky model whose errors fill the modelled delays; the data tell their size."""
 
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")

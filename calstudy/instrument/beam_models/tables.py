@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from pydantic import Field
 
 from calstudy.base.package_files import PackageFile
+from calstudy.instrument.beam_frequencies import choose_frequencies, mwa_frequencies
 from calstudy.instrument.interface import STAND_IN, Beam, BeamModel
 from calstudy.instrument.settings import Channels
 
@@ -41,7 +42,6 @@ class _BeamfitsBeam(_TabulatedBeam, ABC):
 
     def require_usable(self, channels: Channels) -> None:
         """Read the file, and check that its frequencies enclose the channels."""
-        from calstudy.instrument.beam_frequencies import choose_frequencies
         from calstudy.instrument.beam_grid import read_beamfits
 
         choose_frequencies(read_beamfits(self._file()[0]).freq_array, channels.band, self.interpolation)
@@ -101,8 +101,6 @@ class MwaEmbeddedBeam(_TabulatedBeam):
 
     def require_usable(self, channels: Channels) -> None:
         """Check that the frequencies of the file enclose the channels, without reading the rest of it."""
-        from calstudy.instrument.beam_frequencies import choose_frequencies, mwa_frequencies
-
         choose_frequencies(mwa_frequencies(self.path), channels.band, self.interpolation)
 
     def make(self, channels: Channels) -> Beam:

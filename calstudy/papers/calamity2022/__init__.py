@@ -16,7 +16,6 @@ from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
 
 if TYPE_CHECKING:
     from calstudy.claims.realizations import PooledResults
-    from calstudy.experiment.model import Experiment
     from calstudy.results.reader import Results
     from calstudy.verdicts.statement import Statement
 

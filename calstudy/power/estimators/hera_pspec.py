@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from calstudy.power.interface import Estimator, PowerBeam
+from calstudy.power.spectra import DelaySpectra, delay_spectra
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -12,7 +13,6 @@ if TYPE_CHECKING:
     from pyuvdata import UVData
 
     from calstudy.power.settings import PowerSettings
-    from calstudy.power.spectra import DelaySpectra
 
 
 class HeraPspec(Estimator):
@@ -21,7 +21,6 @@ class HeraPspec(Estimator):
     def estimate(self, even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings) -> DelaySpectra:
         """Return the delay spectra of even times odd; see `calstudy.power.estimate.estimate_power`."""
         from calstudy.power.estimate import estimate_power
-        from calstudy.power.spectra import delay_spectra
 
         return delay_spectra(estimate_power(even, odd, beam, settings), settings)
 
@@ -30,7 +29,6 @@ class HeraPspec(Estimator):
     ) -> DelaySpectra:
         """Return the delay spectra of even times odd, and write those of all pairs to pspec.h5, a `UVPSpec`."""
         from calstudy.power.estimate import estimate_power
-        from calstudy.power.spectra import delay_spectra
 
         found = estimate_power(even, odd, beam, settings)
         found.write_hdf5(str(folder / "pspec.h5"))

@@ -124,7 +124,7 @@ class Collection(Family):
     @property
     def external_keys(self) -> frozenset[str]:
         """Keys of the tables of members that were run before."""
-        return frozenset(task.key for name in self.finished for task in self.studies[name].kept_tables)
+        return frozenset(task.key for name in self.finished for task in self.studies[name].tables)
 
     @property
     def content(self) -> Any:

@@ -300,7 +300,7 @@ class Comparison(Family):
 
 def _what_is_made(experiment: Experiment) -> Experiment:
     """Return an experiment without the settings of products that only its own run makes."""
-    outputs = experiment.outputs.with_defaults("store", "runs", "figures")
+    outputs = experiment.outputs.with_defaults("store", "runs", "figures", "tables")
     return experiment.model_copy(update={"outputs": outputs}).with_defaults("scales", "name", "description", "papers")
 
 

@@ -20,17 +20,14 @@ from calstudy.figures import StudyFigure, figure_task, figures_for
 from calstudy.instrument.as_built import COLUMNS, as_built_rows
 from calstudy.instrument.layouts import make_layout
 from calstudy.products import sky_model
-from calstudy.products.agreement import agreement
 from calstudy.products.graph import Graph
-from calstudy.products.score import score
-from calstudy.products.signal_loss import transfer
-from calstudy.products.spectra import spectra
+from calstudy.products.table import tables_of
 from calstudy.run.execution import Budget
 from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit, require_data_fit
 from calstudy.studies.preflight import frame_of, notes_of, require_possible
-from calstudy.studies.study import Study, built_in_kinds
+from calstudy.studies.study import KINDS, Study
 
 SKY_MODEL_TABLE = "sky-model.csv"
 AS_BUILT_TABLE = "as-built.csv"
@@ -40,6 +37,7 @@ class ExperimentStudy(Study):
     """One validated experiment; `folder` is its run folder if another study decides it."""
 
     model = Experiment
+    keeps_tables = True
 
     def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
         self.file = self.experiment = experiment
@@ -101,20 +99,7 @@ class ExperimentStudy(Study):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        graph = self.graph
-        error = sky_model.error(graph) if self.calibrates else None
-        found = (spectra(graph), agreement(graph), transfer(graph), score(graph), error)
-        return [task for task in found if task is not None]
-
-    @property
-    def kept_tables(self) -> list[Task]:
-        """All tables: a collection needs no more of a member."""
-        return self.tables
-
-    @cached_property
-    def calibrates(self) -> bool:
-        """True if any variant is calibrated."""
-        return any(variant.calibrate for variant in self.experiment.variants.values())
+        return tables_of("experiment", self.graph, self.experiment.outputs.tables)
 
     @cached_property
     def claims(self) -> Task | None:
@@ -125,7 +110,7 @@ class ExperimentStudy(Study):
     def texts(self) -> dict[str, str]:
         """The resolved experiment, the assumptions of the calibrator, and deviations of antennas."""
         found = dict(super().texts)
-        if self.calibrates:
+        if self.experiment.calibrates:
             found[f"tables/{SKY_MODEL_TABLE}"] = self._sky_model_table()
         if self.experiment.instrument.as_built.note:
             found[f"tables/{AS_BUILT_TABLE}"] = self._as_built_table()
@@ -134,7 +119,7 @@ class ExperimentStudy(Study):
     @property
     def entries(self) -> dict[str, Any]:
         """The sky model of the calibrator, and all seeds."""
-        described = {"sky_model": sky_model.described(self.graph)} if self.calibrates else {}
+        described = {"sky_model": sky_model.described(self.graph)} if self.experiment.calibrates else {}
         return {**described, "seeds": seeds(self.experiment.model_dump(mode="json"))}
 
     def _as_built_table(self) -> str:
@@ -239,14 +224,13 @@ def content_of(experiment: Experiment) -> Any:
 
 def study_of(experiment: Experiment) -> Study:
     """Return the study of an experiment: of the kind whose key it has, such as `sweep`."""
-    special: list[Any] = [kind for kind in built_in_kinds() if kind.model is Experiment and kind.key]
-    return next((kind for kind in special if getattr(experiment, kind.key)), ExperimentStudy).of(experiment)
+    special = KINDS.marked("key", [name for name, value in experiment if value])
+    return (special[0] if special else ExperimentStudy).of(experiment)
 
 
 def describe_setup(experiment: Experiment) -> str:
     """Return the data of an experiment and how they are calibrated."""
-    calibrated = any(variant.calibrate for variant in experiment.variants.values())
-    return f"{describe_data(experiment)}; {experiment.calibration.label if calibrated else 'not calibrated'}"
+    return f"{describe_data(experiment)}; {experiment.calibration.label if experiment.calibrates else 'not calibrated'}"
 
 
 def describe_data(experiment: Experiment) -> str:

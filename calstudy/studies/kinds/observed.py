@@ -16,8 +16,7 @@ from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.power.settings import PowerSettings
 from calstudy.products.graph import MeasuredGraph
-from calstudy.products.observed_injection import expected_loss, transfer
-from calstudy.products.observed_results import observed_spectra, quality
+from calstudy.products.table import tables_of
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.execution import Budget
@@ -98,9 +97,7 @@ class ObservedStudy(DataStudy):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        graph = self.graph
-        loss = [transfer(graph), expected_loss(graph)] if self.file.injection else []
-        return [observed_spectra(graph), quality(graph), *filter(None, loss)]
+        return tables_of("observed", self.graph)
 
 
 def _halves(file: ObservedFile) -> Parts:

@@ -30,6 +30,8 @@ class Realizations(ExperimentStudy):
     """
 
     key = "realizations"
+    # The members of a collection that have realizations are always run.
+    keeps_tables = False
 
     def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
         expand_realizations(experiment)
@@ -44,11 +46,6 @@ class Realizations(ExperimentStudy):
     def tables(self) -> list[Task]:
         """The tables and verdicts of all realizations."""
         return [pooled(self.graph)]
-
-    @property
-    def kept_tables(self) -> list[Task]:
-        """None: the members of a collection that have realizations are always run."""
-        return []
 
     @property
     def texts(self) -> dict[str, str]:
