@@ -12,10 +12,13 @@ from test_calamity import make_uvdata
 from test_foreground_prior import dense_covariance, free_structure, prior_structure, turned
 from toy import HEX, complex_normal, make_toy, scattered
 
+from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube
 from calstudy.calibrate.calibrators.least_squares import DelayWeighted, SkyBased
 from calstudy.calibrate.deviation import estimate
 from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.interface import Assumed
+from calstudy.calibrate.preparation import prepare, problem_at
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
 from calstudy.calibrate.settings import ForegroundPrior
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
@@ -171,6 +174,23 @@ def test_a_sky_model_without_errors_is_sky_based_calibration():
     difference = result.gains.gain_array - known.gains.gain_array
     # Errors of the gains by the noise are 4e-4.
     assert np.sqrt(np.mean(np.abs(difference) ** 2)) < 1e-4
+
+
+def test_the_problem_of_a_solution_has_the_deviations_that_were_found():
+    """What is computed of a finished fit, as its linear response, takes them from the record of the solve."""
+    toy = make_toy(scattered(6), noise=NOISE)
+    uvd = make_uvdata(toy, n_times=1)
+    sky = from_cube(uvd, 1.05 * toy.foregrounds[None, :, :, None])
+    noise = NOISE * float(np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2)))
+    result = run_calibrator(ESTIMATED, uvd, sky, noise=noise)
+    (record,) = result.solutions
+    gains = result.gains.gain_array[:, :, 0, 0]
+    prepared = prepare(Observation(uvd), ESTIMATED, Assumed(Observation(sky), noise=noise))
+    problem = problem_at(prepared, ESTIMATED, slice(0, 1), 0, gains, record)
+    assert problem.fractions[0] == pytest.approx(record.diagnostics["deviation"][0])
+    # The residual is at the minimum for these: coefficients and gains that the data determine do not move.
+    again = solve(replace(problem, initial_gains=gains), GaussNewton(tolerance=1e-5))
+    assert again.record.loss_history[-1] > 0.99 * again.record.loss_history[0]
 
 
 def test_one_level_cannot_be_estimated_beside_a_fixed_one():
