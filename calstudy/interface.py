@@ -516,7 +516,8 @@ class OpenRun:
 
     @cached_property
     def _study(self) -> Study:
-        return load_study(self.folder / EXPERIMENT)
+        with self._folder.reading():
+            return load_study(self.folder / EXPERIMENT)
 
     @property
     def _experiment(self) -> ExperimentStudy:

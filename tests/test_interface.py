@@ -124,3 +124,17 @@ def test_what_a_run_lacks_has_a_reason(run, tmp_path):
     with pytest.raises(InputError, match="not the folder of a finished run"):
         calstudy.open_run(tmp_path)
     assert "T " in repr(run)
+
+
+def test_a_run_of_an_older_version_says_so(run, tmp_path):
+    """A field that this version does not know any more is a fact of the run, not a mistake of its user."""
+    for name in ("manifest.json", "experiment.yaml"):
+        (tmp_path / name).write_bytes((run.folder / name).read_bytes())
+    older = (
+        (tmp_path / "experiment.yaml")
+        .read_text(encoding="utf-8")
+        .replace("calibration:", "calibration:\n  skip_flagged: 0.5", 1)
+    )
+    (tmp_path / "experiment.yaml").write_text(older, encoding="utf-8")
+    with pytest.raises(InputError, match=r"written on .* by .*; this version refuses it.*\(calibration.skip_flagged"):
+        calstudy.open_run(tmp_path).gains("residual")

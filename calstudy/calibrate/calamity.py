@@ -98,7 +98,8 @@ def _solve_all(
     n_polarizations = prepared.data.n_polarizations
     for p in range(n_polarizations):
         warm: WarmStart | None = None
-        anew, deviations = True, None
+        deviations: tuple[float, float] | None = None
+        anew = True
         for index, times in enumerate(groups):
             with Usage() as usage:
                 problem = make_problem(prepared, settings, times, p)
@@ -107,7 +108,8 @@ def _solve_all(
                 else:
                     start = warm if settings.solver.warm_start else None
                     if settings.estimates_deviation or isinstance(settings.weights, GainWeights):
-                        solution, warm, deviations = _Passes(settings, solver).solve(problem, start, deviations)
+                        known = deviations if settings.solver.warm_start else None
+                        solution, warm, deviations = _Passes(settings, solver).solve(problem, start, known)
                     else:
                         solution, warm, anew = _solve(problem, solver, start, anew)
                     solution = _noted(solution, **_scale(solution, problem))
