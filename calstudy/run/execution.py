@@ -167,6 +167,9 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     settings = {
         "distributed.nanny.pre-spawn-environ": environment,
         "distributed.admin.tick.limit": "10 m",
+        # Nobody looks at dask's own profile and load; every 10 ms, and 500 ms, they take time from the work.
+        "distributed.worker.profile.enabled": False,
+        "distributed.admin.system-monitor.interval": "10 s",
         "distributed.worker.memory.terminate": False,
         "distributed.comm.timeouts.connect": "60 s",
         "distributed.scheduler.allowed-failures": 2,
@@ -231,7 +234,10 @@ class _Queue:
     """
 
     def __init__(self, tasks: Sequence[Task], store: Store, client: Client, again: Container[str]) -> None:
-        self._store, self._client, self._again = store, client, again
+        self._client, self._suffix = client, digest_json(str(store.root))[:8]
+        # All at once, before a worker's thread has work: they take sources of products, and two threads that read
+        # source at the same time can fail (`ast.parse`, CPython before 3.13).
+        self._orders = {task.key: WorkOrder.of(task, store, task.key in again) for task in tasks}
         self._priority = {task.key: -place for place, task in enumerate(tasks)}
         self._tasks = {task.key: task for task in tasks}
         self._missing = {
@@ -259,8 +265,8 @@ class _Queue:
     def _future(self, task: Task) -> Future:
         return self._client.submit(
             _announce_and_perform,
-            WorkOrder.of(task, self._store, task.key in self._again),
-            key=f"{task.stage.name}-{task.key}-{digest_json(str(self._store.root))[:8]}",
+            self._orders[task.key],
+            key=f"{task.stage.name}-{task.key}-{self._suffix}",
             priority=self._priority[task.key],
             pure=False,
         )
