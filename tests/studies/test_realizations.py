@@ -39,10 +39,8 @@ TWO_BLOCKS = [{"draw": ["gains", "noise"], "count": 4}, {"draw": ["eor"], "count
 
 def small(folder, **fields) -> dict:
     data = override(tiny(folder), "instrument.layout", {"kind": "mwa-compact-minredundant", "count": 7})
-    # The figures of an experiment are drawn elsewhere. So few antennas stall in single precision: the second
-    # integration would be solved twice, from the first and anew.
+    # The figures of an experiment are drawn elsewhere.
     cheap = {"simulation.chunks": 1, "calibration.chunks": 1, "outputs.figures": ["layout"]}
-    cheap["calibration.solver"] = {"warm_start": False}
     for path, value in {**cheap, "realizations": EVERYTHING}.items():
         data = override(data, path, value)
     for path, value in fields.items():
