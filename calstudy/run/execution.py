@@ -167,6 +167,9 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     settings = {
         "distributed.nanny.pre-spawn-environ": environment,
         "distributed.admin.tick.limit": "10 m",
+        # Nobody looks at dask's own profile and load; every 10 ms, and 500 ms, they take time from the work.
+        "distributed.worker.profile.enabled": False,
+        "distributed.admin.system-monitor.interval": "10 s",
         "distributed.worker.memory.terminate": False,
         "distributed.comm.timeouts.connect": "60 s",
         "distributed.scheduler.allowed-failures": 2,

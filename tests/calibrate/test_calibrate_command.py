@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
@@ -22,16 +24,36 @@ from calstudy.power.tables import load_spectrum
 from calstudy.realdata.settings import defaults
 from calstudy.studies.calibration import FIGURE_FILES
 
+WRITTEN = {"gains.calh5", "model.uvh5", "residual.uvh5", "solution.json", *FIGURE_FILES}
+"""Without options."""
 OPTIONS = ["--buffer", "50 ns", "--set", "basis.min_delay=50 ns"]
 
 
-@pytest.fixture
-def data(toy, tmp_path):
-    path = tmp_path / "data.uvh5"
+def write_data(toy, folder):
+    path = folder / "data.uvh5"
     uvd = make_uvdata(toy, 2)
     uvd.flag_array[5, :7] = True
     uvd.write_uvh5(str(path))
     return path
+
+
+@pytest.fixture
+def data(toy, tmp_path):
+    return write_data(toy, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def finished(toy, tmp_path_factory):
+    """The folder of data, with all that the command can write in its folder ``out``, and what it told."""
+    folder, told = tmp_path_factory.mktemp("calibrated"), io.StringIO()
+    arguments = [write_data(toy, folder), *OPTIONS, "--output", "out", "--calfits", "--expected-loss"]
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(told), redirect_stderr(told):
+        patch.setattr(sys, "argv", ["calstudy", "calibrate", *map(str, arguments)])
+        patch.chdir(folder)
+        with pytest.raises(SystemExit) as end:
+            cli.main(leave=sys.exit)
+    assert end.value.code == 0
+    return folder, told.getvalue()
 
 
 @pytest.fixture
@@ -62,27 +84,23 @@ def test_a_dry_run_says_what_would_be_solved_and_imports_no_tensorflow(data, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["data.uvh5"]
 
 
-def test_the_expected_loss_is_written_and_how_far_the_fit_is_told(command, data, tmp_path):
-    code, error = command(data, *OPTIONS, "--output", "out", "--expected-loss")
-    assert code == 0
-    expected = load_spectrum(tmp_path / "out" / "expected-transfer.ee.h5", ExpectedTransfer)
+def test_the_expected_loss_is_written_and_how_far_the_fit_is_told(command, finished):
+    folder, error = finished
+    expected = load_spectrum(folder / "out" / "expected-transfer.ee.h5", ExpectedTransfer)
     assert expected.transfer.shape == (28, 64)
     assert -1e-9 < expected.transfer.min() < 0.1 < 0.5 < expected.transfer.max() < 1
     assert not expected.error.any()
     assert "left by stopping: at most" in error
-    records = json.loads((tmp_path / "out" / "solution.json").read_text())["records"]
+    records = json.loads((folder / "out" / "solution.json").read_text())["records"]
     assert all(0 < record["newton_decrement"] < 1e-3 and record["decrement_rms"] > 0 for record in records)
-    again, told = command(data, *OPTIONS, "--output", "out", "--expected-loss")
+    again, told = command(folder / "data.uvh5", *OPTIONS, "--output", folder / "out", "--expected-loss")
     assert again == 2
     assert "expected-transfer.ee.h5" in told
 
 
-def test_everything_is_written_and_readable(command, data, tmp_path):
-    code, _ = command(data, *OPTIONS, "--output", "out", "--calfits")
-    assert code == 0
-    out = tmp_path / "out"
-    names = {path.name for path in out.iterdir()}
-    assert names == {"gains.calh5", "gains.calfits", "model.uvh5", "residual.uvh5", "solution.json", *FIGURE_FILES}
+def test_everything_is_written_and_readable(finished):
+    out, data = finished[0] / "out", finished[0] / "data.uvh5"
+    assert {path.name for path in out.iterdir()} == {*WRITTEN, "gains.calfits", "expected-transfer.ee.h5"}
     gains, fits = UVCal.from_file(str(out / "gains.calh5")), UVCal.from_file(str(out / "gains.calfits"))
     assert np.allclose(gains.gain_array, fits.gain_array, rtol=1e-5)
     model, residual = (UVData.from_file(str(out / name)) for name in ("model.uvh5", "residual.uvh5"))
@@ -96,9 +114,8 @@ def test_everything_is_written_and_readable(command, data, tmp_path):
     assert np.abs(rebuilt - original.data_array)[used].max() < 1e-5 * np.abs(original.data_array).max()
 
 
-def test_scale_and_band_shape_against_the_sky_model_are_told(command, data, tmp_path):
-    command(data, *OPTIONS, "--output", "first")
-    sky = UVData.from_file(str(tmp_path / "first" / "model.uvh5"))
+def test_scale_and_band_shape_against_the_sky_model_are_told(command, finished, data, tmp_path):
+    sky = UVData.from_file(str(finished[0] / "out" / "model.uvh5"))
     sky.data_array *= 2 * np.linspace(0.9, 1.1, sky.Nfreqs)[:, None]
     sky.write_uvh5(str(tmp_path / "sky.uvh5"))
     code, error = command(data, *OPTIONS, "--output", "out", "--sky-model", "sky.uvh5", "--set", "prior=sky-model")
@@ -130,6 +147,7 @@ def test_results_are_never_overwritten_unasked(command, data, tmp_path):
     assert error == "calstudy: --output out: holds gains.calh5 already; use --overwrite or another folder\n"
     assert (folder / "gains.calh5").read_text() == "precious"
     assert command(data, *OPTIONS, "--output", "out", "--overwrite")[0] == 0
+    assert {path.name for path in folder.iterdir()} == WRITTEN
     assert UVCal.from_file(str(folder / "gains.calh5")).Ntimes == 2
 
 
@@ -245,11 +263,9 @@ def test_python_calibrates_as_the_command_does(data, command, tmp_path, monkeypa
         calstudy.calibrate_data(data, "other", **{"bsis.buffer": "50 ns"})
 
 
-def test_gains_have_their_errors_beside_what_other_readers_see(command, data, tmp_path):
-    code, _ = command(data, *OPTIONS, "--output", "out")
-    assert code == 0
-    gains = UVCal.from_file(str(tmp_path / "out" / "gains.calh5"))
-    found = CalibratedData(tmp_path / "out")
+def test_gains_have_their_errors_beside_what_other_readers_see(command, finished, data, tmp_path):
+    gains = UVCal.from_file(str(finished[0] / "out" / "gains.calh5"))
+    found = CalibratedData(finished[0] / "out")
     errors = found.gain_errors
     assert errors.amplitude.shape == gains.gain_array.shape
     # No errors where there are no gains.

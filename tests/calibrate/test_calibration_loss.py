@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import tensorflow as tf
 from toy import HEX, complex_normal, make_toy
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import make_basis
 from calstudy.calibrate.problem import FitStructure, flag_weights, gain_products

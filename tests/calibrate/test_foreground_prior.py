@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tensorflow as tf
 from hera_cal.datacontainer import DataContainer
 from hera_cal.redcal import RedundantCalibrator
 from hera_cal.skycal import refine_gains
@@ -14,6 +13,7 @@ from test_calamity import make_uvdata
 from test_calibration_loss import redundant_structure
 from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 
+from calstudy.base.tensorflow import tf
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import Bucket, ForegroundBasis, flat_wedge_root, make_basis

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tensorflow as tf
 from test_solvers import in_the_span, product_error
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import dpss_vectors, gain_vectors
 from calstudy.calibrate.problem import flag_weights, gain_products, repeat_structure

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tensorflow as tf
 from test_calibration_loss import redundant_structure
 from toy import FREQUENCIES, HEX, complex_normal, make_toy
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.problem import flag_weights

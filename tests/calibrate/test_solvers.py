@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tensorflow as tf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_calibration_loss import redundant_structure
 from toy import complex_normal, make_toy, scattered
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate import calamity
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase, model_scale, sky_model_slope
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products

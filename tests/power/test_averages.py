@@ -14,7 +14,7 @@ from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.power import cosmology as c
 from calstudy.power import delay, errors
-from calstudy.power.binned import cylindrical_average, make_bin_edges, spherical_average
+from calstudy.power.binned import cylindrical_average, make_bin_edges, modes_in_bins, spherical_average
 from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, delay_spectra, outside_wedge
@@ -52,6 +52,23 @@ def cross_group(even, odd):
     n = even.shape[-2]
     total = even.conj().sum(axis=-2) * odd.sum(axis=-2) - (even.conj() * odd).sum(axis=-2)
     return total / (n * (n - 1))
+
+
+def spherical_averages(power, spectra, settings, exclude_wedge):
+    """The spherical average of each of many powers, (N, Nu, Nd), on the same baselines, and the powers in its bins.
+
+    It is linear in the power, and its bins and numbers of modes are the same for all.
+    """
+    trials = [
+        spherical_average(dataclasses.replace(spectra, power=one), settings, exclude_wedge) for one in power[[0, -1]]
+    ]
+    bins = modes_in_bins(spectra, settings, exclude_wedge)
+    weights = (bins == np.arange(trials[0].k.size)[:, None, None]) * spectra.n_pairs[:, None]
+    filled = trials[0].n_modes > 0
+    values = np.einsum("nud,bud->nb", power, weights[filled]) / weights[filled].sum(axis=(1, 2))
+    for trial, found in zip(trials, values[[0, -1]], strict=True):
+        np.testing.assert_allclose(found, trial.power[filled], rtol=1e-9)
+    return trials[0], values.real, filled
 
 
 @pytest.fixture(
@@ -187,11 +204,11 @@ def test_noise_errors_equal_the_scatter(taper, n):
     even, odd = (white_delay_spectra(rng, shape, taper) for _ in range(2))
     power = (even.conj() * odd)[:, :, 0] if n == 1 else cross_group(even, odd)
     n_pairs = np.full(n_units, 1 if n == 1 else n * (n - 1))
-    trials = [spherical_average(make_spectra(p, vectors, n_pairs, taper), SETTINGS, exclude_wedge=True) for p in power]
-    values = np.array([trial.power.real for trial in trials])[:, trials[0].n_modes > 0]
-    levels = [errors.noise_level(make_spectra(p, vectors, n_pairs, taper)) for p in power]
+    spectra = make_spectra(power[0], vectors, n_pairs, taper)
+    trial, values, filled = spherical_averages(power, spectra, SETTINGS, exclude_wedge=True)
+    levels = [errors.noise_level(dataclasses.replace(spectra, power=one)) for one in power]
     assert np.sqrt(np.mean(np.square(levels))) == pytest.approx(np.sqrt(0.5), rel=0.01)
-    predicted = errors.with_errors(trials[0], noise=np.sqrt(0.5)).error[trials[0].n_modes > 0]
+    predicted = errors.with_errors(trial, noise=np.sqrt(0.5)).error[filled]
     # 1500 trials give each standard deviation to 2 %.
     np.testing.assert_allclose(values.std(axis=0), predicted, rtol=0.07)
     assert np.mean(values.std(axis=0) / predicted) == pytest.approx(1.0, abs=0.015)
@@ -206,14 +223,12 @@ def test_sample_variance_equals_the_scatter(n):
     power = np.abs(signal) ** 2 + 0j
     n_pairs = np.full(n_units, 1 if n == 1 else n * (n - 1))
     settings = PowerSettings(bins=KBins(min="1.5 h/Mpc", max="6.0 h/Mpc", width="0.5 h/Mpc"))
-    trials = [spherical_average(make_spectra(p, vectors, n_pairs), settings, False) for p in power]
-    values = np.array([trial.power.real for trial in trials])
-    expected = dataclasses.replace(trials[0], power=np.ones_like(trials[0].power))
+    trial, values, filled = spherical_averages(power, make_spectra(power[0], vectors, n_pairs), settings, False)
+    expected = dataclasses.replace(trial, power=np.ones_like(trial.power))
     predicted = errors.with_errors(expected, signal=expected)
-    filled = predicted.n_modes > 0
     np.testing.assert_allclose(predicted.noise_error[filled], 0)
-    np.testing.assert_allclose(values.mean(axis=0)[filled], 1.0, rtol=0.05)
-    assert np.mean(values.std(axis=0)[filled] / predicted.error[filled]) == pytest.approx(1.0, abs=0.02)
+    np.testing.assert_allclose(values.mean(axis=0), 1.0, rtol=0.05)
+    assert np.mean(values.std(axis=0) / predicted.error[filled]) == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize("n", [1, 5])
@@ -243,13 +258,12 @@ def test_signal_of_neighbouring_baselines_is_not_counted_twice():
     visibilities = (response @ brightness).reshape(len(vectors), n_trials, n_delays)
     power = np.abs(np.fft.fft(visibilities, axis=-1)) ** 2 / n_delays + 0j
     settings = PowerSettings(bins=KBins(max="20.0 h/Mpc", width="20.0 h/Mpc"))
-    trials = [
-        spherical_average(make_spectra(power[:, t], vectors, taper="none"), settings, False) for t in range(n_trials)
-    ]
-    scatter = np.std([trial.power.real for trial in trials])
-    expected = dataclasses.replace(trials[0], power=np.ones(1, dtype=complex))
-    assert scatter / errors.with_errors(expected, signal=expected).error[0] == pytest.approx(1.0, abs=0.06)
-    assert trials[0].sample_modes[0] < 0.75 * trials[0].n_modes[0]
+    power = power.swapaxes(0, 1)
+    spectra = make_spectra(power[0], vectors, taper="none")
+    trial, values, _ = spherical_averages(power, spectra, settings, False)
+    expected = dataclasses.replace(trial, power=np.ones(1, dtype=complex))
+    assert values.std() / errors.with_errors(expected, signal=expected).error[0] == pytest.approx(1.0, abs=0.06)
+    assert trial.sample_modes[0] < 0.75 * trial.n_modes[0]
 
 
 @pytest.mark.parametrize("n", [1, 4])
@@ -267,14 +281,13 @@ def test_the_error_of_the_difference_is_the_scatter_where_the_signal_is_common(n
     power = (even.conj() * odd)[:, :, 0] if n == 1 else cross_group(even, odd)
     n_pairs = np.full(len(vectors), 1 if n == 1 else n * (n - 1))
     settings = PowerSettings(bins=KBins(min="1.5 h/Mpc", max="4.5 h/Mpc", width="1.0 h/Mpc"))
-
-    def average(values):
-        return spherical_average(make_spectra(values, vectors, n_pairs), settings, False)
-
-    both = [(average(p), average(np.abs(s[:, 0]) ** 2 + 0j)) for p, s in zip(power, signal, strict=True)]
-    scatter = np.std([(total.power - sky.power).real for total, sky in both], axis=0)
-    expected = dataclasses.replace(both[0][1], power=np.ones_like(both[0][1].power))
-    predicted = errors.with_errors(both[0][0], noise=np.sqrt(0.5), signal=expected).difference_error
+    spectra = make_spectra(power[0], vectors, n_pairs)
+    trial, total, filled = spherical_averages(power, spectra, settings, False)
+    sky = spherical_averages(np.abs(signal[:, :, 0]) ** 2 + 0j, spectra, settings, False)[1]
+    assert filled.all()
+    scatter = np.std(total - sky, axis=0)
+    expected = dataclasses.replace(trial, power=np.ones_like(trial.power))
+    predicted = errors.with_errors(trial, noise=np.sqrt(0.5), signal=expected).difference_error
     # 2000 trials give each standard deviation to 1.6 %; limits are four times that.
     np.testing.assert_allclose(scatter / predicted, 1.0, atol=0.065)
     assert np.mean(scatter / predicted) == pytest.approx(1.0, abs=0.04)

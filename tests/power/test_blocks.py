@@ -66,15 +66,16 @@ def test_a_source_away_from_the_zenith_is_lost_in_an_hour_and_kept_in_blocks(hou
     data = drifting_source(hour, SkyCoord(alt=60 * u.deg, az=40 * u.deg, frame=place).icrs)
     longest = np.argmax(np.linalg.norm(baseline_vectors(hour), axis=1))
     assert np.abs(to_cube(fringe_stop_and_average(data)))[0, longest].max() < 0.5
-    # 6 min on 220 m: the offset of the block's own phase centre is what is left.
-    kept = np.abs(to_cube(average_in_blocks(data, blocks_of(data, 60.0))))
-    assert kept.shape[0] == 60
+    # 1 min on 220 m: the offset of the block's own phase centre is what is left.
+    first = data.select(times=np.unique(data.time_array)[:30], inplace=False)
+    kept = np.abs(to_cube(average_in_blocks(first, blocks_of(first, 60.0))))
+    assert kept.shape[0] == 10
     assert kept[:, longest].min() > 0.99
 
 
 def test_interleaved_halves_have_the_same_phase_centres(hour, drifting_source):
-    data = drifting_source(hour, SkyCoord(ra=30 * u.deg, dec=-20 * u.deg))
-    times = np.unique(data.time_array)
+    times = np.unique(hour.time_array)[:36]
+    data = drifting_source(hour.select(times=times, inplace=False), SkyCoord(ra=30 * u.deg, dec=-20 * u.deg))
     span = (times[0], times[-1])
     halves = [data.select(times=times[start::2], inplace=False) for start in (0, 1)]
     own, common = (

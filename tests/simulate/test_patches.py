@@ -37,7 +37,7 @@ def eor_direct(template, eor, embedded_beam):
 @pytest.fixture(scope="module")
 def wide():
     """8 MHz in 40 channels."""
-    return observe(count=36, channels=40, width="200 kHz", times=8, integration="15 s", polarizations=("xx",))
+    return observe(count=20, channels=40, width="200 kHz", times=8, integration="15 s", polarizations=("xx",))
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,9 @@ def test_a_smooth_sky_is_exact_to_its_tolerance(wide, sources, embedded_beam):
     assert relative_error(cube, direct) < 1e-8
 
 
-def test_several_beams_have_patches_too(template, eor, embedded_beam, dipole_beam):
-    beams = AntennaBeams((embedded_beam, dipole_beam), np.arange(36) % 2)
+def test_several_beams_have_patches_too(eor, embedded_beam, dipole_beam):
+    template = observe(count=12, channels=3, width="640 kHz", times=28, integration="4 s")
+    beams = AntennaBeams((embedded_beam, dipole_beam), np.arange(12) % 2)
     direct = ENGINE.simulate(eor, beams, template)
     assert rms_error(ENGINE.interpolate(eor, beams, template, CHANNELS), direct) < 1e-2 * CHANNELS.tolerance
 
