@@ -28,6 +28,10 @@ from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, solve_warm
 
 UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
+UNRESOLVED_DEVIATION = (
+    "the deviation of the foregrounds from the sky model is lost in rounding; "
+    "give foreground_prior.deviation as a number"
+)
 
 
 def make_solver(settings: GainFit) -> Solver:
@@ -109,7 +113,8 @@ def _solve_all(
                     start = warm if settings.solver.warm_start else None
                     if settings.estimates_deviation or isinstance(settings.weights, GainWeights):
                         known = deviations if settings.solver.warm_start else None
-                        solution, warm, deviations = _Passes(settings, solver).solve(problem, start, known)
+                        seed = round(float(prepared.data.times[times.start]) * 86400), p
+                        solution, warm, deviations = _Passes(settings, solver, seed).solve(problem, start, known)
                     else:
                         solution, warm, anew = _solve(problem, solver, start, anew)
                     solution = _noted(solution, **_scale(solution, problem))
@@ -149,13 +154,14 @@ class _Pass(NamedTuple):
 class _Passes:
     """Solves with weights from the gains, and deviations of the foregrounds, of the pass before, until both settle.
 
-    Settings ask for one of the two, or both.
+    Settings ask for one of the two, or both. `seed` is that of the estimates.
     """
 
-    def __init__(self, settings: GainFit, solver: Solver) -> None:
+    def __init__(self, settings: GainFit, solver: Solver, seed: tuple[int, int]) -> None:
         self._weights = settings.weights if isinstance(settings.weights, GainWeights) else None
-        self._estimated, self._solver = settings.estimates_deviation, solver
-        self._most = PASSES if self._weights is None else self._weights.passes
+        self._estimated, self._solver, self._seed = settings.estimates_deviation, solver, seed
+        passes = 0 if self._weights is None else self._weights.passes
+        self._most = max(passes, PASSES) if self._estimated else passes
 
     def solve(
         self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
@@ -180,12 +186,12 @@ class _Passes:
                 break
             # Weights that settle further hardly change an estimate that has settled.
             if self._estimated and (found is None or not found.settled):
-                found = estimate(current, solution.gains, solution.model)
+                found = estimate(current, solution.gains, solution.model, self._seed)
             before, current = current, self._for_pass(problem, solution.gains, found and found.deviations)
             change = 0.0 if self._weights is None else weight_change(current.weights, before.weights)
             settled = (self._weights is None or change < self._weights.tolerance) and (found is None or found.settled)
             # What follows from gains that are far from the solution leads away from it.
-            if settled or solution.record.status == "max-steps":
+            if settled or solution.record.status == "max-steps" or not (found is None or found.resolved):
                 break
         return self._kept(done, change, found)
 
@@ -205,8 +211,11 @@ class _Passes:
         if self._weights is not None:
             notes["weight_change"] = change
         if found is not None and kept.deviations is not None:
-            notes |= {"deviation": list(kept.deviations), "deviation_error": list(found.error)}
-            if not found.settled and record.status == "converged":
+            error = found.error if kept is done[-1] else (None, None)
+            notes |= {"deviation": list(kept.deviations), "deviation_error": list(error)}
+            if not found.resolved:
+                record = replace(record, status="stalled", message=UNRESOLVED_DEVIATION)
+            elif not found.settled and record.status == "converged":
                 record = replace(record, status="max-steps", message=f"{UNSETTLED_DEVIATION} {len(done)} passes")
         return kept._replace(solution=_noted(kept.solution._replace(record=record), **notes))
 

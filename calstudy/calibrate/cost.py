@@ -9,7 +9,6 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import (
     MOST_COUPLED,
-    START_DEVIATION,
     BasisSettings,
     ForegroundFit,
     GainFit,
@@ -39,6 +38,8 @@ COLD_SECONDS = 1.5
 FROZEN_SECONDS, FREE_SECONDS, FINITE_SECONDS = 0.1, 0.4, 0.4
 FREE_TOLERANCE, FREE_POWER = 1e-3, -0.6
 FINITE_DEVIATION = 0.1
+# With its passes and probes.
+ESTIMATED_SECONDS = 2.0
 # Compilation takes 3 s and more; pieces with the same baselines in one process share it, so that most have none.
 START_SECONDS = 1.5
 ADAMAX_STEP = 4e-3
@@ -168,8 +169,9 @@ def _warm_seconds(settings: GainFit, tolerance: float) -> float:
         return FROZEN_SECONDS
     prior = settings.foreground_prior
     if prior.finite:
-        given = (prior.deviation, prior.shared_deviation)
-        widest = max(START_DEVIATION if value == "estimated" else float(value) for value in given)
+        if prior.estimated:
+            return ESTIMATED_SECONDS
+        widest = max(float(prior.deviation), float(prior.shared_deviation))
         return FINITE_SECONDS * max(1.0, widest / FINITE_DEVIATION)
     # No solve takes more than some hundred steps.
     return FREE_SECONDS * max(1.0, (max(tolerance, 1e-6) / FREE_TOLERANCE) ** FREE_POWER)

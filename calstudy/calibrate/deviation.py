@@ -18,48 +18,61 @@ determine few, it is further away. A step
 
     ln f = F^-1 diag(t) ln(|B_k^T M y|^2 / t_k),   t_k = tr(B_k^T M B_k),
 
-is exact in the first case and a step of Fisher scoring near the maximum. F^-1 is the covariance of ln f there. Traces
-are from random x (Hutchinson 1990, Commun. Stat. Simul. Comput. 19, 433), of which two add little to that error.
+is exact in the first case, for one k, and a step of Fisher scoring near the maximum. F^-1 is the covariance of ln f
+there. Traces are from random x (Hutchinson 1990, Commun. Stat. Simul. Comput. 19, 433), with a variance of F over their
+number.
+
+A variance whose likelihood is largest at or below zero shrinks forever, to less and less effect: it is taken out of F,
+so that the others settle without it. All coefficients of all integrations of a solve count as independent.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from calstudy.base.tensorflow import tf
 from calstudy.calibrate.expected_loss import GainResponse
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
 
-LEAST, MOST = 1e-6, 1.0
-"""Limits of the deviation, over the rms of the sky model: where it has no effect, and where the sky model has none."""
+LEAST, MOST = 1e-7, 10.0
+"""Limits of the deviation, over the rms of the sky model."""
 FURTHEST = math.log(100)
 """Largest change of the logarithm of a variance in a step."""
 FAR_BELOW = -0.7
 """Steps down to noise are short of it, and are doubled from here on."""
-PROBES = 2
-SEED = 0
+PROBES = 4
 TOLERANCE = 1e-2
 """Of the gains' response to a probe: traces have an error of some percent in any case."""
 SETTLED = 0.05
 """Increase of the logarithm of the likelihood from which on another pass is made: that of a step of 0.3 errors."""
 PASSES = 10
-"""Largest number of passes where weights need none."""
+"""Largest number of passes, or that of the weights if they have more."""
+SINGLE = 200.0
+"""Largest ratio of deviation and noise for probes in single precision."""
+ALIKE = 0.95
+"""Largest correlation of two variances in F: without redundant baselines they are one, and their probes differ."""
+ROUNDED = 1.1
+"""F_kk is below t_k for each probe; probes beyond this are rounding."""
 
 
 class Estimate(NamedTuple):
     """Deviations of the prior, (own, shared), over the rms of the sky model.
 
-    `error` is that of the logarithm of each, and `settled` says whether another pass would not change them.
+    `error` is that of the logarithm of each, None for one that noise hides, or that the prior does not have. `settled`
+    says whether another pass would not change them, and `resolved` whether they are more than rounding.
     """
 
     deviations: tuple[float, float]
-    error: tuple[float, float]
+    error: tuple[float | None, float | None]
     settled: bool
+    resolved: bool = True
 
 
-def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) -> Estimate:
+def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, seed: Sequence[int]) -> Estimate:
     """Make one step from the deviations of a problem towards the most likely ones, at its solution.
 
     Parameters
@@ -68,9 +81,13 @@ def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) 
         The fitted problem, whose foregrounds have a finite prior.
     gains, model
         The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
+    seed
+        Seed of the probes, other numbers for other solves.
     """
-    response, sequences = GainResponse(problem, gains, TOLERANCE), _Sequences(problem)
-    products, rng = gain_products(gains, problem.structure.antennas), np.random.default_rng(SEED)
+    sequences = _Sequences(problem)
+    widest = max(problem.deviations) * math.sqrt(problem.weights.max())
+    response = GainResponse(problem, gains, TOLERANCE, tf.float32 if widest < SINGLE else tf.float64)
+    products, rng = gain_products(gains, problem.structure.antennas), np.random.default_rng(list(seed))
     residual = problem.weights * np.abs(products) ** 2 * (problem.visibilities / products - model)
     powers = np.array([_power(found) for found in sequences.coefficients(residual)])
     traces, fisher = np.zeros(len(powers)), np.zeros((len(powers), len(powers)))
@@ -80,16 +97,35 @@ def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) 
             left = response.left_of(drawn)
             traces[level] += np.vdot(drawn, left).real / PROBES
             fisher[level] += [_power(found) / PROBES for found in sequences.coefficients(left)]
-    covariance = np.linalg.pinv((fisher + fisher.T) / 2)
+    if not (np.isfinite(fisher).all() and (traces > 0).all() and (np.diag(fisher) < ROUNDED * traces).all()):
+        return Estimate(problem.fractions, (None, None), settled=False, resolved=False)
+    return _stepped(problem, sequences.levels, powers, traces, fisher)
+
+
+def _stepped(
+    problem: CalibrationProblem, levels: Sequence[int], powers: np.ndarray, traces: np.ndarray, fisher: np.ndarray
+) -> Estimate:
+    """Return the deviations after a step, from |B_k^T M y|^2, t and F of the levels of the prior."""
+    # Noise hides them, and the best variance is negative.
+    vanishing = (np.diag(fisher) < 1) & (traces - powers > np.diag(fisher))
+    scale = np.sqrt(np.outer(np.diag(fisher), np.diag(fisher)))
+    correlation = np.clip((fisher + fisher.T) / 2 / scale, -ALIKE, ALIKE)
+    np.fill_diagonal(correlation, 1)
+    covariance = np.zeros_like(fisher)
+    kept = np.ix_(~vanishing, ~vanishing)
+    covariance[kept] = np.linalg.inv((correlation * scale)[kept])
     change = covariance @ (traces * np.log(powers / traces))
     change = np.clip(np.where(change < FAR_BELOW, 2 * change, change), -FURTHEST, FURTHEST)
-    deviations, errors = [0.0, 0.0], [0.0, 0.0]
-    for place, level in enumerate(sequences.levels):
+    change[vanishing] = -FURTHEST
+    score = powers - traces
+    gained = score @ covariance @ score / 2 - np.sum(score[vanishing])
+    deviations = [0.0, 0.0]
+    errors: list[float | None] = [None, None]
+    for place, level in enumerate(levels):
         deviations[level] = min(max(problem.fractions[level] * math.exp(change[place] / 2), LEAST), MOST)
-        errors[level] = math.sqrt(covariance[place, place]) / 2
-    # Where the most likely variance is below zero, it shrinks forever, to less and less effect.
-    gained = float((powers - traces) @ change) / 2
-    return Estimate((deviations[0], deviations[1]), (errors[0], errors[1]), gained < SETTLED)
+        if not vanishing[place]:
+            errors[level] = math.sqrt((1 + 1 / PROBES) * covariance[place, place]) / 2
+    return Estimate((deviations[0], deviations[1]), (errors[0], errors[1]), bool(gained < SETTLED))
 
 
 def _power(values: list[np.ndarray]) -> float:

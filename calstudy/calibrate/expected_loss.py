@@ -227,12 +227,18 @@ def _jacobian(problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSp
 class GainResponse:
     """The linear response of the gains to a change of the data, at a solution, (Nants, Nfreqs), complex.
 
-    `tolerance` is the relative residual of the normal equations.
+    `tolerance` is the relative residual of the normal equations, `dtype` the precision of their products.
     """
 
-    def __init__(self, problem: CalibrationProblem, gains: np.ndarray, tolerance: float = CG_TOLERANCE) -> None:
+    def __init__(
+        self,
+        problem: CalibrationProblem,
+        gains: np.ndarray,
+        tolerance: float = CG_TOLERANCE,
+        dtype: tf.DType = tf.float32,
+    ) -> None:
         self._tolerance = tolerance
-        self._kernels = kernels = compiled(problem.structure, problem.frozen)
+        self._kernels = kernels = compiled(problem.structure, problem.frozen, dtype)
         self._antennas, self._shape = problem.structure.antennas.T, gains.shape
         reduced = kernels.reduce(problem, gains)
         self._unit, self._total = reduced.loss_unit, float(np.sum(problem.weights))
@@ -251,7 +257,7 @@ class GainResponse:
         `change` is J_g* y, in the unit of the square root of the loss, complex, (Nants, Nfreqs).
         """
         # Inside the kernels the loss has the weighted square of the data for a unit.
-        descent = pairs.to_pair(change / self._unit, tf.float32)
+        descent = pairs.to_pair(change / self._unit, self._kernels.dtype)
         eta, _ = self._kernels.solve_graph(self._equations, descent, self._tolerance, CG_ITERATIONS)
         return pairs.to_complex(eta)
 
@@ -260,10 +266,10 @@ class GainResponse:
 
         Both are complex, (Nbls, Nfreqs).
         """
-        tensors = self._kernels.tensors
-        loaded = tensors.load_model(difference, 1.0, tf.float32)
+        tensors, unit = self._kernels.tensors, float(np.sqrt(np.mean(np.abs(difference) ** 2)))
+        loaded = tensors.load_model(difference, unit, self._kernels.dtype)
         left = self._kernels.left_of(self._equations, loaded, self._tolerance, CG_ITERATIONS)
-        return tensors.unload(left, self._total)
+        return tensors.unload(left, unit * self._total)
 
     def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
         """Return the part of W y that gains absorb, less the foregrounds' response to it, (Nbls, Nfreqs)."""

@@ -109,8 +109,10 @@ def problem_at(
     problem = make_problem(prepared, settings, times, polarization)
     if isinstance(problem, str):
         return problem
-    if record is not None and "deviation" in record.diagnostics:
-        problem = problem.with_fractions(record.diagnostics["deviation"])
+    if settings.estimates_deviation:
+        if record is None:
+            raise ValueError("record: is needed where the deviations of the foregrounds are estimated")
+        problem = problem.with_fractions(record.diagnostics.get("deviation", problem.fractions))
     return problem.weighted_by(gains) if isinstance(settings.weights, GainWeights) else problem
 
 

@@ -20,7 +20,7 @@ from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.preparation import prepare, problem_at
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
-from calstudy.calibrate.settings import ForegroundPrior
+from calstudy.calibrate.settings import START_DEVIATION, ForegroundPrior
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 
@@ -40,31 +40,29 @@ def errors_of_sky(structure, own, shared, seed):
     return turned(structure, found)
 
 
-def measured(positions, prior, deviations, seed):
+def measured(positions, prior, deviations, seed, level=NOISE):
     """Data of a toy with inverse variances for weights, and a sky model with errors of some size, from far off."""
     toy = make_toy(positions, noise=0.0, seed=seed)
-    structure, rng = (
-        prior_structure(toy, prior) if prior == "both" else free_structure(toy),
-        np.random.default_rng(seed),
-    )
+    rng = np.random.default_rng(seed)
+    structure = prior_structure(toy, prior) if positions is HEX else replace(free_structure(toy), prior=prior)
     # The structure may turn baselines of the toy around.
     flipped = np.any(structure.antennas != toy.antennas, axis=1)[:, None]
     foregrounds = np.where(flipped, toy.foregrounds.conj(), toy.foregrounds)
     rms = np.sqrt(np.mean(np.abs(foregrounds) ** 2))
     products = gain_products(toy.gains, structure.antennas)
-    data = products * (foregrounds + NOISE * rms * complex_normal(rng, foregrounds.shape))
+    data = products * (foregrounds + level * rms * complex_normal(rng, foregrounds.shape))
     sky = foregrounds + rms * errors_of_sky(structure, *deviations, 100 + seed)
-    weights, unity = 1 / np.abs(NOISE * rms * products) ** 2, np.ones(toy.gains.shape, complex)
+    weights, unity = 1 / np.abs(level * rms * products) ** 2, np.ones(toy.gains.shape, complex)
     problem = CalibrationProblem(structure, data, weights, unity, sky, "none", deviations=(1.0, 1.0))
-    return problem.with_fractions((0.1, 0.1))
+    return problem.with_fractions((START_DEVIATION, START_DEVIATION))
 
 
-def settled(problem):
+def settled(problem, seed=0):
     """The problem with the deviations that it finds, its solution and the estimate."""
     solver = GaussNewton(tolerance=1e-5)
     for _ in range(12):
         solution = solve(problem, solver)
-        found = estimate(problem, solution.gains, solution.model)
+        found = estimate(problem, solution.gains, solution.model, (seed,))
         if found.settled:
             return problem, solution, found
         problem = replace(problem.with_fractions(found.deviations), initial_gains=solution.gains)
@@ -82,14 +80,14 @@ def settled(problem):
 def test_the_size_of_the_errors_of_a_sky_model_is_found(positions, prior, deviations):
     pulls = []
     for seed in range(1, 5):
-        _, _, found = settled(measured(positions, prior, deviations, seed))
+        _, _, found = settled(measured(positions, prior, deviations, seed), seed)
         for value, true, error in zip(found.deviations, deviations, found.error, strict=True):
             if true:
                 assert error < 0.15
                 # Fractions are of the rms of the sky model, with its errors.
                 pulls.append(np.log(value / true * np.sqrt(1 + sum(np.square(deviations)))) / error)
     assert abs(np.mean(pulls)) < 3 / np.sqrt(len(pulls))
-    # Fewer than ten draws, with traces whose error is as large as that of the estimate over the root of probes.
+    # Of fewer than ten draws.
     assert np.std(pulls) < 2
 
 
@@ -143,7 +141,7 @@ class DenseLikelihood:
 
 
 def test_the_deviations_are_the_most_likely_ones():
-    problem, solution, found = settled(measured(HEX[:5], "both", (0.01, 0.05), 2))
+    problem, solution, found = settled(measured(HEX, "both", (0.01, 0.05), 2))
     likelihood, best, error = DenseLikelihood(problem, solution), np.log(found.deviations), np.array(found.error)
     steps = [error * row for row in np.eye(2)]
     middle, up, down = likelihood.at(found.deviations), [], []
@@ -151,7 +149,7 @@ def test_the_deviations_are_the_most_likely_ones():
         up.append(likelihood.at(tuple(np.exp(best + step))))
         down.append(likelihood.at(tuple(np.exp(best - step))))
     slopes, curvatures = (np.array(up) - np.array(down)) / 2, 2 * middle - np.array(up) - np.array(down)
-    # In units of errors. The traces of two probes have an error of about 0.7 of them.
+    # In units of errors: traces of four probes have one of 0.5.
     assert np.all(np.abs(slopes / curvatures) < 1.5)
     # Errors include the correlation of both.
     assert np.all(curvatures > 0.7)
@@ -174,6 +172,45 @@ def test_a_sky_model_without_errors_is_sky_based_calibration():
     difference = result.gains.gain_array - known.gains.gain_array
     # Errors of the gains by the noise are 4e-4.
     assert np.sqrt(np.mean(np.abs(difference) ** 2)) < 1e-4
+
+
+def test_a_level_that_is_not_there_vanishes_and_leaves_the_other_at_its_maximum():
+    problem, solution, found = settled(measured(HEX, "both", (0.03, 0.0), 2))
+    # Shared errors are those of three baselines each; below a tenth of the own ones they are hidden.
+    assert found.deviations[1] < 0.3 * 0.03
+    assert found.error[1] is None or found.error[1] > 0.5
+    likelihood = DenseLikelihood(problem, solution)
+    own, step = np.log(found.deviations[0]), found.error[0]
+    values = [likelihood.at((float(np.exp(own + turn * step)), found.deviations[1])) for turn in (-1, 0, 1)]
+    slope, curvature = (values[2] - values[0]) / 2, 2 * values[1] - values[0] - values[2]
+    assert abs(slope / curvature) < 1.5
+
+
+def test_levels_that_are_the_same_do_not_end_in_an_error():
+    """Without redundant baselines own and shared errors are one, and their powers add up."""
+    for seed in (1, 2, 3):
+        _, _, found = settled(measured(scattered(7), "both", (0.02, 0.02), seed), seed)
+        together = np.hypot(*found.deviations)
+        assert together == pytest.approx(np.hypot(0.02, 0.02), rel=0.2)
+
+
+def test_units_of_the_data_do_not_matter():
+    problem, solution, _ = settled(measured(scattered(7), "own", (0.03, 0.0), 1))
+    found = estimate(problem, solution.gains, solution.model, (1,))
+    unit = 1e-26
+    fields = {"visibilities": problem.visibilities * unit, "sky_model": problem.sky_model * unit}
+    small = replace(
+        problem, **fields, weights=problem.weights / unit**2, deviations=tuple(unit * np.array(problem.deviations))
+    )
+    again = estimate(small, solution.gains, solution.model * unit, (1,))
+    assert again.deviations[0] == pytest.approx(found.deviations[0], rel=1e-3)
+    assert again.error[0] == pytest.approx(found.error[0], rel=1e-2)
+
+
+def test_a_deviation_far_above_the_noise_is_found():
+    """Single precision does not resolve it; probes are in double precision then."""
+    _, _, found = settled(measured(scattered(7), "own", (0.03, 0.0), 1, level=1e-5), 1)
+    assert abs(np.log(found.deviations[0] / 0.03)) < 3 * found.error[0]
 
 
 def test_the_problem_of_a_solution_has_the_deviations_that_were_found():
