@@ -203,16 +203,27 @@ def _show(solution: Mapping[str, Any], output: Path, console: Console) -> int:
             f"left by stopping: at most {100 * worst['newton_decrement']:.2g} % of the residual's power "
             f"({worst['decrement_rms']:.2g} rms, in the unit of the data)"
         )
-    known = [found for record in records if "sky_model_slope" in (found := record.get("diagnostics", {}))]
-    if known:
-        names = ("sky_model_slope", "band_shape_rms")
-        slope, shape = (statistics.median(found[name] for found in known) for name in names)
-        lines.append(
-            f"calibrated data over the sky model: {slope:.4f}, and {100 * shape:.2g} % rms from channel to channel"
-        )
+    lines += _about_the_sky_model([record.get("diagnostics", {}) for record in records])
     for line in lines:
         console.print(line, markup=False)
     return _status(records)
+
+
+def _about_the_sky_model(diagnostics: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return sentences on the data against the sky model, of what solves say of it."""
+    lines = []
+    if known := [found for found in diagnostics if "sky_model_slope" in found]:
+        slope, shape = (
+            statistics.median(found[name] for found in known) for name in ("sky_model_slope", "band_shape_rms")
+        )
+        lines.append(
+            f"calibrated data over the sky model: {slope:.4f}, and {100 * shape:.2g} % rms from channel to channel"
+        )
+    if estimated := [found["deviation"] for found in diagnostics if "deviation" in found]:
+        own, shared = (100 * statistics.median(column) for column in zip(*estimated, strict=True))
+        common = f", and {shared:.2g} % that redundant baselines share" if shared > 0 else ""
+        lines.append(f"errors of the sky model: {own:.2g} % of its rms on each baseline{common}")
+    return lines
 
 
 def _status(records: Sequence[Mapping[str, Any]]) -> int:

@@ -126,6 +126,19 @@ def test_scale_and_band_shape_against_the_sky_model_are_told(command, finished, 
     assert all(record["diagnostics"]["sky_model_slope"] == pytest.approx(1) for record in records)
 
 
+def test_the_size_of_the_errors_of_the_sky_model_is_told(command, finished, data, tmp_path):
+    """A model with a tenth more flux on every other baseline, and a tenth less on the others."""
+    sky = UVData.from_file(str(finished[0] / "out" / "model.uvh5"))
+    numbers = np.unique(sky.baseline_array)
+    sky.data_array *= np.where(np.isin(sky.baseline_array, numbers[::2]), 1.1, 0.9)[:, None, None]
+    sky.write_uvh5(str(tmp_path / "sky.uvh5"))
+    block = ["--set", "calibrator=empirical-bayes", "--set", "foreground_prior.noise=0.1 Jy"]
+    code, error = command(data, *block, "--output", "out", "--sky-model", "sky.uvh5", "--select", "times=0..0")
+    assert code == 0, error
+    (found,) = re.findall(r"errors of the sky model: ([0-9.]+) % of its rms on each baseline", error)
+    assert 5 < float(found) < 20
+
+
 def test_the_log_tells_every_solve(command, data, tmp_path):
     command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
     log = json.loads((tmp_path / "out" / "solution.json").read_text())
