@@ -98,8 +98,7 @@ class RunFolder:
 
     def experiment(self, without: Sequence[str] = ()) -> Experiment:
         """Return the validated experiment of a run of one experiment, without some of its sections."""
-        with self.reading():
-            return validate({key: value for key, value in self.content.items() if key not in without}, self.path)
+        return validate({key: value for key, value in self.content.items() if key not in without}, self.path)
 
     @contextmanager
     def reading(self) -> Iterator[None]:

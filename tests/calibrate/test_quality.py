@@ -12,9 +12,9 @@ from test_calamity import make_uvdata
 from toy import make_toy, scattered
 
 from calstudy.base.errors import InputError
-from calstudy.calibrate import execution
 from calstudy.calibrate.records import CalibrationResult, make_gains, make_visibilities
 from calstudy.calibrate.sky_model import common_baselines
+from calstudy.products import calibration as products
 from calstudy.realdata.quality import assess
 from calstudy.realdata.reading import prepare
 from calstudy.realdata.selection import Selection, select
@@ -197,7 +197,7 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(files, capsys):
 def test_a_killed_calibration_is_resumed_and_gives_what_an_undisturbed_one_gives(files, capsys, monkeypatch):
     assert run_command(capsys, *CALIBRATE, "--output", "whole")[0] == 0
     solves = []
-    true = execution.run_calibrator
+    true = products.run_calibrator
 
     def killed(calibrator, data, *others, **more):
         if len(solves) == 2:
@@ -206,7 +206,7 @@ def test_a_killed_calibration_is_resumed_and_gives_what_an_undisturbed_one_gives
         return true(calibrator, data, *others, **more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(execution, "run_calibrator", killed)
+        patch.setattr(products, "run_calibrator", killed)
         with pytest.raises(RuntimeError, match="killed"):
             run_command(capsys, *CALIBRATE, "--output", "cut")
     assert not (files / "cut" / "gains.calh5").exists()
@@ -217,7 +217,7 @@ def test_a_killed_calibration_is_resumed_and_gives_what_an_undisturbed_one_gives
         return true(calibrator, data, *others, **more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(execution, "run_calibrator", counted)
+        patch.setattr(products, "run_calibrator", counted)
         assert run_command(capsys, *CALIBRATE, "--output", "cut")[0] == 0
     assert len(solves) == 2
     whole, cut = (UVCal.from_file(files / name / "gains.calh5") for name in ("whole", "cut"))

@@ -130,7 +130,7 @@ COMMANDS = [
     (["plan", "file.yaml", "--set", "sky.eor.seed=010"], "010 is an octal number in YAML, 8"),
     (
         ["plan", "file.yaml", *WEIGHTED, "--set", "calibration.foreground_prior.deviation=10 %"],
-        "calibration.foreground_prior.deviation: '10 %' is neither a number of at least 0 nor 'infinite'",
+        "foreground_prior.deviation: '10 %' is neither a number of at least 0, nor 'infinite', nor 'estimated'",
     ),
     (["plan", "file.yaml", *WEIGHTED, *NOISELESS], "corruption.noise: is 'none', and the finite deviations of"),
     (
