@@ -16,12 +16,13 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Container, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from functools import cached_property, lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from threading import Lock
 from types import ModuleType
 from typing import Any, ClassVar, TypeVar
 
@@ -35,6 +36,23 @@ from calstudy.base.schema import Kinds, Section
 FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
 FILE_MODULE = "calstudy_plugin_"
 """What the names of modules that were read from a file start with."""
+
+
+ATTEMPTS = 10
+_PARSING = Lock()
+
+
+def parse(code: str) -> ast.Module:
+    """Parse Python code, in one thread at a time.
+
+    Releases of Python 3.11 and 3.12 fail now and then, with SystemError, where two threads parse; the same call again
+    does not. Threads of other packages may parse as well.
+    """
+    with _PARSING:
+        for _ in range(ATTEMPTS - 1):
+            with suppress(SystemError):
+                return ast.parse(code)
+        return ast.parse(code)
 
 
 class Plugin(Section):
@@ -324,7 +342,7 @@ def beside_of(path: Path) -> dict[str, Path]:
 def _imported(path: Path) -> Iterator[str]:
     """Yield the names of all modules that a file may import, and of the packages that they are in."""
     try:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = parse(path.read_text(encoding="utf-8"))
     except (ValueError, SyntaxError):
         return  # Whoever runs it is told.
     for node in ast.walk(tree):
@@ -376,7 +394,7 @@ def _read_code(path: Path) -> tuple[str, dict[str, Path]]:
         raise InputError(f"{str(path)!r} is code, which is not run here; {instead}")
     try:
         text = path.read_text(encoding="utf-8")
-        ast.parse(text)
+        parse(text)
         beside = beside_of(path)
         content = "".join([text, *(f"{name} {digest_file(found)}" for name, found in sorted(beside.items()))])
     except OSError as error:

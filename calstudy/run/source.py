@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from threading import Lock
 from typing import Any, TypeGuard
 
 from pydantic import BaseModel
@@ -29,7 +28,7 @@ from pydantic import BaseModel
 from calstudy.base.downloads import default_directory
 from calstudy.base.files import digest_json, replacing
 from calstudy.base.package_files import PackageFile
-from calstudy.base.plugins import FILE_MODULE
+from calstudy.base.plugins import FILE_MODULE, parse
 from calstudy.run.task import Task
 
 PACKAGE = __name__.partition(".")[0]
@@ -74,21 +73,15 @@ class _Definition:
     files: frozenset[PackageFile]
 
 
-# Some releases of Python 3.11 fail where two threads parse at once: "AST constructor recursion depth mismatch".
-_PARSING = Lock()
-
-
 def source_of(make: Callable[..., Any], settings: Mapping[str, Any]) -> Source:
     """Return the source of what `make` makes with these settings."""
-    with _PARSING:
-        return _source(_roots(make, settings))
+    return _source(_roots(make, settings))
 
 
 def reached(make: Callable[..., Any], settings: Mapping[str, Any]) -> dict[Address, str]:
     """Return by address the digests of all definitions that affect what `make` makes, or a plug-in."""
-    with _PARSING:
-        found = frozenset().union(*map(_reach, _roots(make, settings)))
-        return {address: _definition(address).digest for address in found}
+    found = frozenset().union(*map(_reach, _roots(make, settings)))
+    return {address: _definition(address).digest for address in found}
 
 
 def _roots(make: Callable[..., Any], settings: Mapping[str, Any]) -> frozenset[Address]:
@@ -181,7 +174,7 @@ def _module(name: str) -> _Module | None:
     if not path.is_file():
         return None
     module = _Module()
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parse(path.read_text(encoding="utf-8"))
     for statement in tree.body:
         if isinstance(statement, ast.ClassDef) and any(item.arg == "stage" for item in statement.keywords):
             statement.body = [item for item in statement.body if getattr(item, "name", "") not in PLANNED]
