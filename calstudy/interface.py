@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import yaml
 
-from calstudy.base.errors import InputError, nearest
+from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.experiment.files import StudyFile
 from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
@@ -516,8 +516,16 @@ class OpenRun:
 
     @cached_property
     def _study(self) -> Study:
-        with self._folder.reading():
+        try:
             return load_study(self.folder / EXPERIMENT)
+        except ExperimentError as error:
+            # The version that wrote the file accepted it.
+            commit = self._manifest.get("git_commit")
+            writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
+            raise InputError(
+                f"{self.folder / EXPERIMENT}: written on {self._folder.finished:%d %B %Y} by {writer}; this version "
+                f"refuses it, so run the experiment again, or read the run with that version ({error})"
+            ) from None
 
     @property
     def _experiment(self) -> ExperimentStudy:

@@ -45,8 +45,8 @@ _PARSING = Lock()
 def parse(code: str) -> ast.Module:
     """Parse Python code, in one thread at a time.
 
-    Releases of Python 3.11 and 3.12 fail now and then, with SystemError, where two threads parse; the same call again
-    does not. Threads of other packages may parse as well.
+    Some releases of Python 3.11 fail now and then, with SystemError, where two threads parse. Another attempt helps;
+    threads of other packages may parse as well.
     """
     with _PARSING:
         for _ in range(ATTEMPTS - 1):

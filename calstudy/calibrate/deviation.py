@@ -89,7 +89,8 @@ def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, 
     response = GainResponse(problem, gains, TOLERANCE, tf.float32 if widest < SINGLE else tf.float64)
     products, rng = gain_products(gains, problem.structure.antennas), np.random.default_rng(list(seed))
     residual = problem.weights * np.abs(products) ** 2 * (problem.visibilities / products - model)
-    powers = np.array([_power(found) for found in sequences.coefficients(residual)])
+    # A residual of exactly zero has a logarithm, too.
+    powers = np.array([_power(found) for found in sequences.coefficients(residual)]) + np.finfo(float).tiny
     traces, fisher = np.zeros(len(powers)), np.zeros((len(powers), len(powers)))
     for _ in range(PROBES):
         for level in range(len(powers)):

@@ -173,7 +173,6 @@ class Comparison(Task, stage="comparison", version=4):
         return result
 
     def _spectra(self, case: str) -> CalibratedSpectra:
-
         folders = {name: self.cases[f"{case}:{name}"] for name in score.SPECTRA}
         return CalibratedSpectra(**{name: spectra.read_delay_spectra(folder) for name, folder in folders.items()})
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.errors import InputError
 from calstudy.base.table import Table, from_json
 from calstudy.experiment.files import validate
 from calstudy.experiment.model import Experiment
@@ -99,19 +98,6 @@ class RunFolder:
     def experiment(self, without: Sequence[str] = ()) -> Experiment:
         """Return the validated experiment of a run of one experiment, without some of its sections."""
         return validate({key: value for key, value in self.content.items() if key not in without}, self.path)
-
-    @contextmanager
-    def reading(self) -> Iterator[None]:
-        """Raise InputError, with the version that wrote it, where this version of calstudy refuses the experiment."""
-        try:
-            yield
-        except ExperimentError as error:
-            commit = self.manifest.get("git_commit")
-            writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
-            raise InputError(
-                f"{self.path / EXPERIMENT}: written on {self.finished:%d %B %Y} by {writer}; this version refuses it, "
-                f"so run the experiment again, or read the run with that version ({error})"
-            ) from None
 
     @property
     def tables(self) -> Tables:
