@@ -9,6 +9,7 @@ a file has several, ``calibrator: mine.py:MeanGain``.
 from __future__ import annotations
 
 import ast
+import gc
 import hashlib
 import importlib.util
 import inspect
@@ -16,7 +17,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Container, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -38,21 +39,24 @@ FILE_MODULE = "calstudy_plugin_"
 """What the names of modules that were read from a file start with."""
 
 
-ATTEMPTS = 10
 _PARSING = Lock()
 
 
 def parse(code: str) -> ast.Module:
-    """Parse Python code, in one thread at a time.
+    """Parse Python code while no other thread can run.
 
-    Some releases of Python 3.11 fail now and then, with SystemError, where two threads parse. Another attempt helps;
-    threads of other packages may parse as well.
+    Python 3.11 has one counter of the depth of a tree for all threads, and fails with SystemError where another thread
+    parses in the meantime. A thread is left while it parses only by the garbage collector, where it runs code of
+    objects that it deletes.
     """
     with _PARSING:
-        for _ in range(ATTEMPTS - 1):
-            with suppress(SystemError):
-                return ast.parse(code)
-        return ast.parse(code)
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return ast.parse(code)
+        finally:
+            if collects:
+                gc.enable()
 
 
 class Plugin(Section):
