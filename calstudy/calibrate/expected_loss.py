@@ -38,6 +38,7 @@ W x|^2 - |f* M x|^2 is <f|W^2 - M^2|f>, and P x or M x cost one solve of the nor
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -282,11 +283,12 @@ class GainResponse:
         return tangent.without_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
 
 
-def linear_response(
-    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signal: np.ndarray
-) -> np.ndarray:
-    """Compute the residual of a small signal after calibration, to first order.
+def linear_responses(
+    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signals: Iterable[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Compute the residual of small signals after calibration, to first order, one after the other.
 
+    In double precision: where foregrounds nearly follow the gains, single precision does not resolve the response.
     It is the difference of the residuals of two fits, of data with the signal and without, if both are at the minimum;
     it does not depend on where these start and stop.
 
@@ -296,17 +298,25 @@ def linear_response(
         The fitted problem.
     gains, model
         The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    signal
-        Calibrated visibilities of the signal, (Nbls, Nfreqs), in the unit of the model.
+    signals
+        Calibrated visibilities of each signal, (Nbls, Nfreqs), in the unit of the model.
 
-    Returns
-    -------
+    Yields
+    ------
     Complex, (Nbls, Nfreqs); zero for samples without weight.
     """
-    tangent = TangentSpace.at(problem, gains, model)
-    left = tangent.without_foregrounds(tangent.roots * signal)
-    left = left - GainResponse(problem, gains).absorbed(tangent, left)
-    return np.divide(left, tangent.roots, out=np.zeros(left.shape, complex), where=tangent.roots > 0)
+    tangent, response = TangentSpace.at(problem, gains, model), GainResponse(problem, gains, dtype=tf.float64)
+    for signal in signals:
+        left = tangent.without_foregrounds(tangent.roots * signal)
+        left = left - response.absorbed(tangent, left)
+        yield np.divide(left, tangent.roots, out=np.zeros(left.shape, complex), where=tangent.roots > 0)
+
+
+def linear_response(
+    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signal: np.ndarray
+) -> np.ndarray:
+    """Compute the residual of one small signal after calibration; parameters are as for `linear_responses`."""
+    return next(linear_responses(problem, gains, model, [signal]))
 
 
 def _stochastic_diagonal(

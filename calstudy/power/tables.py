@@ -15,9 +15,19 @@ from calstudy.power.expected import ExpectedBins
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.power.transfer import TransferFunction, TransferMap
+from calstudy.power.windows import UnbiasedSpectrum, Windows
 
 Spectrum = TypeVar(
-    "Spectrum", DelaySpectra, SphericalSpectrum, CylindricalSpectrum, TransferFunction, TransferMap, ExpectedBins, Score
+    "Spectrum",
+    DelaySpectra,
+    SphericalSpectrum,
+    CylindricalSpectrum,
+    TransferFunction,
+    TransferMap,
+    ExpectedBins,
+    Score,
+    Windows,
+    UnbiasedSpectrum,
 )
 
 CSV_COLUMNS = {

@@ -12,7 +12,7 @@ from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Variant
 from calstudy.instrument.size import Size
 from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
 from calstudy.power.settings import PowerSettings
@@ -56,42 +56,55 @@ NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
 def expected_loss(graph: Graph) -> Task:
     """Return the task that predicts T for the middle integration."""
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
-    return ExpectedLoss(LABEL, probes=PROBES, power=power, **_solved(graph))
+    return ExpectedLoss(LABEL, probes=PROBES, power=power, integration=_middle(graph), **solved(graph))
 
 
 @memoize
 def linear_response(graph: Graph) -> Task | None:
-    """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T.
-
-    Calibrators must fit each integration by least squares and use the gains without smoothing. Spectra must be of each
-    baseline with itself, because a fit responds differently on different baselines of a group. Large arrays have none.
-    """
-    fit, power = graph.experiment.calibration, graph.experiment.power
-    fits = isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None
-    size = Size.of(graph.experiment.instrument)
-    large = size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES
-    if not fits or large or power.pairs == "redundant-group":
+    """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T."""
+    if why_no_response(graph.experiment):
         return None
+    power = graph.experiment.power
     return LinearResponse(
         "linear response to the EoR",
         power=power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin"),
         signal=corruption.data(graph, Variant(components=("eor",)), "even"),
-        **_solved(graph),
+        integration=_middle(graph),
+        **solved(graph),
     )
 
 
-def _solved(graph: Graph) -> dict[str, Any]:
+def why_no_response(experiment: Experiment) -> str:
+    """Return why the linear response of the fits of an experiment cannot be compared with T; empty if it can.
+
+    A fit responds differently on different baselines of a group.
+    """
+    fit, size = experiment.calibration, Size.of(experiment.instrument)
+    if not (isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None):
+        return "needs a calibrator that fits each integration by least squares, and gains that are not smoothed"
+    if experiment.power.pairs == "redundant-group":
+        return "needs power.pairs: same-baseline"
+    if size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES:
+        return f"needs at most {LARGEST:g} times the baselines and channels of the paper"
+    return ""
+
+
+def _middle(graph: Graph) -> int:
+    return graph.experiment.instrument.times.count // 2
+
+
+def solved(graph: Graph, parity: str = "even") -> dict[str, Any]:
+    """Return the fields of `Solved` for the data of all components of one noise realization."""
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
     return {
-        **calibration.calibration_inputs(graph, residual, "even"),
-        "calibration": calibration.calibration(graph, residual, "even"),
+        **calibration.calibration_inputs(graph, residual, parity),
+        "calibration": calibration.calibration(graph, residual, parity),
         "calibrator": graph.experiment.calibration.with_defaults("assumed"),
-        "integration": graph.experiment.instrument.times.count // 2,
     }
 
 
 @dataclass(frozen=True)
-class _Solution:
+class Solution:
     """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs)."""
 
     problem: CalibrationProblem
@@ -102,15 +115,14 @@ class _Solution:
     frequency: np.ndarray
 
 
-class _Solved(Calibrated):
-    """A calibrated integration of simulated data."""
+class Solved(Calibrated):
+    """Calibrated integrations of simulated data."""
 
     calibration: Input
     calibrator: GainFit = called("calibration")
     power: PowerSettings
-    integration: int
 
-    def solution(self) -> _Solution | None:
+    def solution(self, integration: int) -> Solution | None:
         """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
         import numpy as np
 
@@ -118,22 +130,23 @@ class _Solved(Calibrated):
         from calstudy.calibrate.records import Solve
         from calstudy.products.selection import read_gains
 
-        data, sky, noise = self.read(self.times)
+        times = self.times(integration)
+        data, sky, noise = self.read(times)
         prepared = prepared_fit(self.calibrator, data, sky, noise)
         fitted = read_gains(self.calibration)
-        gains = fitted.at(self.integration, prepared.data.numbers)
+        gains = fitted.at(integration, prepared.data.numbers)
         records = map(Solve.from_json, read_json(self.calibration / SOLUTION)["records"])
         record = next(
             found
             for found in records
             if found.polarization == data.polarization_array[0]
-            and found.integration <= self.integration < found.integration + found.n_integrations
+            and found.integration <= integration < found.integration + found.n_integrations
         )
         problem = problem_at(prepared, self.calibrator, slice(0, 1), 0, gains, record)
-        if isinstance(problem, str) or fitted.flags[self.integration].any():
+        if isinstance(problem, str) or fitted.flags[integration].any():
             return None
-        model = read_visibilities(self.calibration / MODEL, self.times)
-        return _Solution(
+        model = read_visibilities(self.calibration / MODEL, times)
+        return Solution(
             problem,
             gains,
             to_cube(model)[0, ..., 0],
@@ -142,20 +155,27 @@ class _Solved(Calibrated):
             np.asarray(data.freq_array, float),
         )
 
-    @property
-    def times(self) -> np.ndarray:
-        """Julian date of the integration, (1,)."""
-        return integration_times(self.data / DATA)[[self.integration]]
+    def times(self, integration: int) -> np.ndarray:
+        """Julian date of an integration, (1,)."""
+        return integration_times(self.data / DATA)[[integration]]
 
-    def _cost(self) -> Cost:
+    def signal_at(self, solution: Solution, path: Path, integration: int) -> np.ndarray:
+        """Read the visibilities of a signal on the baselines of a solution, (Nbls, Nfreqs)."""
+        found = read_visibilities(path, self.times(integration))
+        places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(found).tolist())}
+        return to_cube(found)[0, [places[pair] for pair in solution.pairs], :, 0]
+
+    def cost_of(self, responses: int) -> Cost:
+        """Estimate the cost of some linear responses of one integration."""
         size = size_of(self)
         work = size.baselines * size.channels.count / PAPER_SAMPLES
-        return Cost(6 + 0.8 * getattr(self, "probes", 1) * work, LIBRARIES_MEMORY + 1.5e9 * work, 1e6)
+        return Cost(6 + 0.8 * responses * work, LIBRARIES_MEMORY + 2.5e9 * work, 1e6)
 
 
-class ExpectedLoss(_Solved, stage="expected-loss", version=4):
+class ExpectedLoss(Solved, stage="expected-loss", version=4):
     """The expected T of one calibrated integration."""
 
+    integration: int
     probes: int
 
     def make(self, output: Path) -> Mapping[str, Any]:
@@ -164,7 +184,7 @@ class ExpectedLoss(_Solved, stage="expected-loss", version=4):
         from calstudy.calibrate.expected_loss import expected_transfer as expected_of
         from calstudy.power.tables import save_spectrum
 
-        solution = self.solution()
+        solution = self.solution(self.integration)
         if solution is None:
             raise InputError(
                 f"expected-loss: integration {self.integration} was not calibrated in all antennas and channels, and "
@@ -176,10 +196,14 @@ class ExpectedLoss(_Solved, stage="expected-loss", version=4):
         save_spectrum(output / EXPECTED, found)
         return {"integration": self.integration, "probes": self.probes}
 
+    def _cost(self) -> Cost:
+        return self.cost_of(self.probes)
 
-class LinearResponse(_Solved, stage="linear-response", version=1):
+
+class LinearResponse(Solved, stage="linear-response", version=2):
     """T and C of the linear response of one integration to the EoR."""
 
+    integration: int
     signal: Input
 
     def make(self, output: Path) -> Mapping[str, Any]:
@@ -188,16 +212,14 @@ class LinearResponse(_Solved, stage="linear-response", version=1):
         from calstudy.calibrate.expected_loss import linear_response as response_to
         from calstudy.power.score import BANDS
 
-        power, solution = self.power, self.solution()
+        power, solution = self.power, self.solution(self.integration)
         if solution is None:
             write_json(output / RESPONSE, {"bands": None})
             return {}
-        eor = read_visibilities(self.signal / DATA, self.times)
-        places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(eor).tolist())}
-        signal = to_cube(eor)[0, [places[pair] for pair in solution.pairs], :, 0]
+        signal = self.signal_at(solution, self.signal / DATA, self.integration)
         left = response_to(solution.problem, solution.gains, solution.model, signal)
         modes = DelayModes(solution.frequency, power.taper)
-        where = _modes(modes.delay, solution.lengths, float(solution.frequency.mean()), power)
+        where = baseline_modes(modes.delay, solution.lengths, float(solution.frequency.mean()), power)
         put_in, answered = modes.amplitudes(signal), modes.amplitudes(left)
         transfer, cross = bin_response(where, put_in, answered, BANDS, power.wedge_buffer)
         bands = [
@@ -207,8 +229,12 @@ class LinearResponse(_Solved, stage="linear-response", version=1):
         write_json(output / RESPONSE, {"bands": bands})
         return {}
 
+    def _cost(self) -> Cost:
+        return self.cost_of(1)
 
-def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
+
+def baseline_modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
+    """Return the modes of baselines (lengths in m) at delays (s), for the centre of the band (Hz)."""
     from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
     from calstudy.power.spectra import BaselineModes
 
@@ -225,6 +251,6 @@ def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power
     """Return an expected T of baselines (lengths in m, band centre in Hz) in bins of k and of length and delay."""
     from calstudy.power.binned import make_bin_edges
 
-    modes = _modes(expected.delay, lengths, centre, power)
+    modes = baseline_modes(expected.delay, lengths, centre, power)
     edges = make_bin_edges(power.bins)
     return bin_expected(modes, expected.transfer, expected.error, edges, power.wedge_buffer, power.length_bin)
