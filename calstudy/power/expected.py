@@ -76,18 +76,23 @@ def bin_expected(
 
 
 def bin_response(
-    modes: BaselineModes, signal: np.ndarray, response: np.ndarray, edges: ArrayLike, buffer: float
+    modes: BaselineModes,
+    signal: np.ndarray,
+    responses: tuple[np.ndarray, np.ndarray],
+    edges: ArrayLike,
+    buffer: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return T = P^D / P^S and C = Re <S* D> / P^S outside the wedge, (Nk,) each; NaN in bins without signal.
+    """Return T = Re <D* D'> / P^S and C = Re <S* (D + D')> / 2 P^S outside the wedge, (Nk,) each; NaN without signal.
 
-    `signal` holds the amplitudes of the signal S, and `response` those of the part D that is left of it,
-    (Nbls, Ndelays), complex; `edges` and `buffer` are as in `bin_expected`.
+    `signal` holds the amplitudes of the signal S, and `responses` those of the parts D and D' that two fits leave of
+    it, (Nbls, Ndelays), complex; `edges` and `buffer` are as in `bin_expected`.
     """
     limits = np.asarray(edges, float)
     bins, used = _bins_outside(modes, limits, buffer)
+    first, second = responses
     left, crossed, put_in = (
-        np.bincount(bins[used], np.real(first.conj() * second)[used], limits.size - 1)
-        for first, second in ((response, response), (signal, response), (signal, signal))
+        np.bincount(bins[used], np.real(one.conj() * other)[used], limits.size - 1)
+        for one, other in ((first, second), (signal, (first + second) / 2), (signal, signal))
     )
     put_in = np.where(put_in > 0, put_in, np.nan)
     return left / put_in, crossed / put_in

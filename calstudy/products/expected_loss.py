@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from calstudy.calibrate.problem import CalibrationProblem
     from calstudy.power.spectra import BaselineModes
 
-EXPECTED, RESPONSE = "expected-loss.h5", "linear-response.json"
+EXPECTED, RESPONSE, AMPLITUDES = "expected-loss.h5", "linear-response.json", "amplitudes.npz"
 # Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
 # further within a bin.
 PROBES = 16
@@ -64,14 +63,19 @@ def linear_response(graph: Graph) -> Task | None:
     """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T."""
     if why_no_response(graph.experiment):
         return None
-    power = graph.experiment.power
-    return LinearResponse(
-        "linear response to the EoR",
-        power=power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin"),
-        signal=corruption.data(graph, Variant(components=("eor",)), "even"),
-        integration=_middle(graph),
-        **solved(graph),
+    power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin")
+    even, odd = (
+        Response(
+            f"response to the EoR to first order, {parity}",
+            power=power,
+            signal=corruption.data(graph, Variant(components=("eor",)), "even"),
+            integration=_middle(graph),
+            temporary=True,
+            **solved(graph, parity),
+        )
+        for parity in corruption.PARITIES
     )
+    return LinearResponse("linear response to the EoR", power=power, even=even, odd=odd)
 
 
 def why_no_response(experiment: Experiment) -> str:
@@ -200,37 +204,64 @@ class ExpectedLoss(Solved, stage="expected-loss", version=4):
         return self.cost_of(self.probes)
 
 
-class LinearResponse(Solved, stage="linear-response", version=2):
-    """T and C of the linear response of one integration to the EoR."""
+class Response(Solved, stage="response", version=1):
+    """The linear response of one calibrated integration to a signal."""
 
     integration: int
     signal: Input
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write T and C in the bands of scores; null if flagged."""
+        """Write the amplitudes of the signal and of what is left of it; none if there are no gains."""
+        import numpy as np
+
         from calstudy.calibrate.expected_loss import DelayModes
         from calstudy.calibrate.expected_loss import linear_response as response_to
-        from calstudy.power.score import BANDS
 
-        power, solution = self.power, self.solution(self.integration)
-        if solution is None:
-            write_json(output / RESPONSE, {"bands": None})
-            return {}
-        signal = self.signal_at(solution, self.signal / DATA, self.integration)
-        left = response_to(solution.problem, solution.gains, solution.model, signal)
-        modes = DelayModes(solution.frequency, power.taper)
-        where = baseline_modes(modes.delay, solution.lengths, float(solution.frequency.mean()), power)
-        put_in, answered = modes.amplitudes(signal), modes.amplitudes(left)
-        transfer, cross = bin_response(where, put_in, answered, BANDS, power.wedge_buffer)
-        bands = [
-            {"k": list(edges), "transfer": json_number(t), "cross_transfer": json_number(c)}
-            for edges, t, c in zip(pairwise(BANDS), transfer, cross, strict=True)
-        ]
-        write_json(output / RESPONSE, {"bands": bands})
+        solution, arrays = self.solution(self.integration), {}
+        if solution is not None:
+            signal = self.signal_at(solution, self.signal / DATA, self.integration)
+            left = response_to(solution.problem, solution.gains, solution.model, signal)
+            modes = DelayModes(solution.frequency, self.power.taper)
+            arrays = {
+                "signal": modes.amplitudes(signal),
+                "left": modes.amplitudes(left),
+                "delay": modes.delay,
+                "lengths": solution.lengths,
+                "centre": solution.frequency.mean(),
+            }
+        np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
         return {}
 
     def _cost(self) -> Cost:
         return self.cost_of(1)
+
+
+class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk=1e4)):
+    """T and C of the linear response of one integration to the EoR, in two realizations of the noise."""
+
+    power: PowerSettings
+    even: Input
+    odd: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write T and C in bands, crossed between the realizations as T by injection is, or null if not known."""
+        import numpy as np
+
+        from calstudy.power.score import BANDS
+
+        with np.load(self.even / AMPLITUDES) as even, np.load(self.odd / AMPLITUDES) as odd:
+            if not even.files or not odd.files:
+                write_json(output / RESPONSE, {"bands": None})
+                return {}
+            where = baseline_modes(even["delay"], even["lengths"], float(even["centre"]), self.power)
+            answers = even["left"], odd["left"]
+            transfer, cross = bin_response(where, even["signal"], answers, BANDS, self.power.wedge_buffer)
+        bands = [
+            {"transfer": json_number(left), "cross_transfer": json_number(crossed)}
+            for left, crossed in zip(transfer, cross, strict=True)
+        ]
+        write_json(output / RESPONSE, {"bands": bands})
+        return {}
 
 
 def baseline_modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
