@@ -21,18 +21,12 @@ class MwaFile:
 
     Attributes
     ----------
-    packaged
-        The file in the package.
-    content
-        What it is, for messages.
-    fetched_as
-        Its name for ``calstudy data fetch``.
-    url
-        A source besides the package.
-    sha256
-        Of the file in mwa_pb 1.1, which that at the source must have.
-    instead
-        What can be done without it, for messages.
+    packaged : the file in the package
+    content : what it is, for messages
+    fetched_as : its name for ``calstudy data fetch``
+    url : a source besides the package
+    sha256 : of the file in mwa_pb 1.1, which that at the source must have
+    instead : what can be done without it, for messages
     """
 
     packaged: PackageFile
@@ -50,17 +44,12 @@ class MwaFile:
     def fetch(self, directory: Path | None = None, progress: bool = True) -> Path:
         """Download the file, or verify an existing copy.
 
+        Raises InputError if the download fails or is not the file.
+
         Parameters
         ----------
-        directory
-            Where to put it, `calstudy.base.downloads.default_directory` by default; made if need be.
-        progress
-            Whether to show a progress bar.
-
-        Raises
-        ------
-        InputError
-            If the download fails or is not the file.
+        directory : where to put it, `calstudy.base.downloads.default_directory` by default; made if need be
+        progress : whether to show a progress bar
         """
         path = (default_directory() if directory is None else directory) / self.name
         download(self.url, path, f"install mwa_pb 1.1, or {self.instead}", known_hash=self.sha256, progress=progress)
@@ -69,10 +58,7 @@ class MwaFile:
     def find(self) -> Path:
         """Return the path of the file in the mwa_pb package or, if that is not there, of the downloaded file.
 
-        Raises
-        ------
-        InputError
-            If there is neither.
+        Raises InputError if there is neither.
         """
         with suppress(InputError):
             if (packaged := self.packaged.path).is_file():

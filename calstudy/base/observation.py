@@ -31,8 +31,7 @@ class Frame:
         The two antennas (a, b) of each baseline as indices into `numbers`.
     frequencies : (Nfreqs,) float
         Channel centres, Hz.
-    n_times, n_polarizations
-        Numbers of integrations and polarizations.
+    n_times, n_polarizations : numbers of integrations and polarizations
     """
 
     def __init__(
@@ -104,6 +103,8 @@ class Frame:
 class Observation(Frame):
     """Visibilities of every baseline at every time, with their antennas, baselines and channels.
 
+    Raises InputError if the visibilities are not rectangular.
+
     Parameters
     ----------
     uvd
@@ -116,11 +117,6 @@ class Observation(Frame):
         Julian date of each integration.
     polarizations : (Npols,) int
         AIPS numbers, such as -5 for XX.
-
-    Raises
-    ------
-    InputError
-        If the visibilities are not rectangular.
     """
 
     def __init__(self, uvd: UVData) -> None:

@@ -18,7 +18,7 @@ from calstudy.base.resources import Cost, Usage
 from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress
 from calstudy.calibrate.records import CalibrationResult, Solve, Status, make_gains, make_visibilities
 from calstudy.calibrate.smoothing import smooth
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
@@ -53,26 +53,17 @@ def run_calibrator(
 ) -> CalibrationResult:
     """Calibrate visibilities, and return gains, model and residual as standard objects.
 
+    Raises InputError if the data or the sky model cannot be used, the calibrator refuses them, or a user's calibrator
+    fails or returns an invalid calibration.
+
     Parameters
     ----------
-    calibrator
-        Any calibrator, built in or a user's.
-    data
-        Visibilities, rectangular and time-major; not changed.
-    sky_model
-        Visibilities of the known part of the sky, with the samples of `data`, or None; not changed.
-    gains
-        Gains to start from, for an iterative calibrator; None for the calibrator's own start.
-    progress
-        Called after each solve with the number done and the total.
-    noise
-        Standard deviation of the noise of a sample (see `Assumed`); None if it is not known.
-
-    Raises
-    ------
-    InputError
-        If the data or the sky model cannot be used, the calibrator refuses them, or a user's calibrator fails or
-        returns an invalid calibration.
+    calibrator : any calibrator, built in or a user's
+    data : visibilities, rectangular and time-major; not changed
+    sky_model : visibilities of the known part of the sky, with the samples of `data`, or None; not changed
+    gains : gains to start from, for an iterative calibrator; None for the calibrator's own start
+    progress : called after each solve with the number done and the total
+    noise : standard deviation of the noise of a sample (see `Assumed`); None if it is not known
     """
     observation = Observation(data)
     assumed = Assumed(None if sky_model is None else Observation(sky_model), gains, noise)

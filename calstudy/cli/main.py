@@ -162,7 +162,7 @@ def claims(
     Writes claims.json and claims.md into the folder. For a collection with studies by the paper's own solver and by
     another one, also writes claims-by-solver.json and claims-by-solver.md.
     """
-    from calstudy.claims.folders import evaluate_folder
+    from calstudy.claims.evaluation import evaluate_folder
     from calstudy.verdicts.tables import show_verdicts, to_json
 
     console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or (), run_code)

@@ -175,7 +175,8 @@ def compare_floors(
 
     Every channel is simulated, so that only the beam is interpolated.
     """
-    from calstudy.instrument.telescope import make_template, subset_template
+    from calstudy.base.visibilities import subset_template
+    from calstudy.instrument.telescope import make_template
     from calstudy.simulate.chunks import simulate_visibilities
     from calstudy.sky.foregrounds import make_foregrounds
 

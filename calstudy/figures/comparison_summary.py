@@ -184,14 +184,10 @@ def draw_tolerances(
 
     Parameters
     ----------
-    found
-        The faults.
-    cases
-        By world and calibrator.
-    calibrators
-        Their labels, in order.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    found : the faults
+    cases : by world and calibrator
+    calibrators : their labels, in order
+    stand_ins : see `calstudy.plotting.style.note_stand_ins`
     eor_level
         Amplitude of the EoR over that of the foregrounds in dB, to which the bias is relative; None if cases differ in
         it, or it is not known.

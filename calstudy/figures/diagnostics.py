@@ -38,26 +38,17 @@ class Diagnostics:
 
     Attributes
     ----------
-    delay
-        s, ascending, (Ndelays,).
-    lengths
-        Baseline lengths in m, ascending, (Nbls,).
+    delay : s, ascending, (Ndelays,)
+    lengths : baseline lengths in m, ascending, (Nbls,)
     data, model, residual
         Delay transform after a Blackman-Harris taper, rms over integrations, (Nbls, Ndelays); flagged samples are zero.
-    frequency
-        Hz, (Nfreqs,).
-    antennas
-        Names of the antennas that are drawn, (Nshown,).
-    gains
-        Complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs).
-    losses
-        Loss after each step over the first loss of its own solve, one array for each solve.
-    converged
-        True for each solve that converged, (Nsolves,).
-    chi2_antennas
-        Names of all calibrated antennas, (Nants,).
-    chi2_by_antenna, chi2_by_channel, chi2_by_integration
-        As in `calstudy.realdata.quality.Quality`.
+    frequency : hz, (Nfreqs,)
+    antennas : names of the antennas that are drawn, (Nshown,)
+    gains : complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs)
+    losses : loss after each step over the first loss of its own solve, one array for each solve
+    converged : true for each solve that converged, (Nsolves,)
+    chi2_antennas : names of all calibrated antennas, (Nants,)
+    chi2_by_antenna, chi2_by_channel, chi2_by_integration : as in `calstudy.realdata.quality.Quality`
     """
 
     polarization: str

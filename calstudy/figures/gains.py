@@ -32,14 +32,10 @@ class GainComparison:
 
     Attributes
     ----------
-    antennas
-        The two antenna numbers.
-    true, recovered, residual
-        Injected gains, solutions as fitted and true - recovered, spectra of shape (2, Nfreqs).
-    aligned_residual
-        True gains less the solutions that are aligned with them, free of what no fit can know.
-    correction
-        The gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, as fitted, (Nfreqs,).
+    antennas : the two antenna numbers
+    true, recovered, residual : injected gains, solutions as fitted and true - recovered, spectra of shape (2, Nfreqs)
+    aligned_residual : true gains less the solutions that are aligned with them, free of what no fit can know
+    correction : the gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, as fitted, (Nfreqs,)
     """
 
     antennas: tuple[int, int]
@@ -59,10 +55,8 @@ def compare_gains(
 
     Parameters
     ----------
-    antennas
-        The two antenna numbers.
-    frequency
-        Channel centres, Hz, (Nfreqs,).
+    antennas : the two antenna numbers
+    frequency : channel centres, Hz, (Nfreqs,)
     true, recovered, aligned
         Gains: injected, as fitted, and fitted with the scale and the phase of each channel that come closest to the
         truth; complex, (2, Nfreqs).

@@ -15,12 +15,11 @@ from calstudy.figures.wedge import draw_panels
 from calstudy.plotting import style
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
-from calstudy.products.expected_loss import EXPECTED
-from calstudy.products.files import spectrum_file
+from calstudy.products.files import EXPECTED, spectrum_file
+from calstudy.products.files import TRANSFER as FILE
 from calstudy.products.graph import required
 from calstudy.products.observed_injection import expected_loss, transfer
 from calstudy.products.observed_results import observed_spectra
-from calstudy.products.signal_loss import TRANSFER as FILE
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 

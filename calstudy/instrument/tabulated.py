@@ -107,8 +107,7 @@ class TabulatedBeam:
         In radians.
     tabulated_frequencies : (Ntab,) float
         Those in the band, and those next to its ends, in Hz.
-    fit_error
-        Largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`.
+    fit_error : largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`
     """
 
     def __init__(self, fitted: Mapping[str, Any]) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 from astropy.time import Time
 from pyuvdata import UVData
 
-from calstudy.base.visibilities import require_rectangular
-from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.base.visibilities import require_rectangular, use_bundled_earth_orientation
 
 SECONDS_PER_DAY = 86400.0
 

@@ -48,16 +48,13 @@ class Corrected:
     ----------
     transfer, transfer_error
         Mean T of the other realizations, and the expected deviation of this one's T from it, (K, Nk).
-    power
-        P^R / T, (K, Nk), mK^2 h^-3 Mpc^3.
+    power : P^R / T, (K, Nk), mK^2 h^-3 Mpc^3
     error, error_with_sample
         Standard deviations of its difference from P^S, and from the input power, with its sample variance, (K, Nk).
     power_known_scale
         P^R s^2 / (T s^2), (K, Nk): P^R on the true flux scale, by s of the realization itself, over T s^2 of others.
-    shared
-        Largest number of parts (EoR, gains, noise) in common with a realization that T is from, (K,) int.
-    reasons
-        Why a bin is not corrected in any realization, (Nk,) str; empty where it is.
+    shared : largest number of parts (EoR, gains, noise) in common with a realization that T is from, (K,) int
+    reasons : why a bin is not corrected in any realization, (Nk,) str; empty where it is
     """
 
     transfer: np.ndarray = field(metadata={"unit": ""})

@@ -64,12 +64,9 @@ class Pooled:
 
     Attributes
     ----------
-    scatter, error
-        Standard deviation of one realization, and standard error of the mean, (Nk,).
-    quoted
-        rms of the errors that the realizations quote, (Nk,).
-    covariance
-        Of one realization, between bins, (Nk, Nk). Its rank is below the number of realizations.
+    scatter, error : standard deviation of one realization, and standard error of the mean, (Nk,)
+    quoted : rms of the errors that the realizations quote, (Nk,)
+    covariance : of one realization, between bins, (Nk, Nk). Its rank is below the number of realizations.
     counted_twice
         Part of the sum of the variances of all blocks that is in several of them, and left out of `covariance`.
     """

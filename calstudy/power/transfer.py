@@ -81,23 +81,17 @@ class TransferFunction:
 
     Attributes
     ----------
-    k, bin_edges
-        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
-    transfer, transfer_error
-        T = P^D / P^S and its standard deviation, (Nk,).
-    cross_transfer, cross_transfer_error
-        C = Re <S* D> / P^S and its standard deviation, (Nk,).
+    k, bin_edges : bin centres (Nk,) and edges (Nk + 1,), h/Mpc
+    transfer, transfer_error : t = P^D / P^S and its standard deviation, (Nk,)
+    cross_transfer, cross_transfer_error : c = Re <S* D> / P^S and its standard deviation, (Nk,)
     scale_free_transfer, scale_free_transfer_error
         T s^2, the transfer function free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     squared_coherence, squared_coherence_error
         C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,). For spectra of each
         baseline with itself it is the fraction of the power that is retained.
-    signal
-        Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins.
-    n_samples
-        Baselines, or redundant groups, in each bin, (Nk,) int.
-    flux_scale
-        s: fitted gain products over the true ones; NaN if not known.
+    signal : sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins
+    n_samples : baselines, or redundant groups, in each bin, (Nk,) int
+    flux_scale : s: fitted gain products over the true ones; NaN if not known
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})
@@ -121,16 +115,12 @@ class TransferMap:
 
     Attributes
     ----------
-    baseline_length, k_perp
-        Mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
-    bin_edges
-        Lower and upper edge of each bin, (Nb, 2), m.
-    delay, k_parallel
-        (Nd,) ascending, s and h/Mpc.
+    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
+    bin_edges : lower and upper edge of each bin, (Nb, 2), m
+    delay, k_parallel : (Nd,) ascending, s and h/Mpc
     transfer, transfer_error, cross_transfer, cross_transfer_error
         As in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples.
-    horizon_delay
-        |b|/c, the edge of the wedge, (Nb,), s.
+    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
     """
 
     baseline_length: np.ndarray = field(metadata={"unit": "m"})

@@ -208,8 +208,7 @@ class MeasureLevels(Task, stage="levels", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scales to levels.json."""
-        from calstudy.corrupt.levels import rms, set_levels
-        from calstudy.corrupt.noise import radiometer_std
+        from calstudy.corrupt.levels import radiometer_std, rms, set_levels
 
         foregrounds, eor = (
             0.0 if folder is None else rms(to_cube(read_visibilities(folder / VISIBILITIES)))

@@ -13,7 +13,7 @@ from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
-from calstudy.instrument.size import Size
+from calstudy.instrument.layouts import size_of_instrument
 from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
 from calstudy.power.settings import PowerSettings
 from calstudy.products import calibration, corruption
@@ -68,7 +68,7 @@ def linear_response(graph: Graph) -> Task | None:
     """
     fit, power = graph.experiment.calibration, graph.experiment.power
     fits = isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None
-    size = Size.of(graph.experiment.instrument)
+    size = size_of_instrument(graph.experiment.instrument)
     large = size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES
     if not fits or large or power.pairs == "redundant-group":
         return None

@@ -11,10 +11,11 @@ from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cub
 from calstudy.calibrate.settings import GainFit
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products.calibration import prepared_fit, read_result
-from calstudy.products.expected_loss import EXPECTED, LABEL, NOT_OF_THE_FIT, PROBES, binned
+from calstudy.products.expected_loss import LABEL, NOT_OF_THE_FIT, PROBES, binned
 from calstudy.products.files import (
     AVERAGE,
     DATA,
+    EXPECTED,
     GAINS,
     MODEL,
     RESIDUAL,
@@ -152,9 +153,9 @@ class SimulateEor(Task, stage="observed-eor", version=3):
         """Write the EoR to visibilities.uvh5."""
         import numpy as np
 
+        from calstudy.base.visibilities import subset_template
         from calstudy.instrument.beams import make_beam
         from calstudy.instrument.interface import model_of
-        from calstudy.instrument.telescope import subset_template
         from calstudy.power.cosmology import make_cosmology
         from calstudy.simulate.chunks import assemble, plan_chunks, simulate_chunk
         from calstudy.sky.eor import EorField

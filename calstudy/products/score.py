@@ -11,7 +11,19 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.products import calibration, corruption, expected_loss, signal_loss, sky_model, spectra
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import DATA, MODEL, SOLUTION, json_number, read_in_parts, read_json, write_json
+from calstudy.products.files import (
+    DATA,
+    MODEL,
+    SCORE,
+    SCORE_BANDS,
+    SCORE_BINS,
+    SKY_MODEL_ERROR,
+    SOLUTION,
+    json_number,
+    read_in_parts,
+    read_json,
+    write_json,
+)
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
@@ -25,9 +37,6 @@ if TYPE_CHECKING:
     from calstudy.power.settings import PowerSettings
     from calstudy.products.selection import Gains
 
-SPECTRA = ("signal", "response", "cross", "residual", "residual_without_eor")
-"""What the scores are made from, and what differences of two of them are."""
-BINS, BANDS, SUMMARY = "score-bins.h5", "score-bands.h5", "score.json"
 MEASURED = 2
 """Version of T and the bias; scores of different versions are not ranked together."""
 SAMPLES_AT_A_TIME = 14 * 630 * 384
@@ -90,8 +99,7 @@ class MeasureScore(Task, stage="score", version=4):
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scores, and all numbers to score.json."""
         from calstudy.power.binned import make_bin_edges
-        from calstudy.power.score import BANDS as EDGES
-        from calstudy.power.score import CalibratedSpectra
+        from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra
         from calstudy.power.score import score as measure
         from calstudy.power.spectra import of_common_units
         from calstudy.power.tables import save_spectrum
@@ -100,10 +108,10 @@ class MeasureScore(Task, stage="score", version=4):
         measured = CalibratedSpectra(**of_common_units(delays))
         known = read_json(self.scale / signal_loss.SCALE)["flux_scale"]
         scale, power = math.nan if known is None else known, self.power
-        save_spectrum(output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
-        bands = measure(measured, EDGES, power.wedge_buffer, scale)
+        save_spectrum(output / SCORE_BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
+        bands = measure(measured, BANDS, power.wedge_buffer, scale)
         linear = self._linear_transfer(measured)
-        save_spectrum(output / BANDS, bands)
+        save_spectrum(output / SCORE_BANDS, bands)
         summary = {
             "bands": _in_bands(bands, linear),
             "flux_scale": known,
@@ -112,7 +120,7 @@ class MeasureScore(Task, stage="score", version=4):
             "held_out_chi_squared": self._held_out_chi_squared(),
             **self._solves(),
         }
-        write_json(output / SUMMARY, summary)
+        write_json(output / SCORE, summary)
         return {}
 
     def _linear_transfer(self, measured: CalibratedSpectra) -> np.ndarray | None:
@@ -128,7 +136,7 @@ class MeasureScore(Task, stage="score", version=4):
         """Return the rms of the sky model's error over that of the true foregrounds; zero for a perfect sky model."""
         if self.sky_model_error is None:
             return 0.0
-        return read_json(self.sky_model_error / sky_model.ERROR)["relative_error"]
+        return read_json(self.sky_model_error / SKY_MODEL_ERROR)["relative_error"]
 
     def _known_gains(self, parity: str) -> tuple[Gains, np.ndarray]:
         """Return fitted gains, and the true ones of the same antennas and integrations."""

@@ -42,10 +42,7 @@ UNREADABLE = (OSError, ValueError, KeyError, IndexError, TypeError, AttributeErr
 def read_visibilities(paths: Sequence[Path], read_data: bool = True) -> UVData:
     """Read one data set from a file or folder, or from several that belong together; or its metadata alone.
 
-    Raises
-    ------
-    InputError
-        If a path does not exist, pyuvdata cannot read it, or its antennas have no positions.
+    Raises InputError if a path does not exist, pyuvdata cannot read it, or its antennas have no positions.
     """
     _require_readable(paths)
     names = ", ".join(map(str, paths))
@@ -124,6 +121,9 @@ def _first_sentence(error: Exception) -> str:
 def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:
     """Select, unphase, order and fill a data set; the given one is not changed.
 
+    Raises InputError if nothing is left, the polarizations are not of feeds, or less than half of the samples are at
+    common times.
+
     Returns
     -------
     data
@@ -131,11 +131,6 @@ def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, li
         missing or not finite are flagged.
     notes
         One sentence for each change.
-
-    Raises
-    ------
-    InputError
-        If nothing is left, the polarizations are not of feeds, or less than half of the samples are at common times.
     """
     notes: list[str] = []
     data = select(data, replace(selection, times=None)).copy()

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
-from calstudy.results.folder import MANIFEST, RunFolder
+from calstudy.results.reader import MANIFEST, RunFolder
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task
 from calstudy.studies.kinds.collection import Collection
@@ -58,10 +58,7 @@ class FinishedRun:
 def find_finished(folders: Sequence[Path]) -> list[FinishedRun]:
     """Return the readable finished runs among these folders and directly below them.
 
-    Raises
-    ------
-    InputError
-        If a folder neither is one nor contains any.
+    Raises InputError if a folder neither is one nor contains any.
     """
     found = []
     for folder in folders:
@@ -87,15 +84,10 @@ def _read(folder: Path) -> FinishedRun | None:
 def with_finished(collection: Study, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Collection:
     """Return a collection whose members are taken from finished runs of the same studies.
 
-    The tables of such a member are put into the store of the collection, and it is not run again. The console shows
-    the run of each member, and the reason why a run of its name is not used. With `planned`, the store does not
-    change.
-
-    Raises
-    ------
-    InputError
-        If the study is not a collection, no member is found, the store has other results of a member, or it cannot
-        be written.
+    The tables of such a member are put into the store of the collection, and it is not run again. The console shows the
+    run of each member, and the reason why a run of its name is not used. With `planned`, the store does not change.
+    Raises InputError if the study is not a collection, no member is found, the store has other results of a member, or
+    it cannot be written.
     """
     if not isinstance(collection, Collection):
         raise InputError("--finished: only a collection (a file with the key 'experiments') takes members from runs")

@@ -15,9 +15,8 @@ from pydantic import BeforeValidator, Field, model_validator
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
 from calstudy.base.schema import Section, fault
-from calstudy.claims.evaluation import members_by_role, refusal_of_role
+from calstudy.claims.evaluation import combined_claims, members_by_role, refusal_of_role
 from calstudy.claims.paper import distinct_papers, unique_notes
-from calstudy.claims.product import combined_claims
 from calstudy.experiment.files import StudyFile, apply_scale, checked, override, validate
 from calstudy.experiment.model import Experiment, Figures, StudyName
 from calstudy.experiment.yaml_files import read_mapping
@@ -151,9 +150,9 @@ class Collection(Family):
     @cached_property
     def claims(self) -> Task | None:
         """The statements of the members' papers, each evaluated on the members that play its roles, or None."""
-        graphs = {name: study.graph for name, study in self.studies.items()}
+        runs = {name: study.evaluated for name, study in self.studies.items()}
         papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
-        return combined_claims(self.name, graphs, papers, self.roles, self.stand_ins)
+        return combined_claims(self.name, runs, papers, self.roles, self.stand_ins)
 
     def _place(self, name: str) -> str:
         """Return the path of a member's folder, relative to the folder of runs."""

@@ -15,8 +15,8 @@ from calstudy.base.resources import free_memory, parse_memory
 from calstudy.base.schema import Section, fault
 from calstudy.base.units import Length
 from calstudy.calibrate.settings import BasisSettings
+from calstudy.claims.evaluation import run_time_claims
 from calstudy.claims.paper import distinct_papers
-from calstudy.claims.product import run_time_claims
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Folders, Papers, StudyName
 from calstudy.figures import draw_task

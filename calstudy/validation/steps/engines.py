@@ -18,13 +18,13 @@ from pydantic import Field
 from pyradiosky import SkyModel
 from scipy.constants import speed_of_light
 
-from calstudy.base.visibilities import baseline_vectors
+from calstudy.base.visibilities import baseline_vectors, subset_template
 from calstudy.corrupt.levels import rms
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.beam_models.formulas import GaussianBeam
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import InstrumentSettings
-from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.instrument.telescope import make_template
 from calstudy.simulate.interface import Engine
 from calstudy.simulate.nodes import integration_times
 from calstudy.sky.foregrounds import make_foregrounds
