@@ -13,7 +13,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.visibilities import antenna_pairs
+from calstudy.base.visibilities import antenna_pairs, positions
 
 CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
 """Package that reads and writes CASA tables and measurement sets."""
@@ -145,8 +145,7 @@ def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     `pairs` are numbers of antennas that are in `cal`, whose convention is "divide".
     """
-    order = np.argsort(cal.ant_array)
-    first, second = (order[np.searchsorted(cal.ant_array, column, sorter=order)] for column in pairs.T)
+    first, second = positions(cal.ant_array, pairs).T
     products = cal.gain_array[first] * cal.gain_array[second].conj()
     return np.moveaxis(products, 2, 0), np.moveaxis(cal.flag_array[first] | cal.flag_array[second], 2, 0)
 

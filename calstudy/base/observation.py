@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
+from calstudy.base.visibilities import antenna_pairs, flag_cube, positions, require_rectangular, to_cube
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -125,8 +125,7 @@ class Observation(Frame):
         except ValueError as error:
             raise InputError(str(error)) from None
         numbers, antennas = np.unique(antenna_pairs(uvd), return_inverse=True)
-        order = np.argsort(uvd.telescope.antenna_numbers)
-        rows = order[np.searchsorted(uvd.telescope.antenna_numbers, numbers, sorter=order)]
+        rows = positions(uvd.telescope.antenna_numbers, numbers)
         super().__init__(
             numbers,
             uvd.telescope.get_enu_antpos()[rows],

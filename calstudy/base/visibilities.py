@@ -87,6 +87,12 @@ def antenna_pairs(uvd: UVData) -> np.ndarray:
     return np.column_stack([uvd.ant_1_array[: uvd.Nbls], uvd.ant_2_array[: uvd.Nbls]])
 
 
+def positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the index in `values`, unique and in any order, (N,), of each of `wanted`, in the shape of `wanted`."""
+    order = np.argsort(values)
+    return order[np.searchsorted(values, wanted, sorter=order)]
+
+
 def rows_of(uvd: UVData, pairs: np.ndarray) -> list[int]:
     """Return the places of baselines (a, b), (n, 2), among `antenna_pairs`; raise KeyError if one is missing."""
     places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(uvd).tolist())}
@@ -95,15 +101,12 @@ def rows_of(uvd: UVData, pairs: np.ndarray) -> list[int]:
 
 def antenna_indices(uvd: UVData) -> np.ndarray:
     """Return `antenna_pairs` as indices into `uvd.telescope.antenna_numbers`, (Nbls, 2)."""
-    order = np.argsort(uvd.telescope.antenna_numbers)
-    return order[np.searchsorted(uvd.telescope.antenna_numbers, antenna_pairs(uvd), sorter=order)]
+    return positions(uvd.telescope.antenna_numbers, antenna_pairs(uvd))
 
 
 def antenna_rows(uvd: UVData) -> np.ndarray:
     """Return the indices in `uvd.telescope.antenna_numbers` of the antennas of the baselines, by ascending number."""
-    order = np.argsort(uvd.telescope.antenna_numbers)
-    numbers = np.unique(antenna_pairs(uvd))
-    return order[np.searchsorted(uvd.telescope.antenna_numbers, numbers, sorter=order)]
+    return positions(uvd.telescope.antenna_numbers, np.unique(antenna_pairs(uvd)))
 
 
 def baseline_vectors(uvd: UVData) -> np.ndarray:

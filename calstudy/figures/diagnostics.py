@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -87,7 +87,7 @@ def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.nd
 
 
 @style.journal_style()
-def draw_diagnostics(found: Diagnostics, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_diagnostics(found: Diagnostics) -> Figure:
     """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 
     The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
@@ -109,7 +109,6 @@ def draw_diagnostics(found: Diagnostics, stand_ins: Sequence[str] = ()) -> Figur
         _label_between_powers(axes)
     # Above the axes: gains of measured data have peaks anywhere.
     grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -291,4 +290,4 @@ class DiagnosticsFigure(StudyFigure):
         """Draw the diagnostics of the first polarization."""
         data = read_visibilities(job.inputs["data"] / DATA)
         found = diagnose(data, read_result(job.inputs["calibration"]))
-        return Drawing(draw_diagnostics(found, job.settings["notes"]), found)
+        return Drawing(draw_diagnostics(found), found)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.visibilities import positions
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.delay import horizon_delay
 from calstudy.power.settings import PowerSettings
@@ -286,12 +287,11 @@ def _units(uvp: UVPSpec, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    baselines, positions = np.unique(pairs, return_inverse=True)
-    first, second = positions.reshape(pairs.shape).T
+    baselines, places = np.unique(pairs, return_inverse=True)
+    first, second = places.reshape(pairs.shape).T
     graph = coo_array((np.ones(first.size), (first, second)), shape=(baselines.size, baselines.size))
     _, label = connected_components(graph, directed=False)
-    order = np.argsort(uvp.bl_array)
-    rows = order[np.searchsorted(uvp.bl_array, baselines, sorter=order)]
+    rows = positions(uvp.bl_array, baselines)
     # hera_pspec stores x_a - x_b.
     vectors = -uvp.get_ENU_bl_vecs()[rows]
     mean = np.stack([np.bincount(label, vectors[:, axis]) for axis in range(3)], axis=1) / np.bincount(label)[:, None]

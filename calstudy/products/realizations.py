@@ -13,13 +13,14 @@ from calstudy.base.resources import Cost
 from calstudy.base.table import Table, number
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
 from calstudy.experiment.realizations import described, expand_realizations, members
-from calstudy.power.corrected import Corrected, correct_realizations
 from calstudy.power.realizations import (
     QUANTITIES,
     TRANSFER_QUANTITIES,
+    Corrected,
     Design,
     PooledRegion,
     Sample,
+    correct_realizations,
     coverage,
     error_ratio,
     inside_bars,
@@ -46,8 +47,8 @@ REGIONS = ("outside-wedge", "inside-wedge", "all-modes")
 """Parts of Fourier space in which spectra are averaged; the transfer function is known in those of `signal_loss`."""
 JUDGED_REGION, JUDGED_K = "outside-wedge", 0.2
 WHERE = f"outside the wedge, k >= {JUDGED_K:g} h/Mpc"
-CRITERIA = {
-    "bars-cover-eor": Criterion(
+_CRITERIA = (
+    Criterion(
         "bars-cover-eor",
         "Error bars as quoted",
         "the 95 % bars of P^R cover P^S in 95 % of bins",
@@ -55,7 +56,7 @@ CRITERIA = {
         Within(0.93, 0.97),
         "95 ± 2 %, as of a 95 % bar",
     ),
-    "bars-cover-input": Criterion(
+    Criterion(
         "bars-cover-input",
         "Error bars as quoted",
         "the 95 % bars of P^R cover the input power in 95 % of bins",
@@ -63,7 +64,7 @@ CRITERIA = {
         Within(0.93, 0.97),
         "95 ± 2 %, as of a 95 % bar",
     ),
-    "corrected-mean": Criterion(
+    Criterion(
         "corrected-mean",
         "P^R corrected by T of other realizations",
         "P^R / T is the input on average",
@@ -71,7 +72,7 @@ CRITERIA = {
         Within(0.99, 1.01),
         "to 1 %",
     ),
-    "corrected-mean-known-scale": Criterion(
+    Criterion(
         "corrected-mean-known-scale",
         "P^R corrected by T of other realizations",
         "P^R / T is the input on average where the flux scale is known",
@@ -79,7 +80,7 @@ CRITERIA = {
         Within(0.99, 1.01),
         "to 1 %",
     ),
-    "corrected-covers-eor": Criterion(
+    Criterion(
         "corrected-covers-eor",
         "P^R corrected by T of other realizations",
         "the 95 % intervals of P^R / T cover P^S in 95 % of bins",
@@ -87,7 +88,7 @@ CRITERIA = {
         Within(0.92, 0.98),
         "95 ± 3 %, as of a 95 % interval",
     ),
-    "corrected-covers-input": Criterion(
+    Criterion(
         "corrected-covers-input",
         "P^R corrected by T of other realizations",
         "the 95 % intervals of P^R / T cover the input power in 95 % of bins",
@@ -95,7 +96,8 @@ CRITERIA = {
         Within(0.92, 0.98),
         "95 ± 3 %, as of a 95 % interval",
     ),
-}
+)
+CRITERIA = {criterion.name: criterion for criterion in _CRITERIA}
 COVERED = {
     "bars-cover-eor": "eor",
     "bars-cover-input": "input",

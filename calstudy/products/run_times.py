@@ -9,7 +9,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
+
+import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
@@ -22,9 +24,6 @@ from calstudy.instrument.layouts import antenna_count
 from calstudy.instrument.settings import Channels, Layout
 from calstudy.products.files import read_json, write_json
 from calstudy.run.task import Input, Inputs, Task
-
-if TYPE_CHECKING:
-    import numpy as np
 
 CASE, LOSSES, DESCENT, RUNTIME = "case.json", "losses.npz", "descent.json", "runtime.json"
 # The paper's padded step, per byte of its basis.
@@ -185,8 +184,6 @@ class TimeSteps(Timed, stage="step-times", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Time the solvers, and write all samples to case.json."""
-        import numpy as np
-
         array = self.array.model_dump(mode="json")
         found = asdict(time_steps_apart(array, Samples(**self.samples), self.device))
         case = {name: getattr(self, name) for name in ("panel", "size", "device", "machine")}
@@ -208,8 +205,6 @@ class CountSteps(Timed, stage="descent", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Run the solver for `max_steps`, and count the steps to each of `EXCESSES`."""
-        import numpy as np
-
         found = descend_apart(self.array.model_dump(mode="json"), self.max_steps)
         np.savez(output / LOSSES, allow_pickle=False, losses=found.losses, floor=found.floor)
         counted = {
@@ -258,8 +253,6 @@ class RunTimes(Task, stage="runtime", version=2, cost=Cost(1, disk=1e5)):
 
 
 def _quantiles(samples: Sequence[float]) -> dict[str, float]:
-    import numpy as np
-
     low, median, high = (float(value) for value in np.quantile(samples, QUANTILES))
     return {"median": median, "low": low, "high": high, "count": len(samples)}
 
@@ -282,8 +275,6 @@ def fit_power_law(size: np.ndarray, value: np.ndarray) -> PowerLaw:
 
     Raises ValueError if there are fewer sizes, or a number is not positive.
     """
-    import numpy as np
-
     if len(size) != len(value) or np.unique(size).size < 3 or min(*size, *value) <= 0:
         raise ValueError(f"a power law needs positive values at three sizes or more, got {len(value)} at {len(size)}")
     (exponent, logarithm), covariance = np.polyfit(np.log(size), np.log(value), 1, cov=True)

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from calstudy.power.score import CalibratedSpectra, Score
     from calstudy.power.settings import PowerSettings
-    from calstudy.products.selection import Gains
 
 MEASURED = 2
 """Version of T and the bias; scores of different versions are not ranked together."""
@@ -138,24 +137,15 @@ class MeasureScore(Task, stage="score", version=4):
             return 0.0
         return read_json(self.sky_model_error / SKY_MODEL_ERROR)["relative_error"]
 
-    def _known_gains(self, parity: str) -> tuple[Gains, np.ndarray]:
-        """Return fitted gains, and the true ones of the same antennas and integrations."""
-        import numpy as np
-
-        from calstudy.products.selection import read_gains
-
-        fitted = read_gains(self.calibration[parity])
-        if self.gains is None:
-            return fitted, np.ones(fitted.values.shape)
-        return fitted, read_gains(self.gains).over(len(fitted.values), fitted.numbers)
-
     def _gain_errors(self) -> dict[str, float | None]:
         """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
         import numpy as np
 
         from calstudy.calibrate.agreement import aligned_gains, gain_errors
+        from calstudy.products.selection import read_gains, true_of
 
-        fitted, true = self._known_gains(PARITIES[0])
+        fitted = read_gains(self.calibration[PARITIES[0]])
+        true = true_of(self.gains, fitted)
         solved = ~fitted.flags.all(axis=(1, 2))
         if not solved.any():
             return {"gain_error_aligned": None, "gain_error_as_fitted": None}
@@ -173,16 +163,16 @@ class MeasureScore(Task, stage="score", version=4):
         """
         import numpy as np
 
-        from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+        from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
+        from calstudy.products.selection import read_gains
 
-        fitted, _ = self._known_gains(PARITIES[0])
+        fitted = read_gains(self.calibration[PARITIES[0]])
         paths = [self.data[parity] / DATA for parity in PARITIES]
         paths.append(self.calibration[PARITIES[0]] / MODEL)
         misfit = noise = 0.0
         for part, (even, odd, model) in read_in_parts(paths, SAMPLES_AT_A_TIME):
-            places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(even).tolist())}
-            rows = [places[tuple(pair)] for pair in antenna_pairs(model).tolist()]
-            first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
+            rows = rows_of(even, antenna_pairs(model))
+            first, second = np.searchsorted(fitted.numbers, antenna_pairs(model)).T
             cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
             flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
             unsolved = flag_cube(model)[..., 0]

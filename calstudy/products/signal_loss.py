@@ -254,15 +254,12 @@ class FluxScale(Task, stage="flux-scale", version=1):
         import numpy as np
 
         from calstudy.power.delay import make_taper
-        from calstudy.products.selection import read_gains
+        from calstudy.products.selection import read_gains, true_of
 
         ratios = []
         for folder in (self.even, self.odd):
             fitted = read_gains(folder)
-            true = np.ones(fitted.values.shape)
-            if self.gains is not None:
-                true = read_gains(self.gains).over(len(fitted.values), fitted.numbers)
-            ratios.append(gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values)))
+            ratios.append(gain_ratio(true_of(self.gains, fitted), np.where(fitted.flags, np.nan, fitted.values)))
         scale = flux_scale(ratios[0], ratios[1], make_taper(self.taper, fitted.frequency.size) ** 2)
         write_json(output / SCALE, {"flux_scale": json_number(scale)})
         return {}

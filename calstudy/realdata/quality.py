@@ -15,6 +15,7 @@ from calstudy.base.visibilities import (
     antenna_pairs,
     flag_cube,
     from_cube,
+    positions,
     rows_of,
     to_cube,
     use_bundled_earth_orientation,
@@ -137,8 +138,7 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     """
     gains, pairs = result.gains, antenna_pairs(result.model)
     numbers = np.unique(pairs)
-    order = np.argsort(gains.ant_array)
-    rows = order[np.searchsorted(gains.ant_array, numbers, sorter=order)]
+    rows = positions(gains.ant_array, numbers)
     flags = gains.flag_array[rows, :, :, polarization]
     values = np.where(flags, np.nan, gains.gain_array[rows, :, :, polarization])
     by_channel, by_antenna = _gain_ratios(np.abs(values))

@@ -104,7 +104,7 @@ def accept(run: Path, reference: Path) -> None:
         paths = {path.name: path for ending in KEPT for path in (run / "figures").glob(f"*.{ending}")}
         paths |= {name: run / name for name in CLAIMS_FILES if (run / name).is_file()}
         paths |= {name: run / "tables" / name for name in TABLES if (run / "tables" / name).is_file()}
-        # A collection can be assembled from references with these (`calstudy.studies.finished`).
+        # A collection can be assembled from references with these (`calstudy.studies.kinds.collection`).
         listed = {name for entry in manifest.get("products", []) for name in entry.get("files", ())}
         paths |= {f"tables/{name}": run / "tables" / name for name in sorted(listed)}
         contents = {name: path.read_bytes() for name, path in paths.items()}

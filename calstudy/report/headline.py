@@ -13,7 +13,7 @@ from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.measured import marked, why_not_measured
-from calstudy.verdicts.sentences import counts, outcomes_of_sentences
+from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
 BAND = (0.2, 0.5)
 """Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""

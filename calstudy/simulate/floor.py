@@ -65,6 +65,12 @@ def delay_profile(foregrounds: UVData, taper: Taper) -> tuple[np.ndarray, np.nda
     return np.fft.fftfreq(cube.shape[2], width), np.mean(np.abs(spectrum) ** 2, axis=(0, 3))
 
 
+def folded_spectrum(delays: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return delays >= 0, (N // 2,), and the mean power of both signs of each, from the order of `numpy.fft`."""
+    half = delays.size // 2
+    return delays[:half], np.concatenate([power[:1], (power[1:half] + power[:-half:-1]) / 2])
+
+
 def floor_buffers(foregrounds: UVData) -> dict[Taper, float]:
     """Return the delay beyond the horizon at which the main lobe of each taper ends, at least 100 ns, in s.
 

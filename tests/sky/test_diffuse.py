@@ -10,7 +10,7 @@ from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 from pyradiosky.utils import jy_to_ksr
 
-from calstudy.base import mwa_files, package_files
+from calstudy.base import package_files
 from calstudy.base.errors import InputError
 from calstudy.sky import foregrounds
 from calstudy.sky import settings as section
@@ -146,6 +146,6 @@ def test_a_map_alone():
 
 def test_a_missing_map_is_told(monkeypatch, tmp_path):
     monkeypatch.setattr(package_files, "find_spec", lambda name: None)
-    monkeypatch.setattr(mwa_files, "default_directory", lambda: tmp_path)
+    monkeypatch.setattr(package_files, "default_directory", lambda: tmp_path)
     with pytest.raises(InputError, match=r"data fetch haslam'.*use sky.diffuse: synthetic"):
         foregrounds.make_diffuse(FINEST)

@@ -24,8 +24,7 @@ from calstudy.products.spectra import power
 from calstudy.regression.comparison import accept
 from calstudy.run.execution import schedule
 from calstudy.run.store import Store
-from calstudy.studies.finished import with_finished
-from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.collection import Collection, with_finished
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.show import describe_plan
