@@ -41,8 +41,7 @@ from calstudy.products.files import (
 from calstudy.products.gain_errors import ERRORS
 from calstudy.products.gain_errors import gain_errors as errors_of_gains
 from calstudy.report.headline import read_headline
-from calstudy.results.folder import EXPERIMENT, RunFolder
-from calstudy.results.reader import Tables
+from calstudy.results.reader import EXPERIMENT, RunFolder, Tables
 from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task

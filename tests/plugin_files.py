@@ -14,7 +14,7 @@ from tiny import tiny
 
 from calstudy.experiment.files import validate
 from calstudy.experiment.model import Experiment
-from calstudy.run.perform import WorkOrder, perform
+from calstudy.run.execution import WorkOrder, perform
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
 

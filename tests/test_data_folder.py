@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calstudy.base.mwa_files import G4JY, MWA_FILES
+from calstudy.base.package_files import G4JY, MWA_FILES
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.layouts import make_layout
 from calstudy.sky import counts

@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calstudy.base import downloads, mwa_files, package_files
-from calstudy.base.downloads import download
+from calstudy.base import package_files
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
-from calstudy.base.mwa_files import BEAM, MWA_FILES
+from calstudy.base.package_files import BEAM, MWA_FILES, download
 from calstudy.cli.main import app
 
 
@@ -82,7 +81,7 @@ def test_files_of_the_package_are_those_that_would_be_fetched(name, monkeypatch,
     file = MWA_FILES[name]
     assert sha256(file.find()) == file.sha256
     monkeypatch.setattr(package_files, "find_spec", lambda _: None)
-    monkeypatch.setattr(mwa_files, "default_directory", lambda: tmp_path / "cache")
+    monkeypatch.setattr(package_files, "default_directory", lambda: tmp_path / "cache")
     with pytest.raises(InputError, match=f"calstudy data fetch {name}', install mwa_pb 1.1, or"):
         file.find()
     (tmp_path / "cache").mkdir()
@@ -91,4 +90,4 @@ def test_files_of_the_package_are_those_that_would_be_fetched(name, monkeypatch,
 
 
 def test_downloads_have_a_place_of_the_users():
-    assert downloads.default_directory().is_absolute()
+    assert package_files.default_directory().is_absolute()

@@ -11,8 +11,7 @@ import pytest
 
 from calstudy.studies.kinds.collection import Collection
 from calstudy.studies.load import load_study
-from calstudy.verdicts.sentences import OUTCOMES, outcomes_of_sentences
-from calstudy.verdicts.tables import from_json
+from calstudy.verdicts.tables import OUTCOMES, from_json, outcomes_of_sentences
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = sorted(path.name for path in (ROOT / "figures").iterdir() if path.is_dir())

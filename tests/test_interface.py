@@ -14,7 +14,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.report.headline import read_signal
-from calstudy.results.folder import RunFolder
+from calstudy.results.reader import RunFolder
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Physical constants, without imports."""
+"""Physical constants, and one of statistics, without imports."""
 
 HYDROGEN_LINE = 1420405751.768
 """Rest frequency of the 21 cm line, Hz."""
@@ -6,3 +6,5 @@ SPEED_OF_LIGHT = 299_792_458.0
 """Speed of light, m/s."""
 BOLTZMANN = 1.380649e-23
 """Boltzmann constant, J/K."""
+SIGMAS_95 = 1.96
+"""Half-width of a 95 % interval, in standard deviations."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.visibilities import antenna_pairs
+from calstudy.base.visibilities import antenna_pairs, positions
 
 CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
 """Package that reads and writes CASA tables and measurement sets."""
@@ -74,13 +74,11 @@ def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = N
 
     Parameters
     ----------
-    template
-        Gives telescope, channels, polarizations (xx, yy) and times.
+    template : gives telescope, channels, polarizations (xx, yy) and times
     gains
         Complex, (Nants_telescope, Nfreqs, Ntimes, Npols) in the order of `telescope.antenna_numbers`. Ntimes is
         the template's, or 1 for gains that are constant during the run.
-    flags
-        Boolean of the same shape; none flagged by default.
+    flags : boolean of the same shape; none flagged by default
     """
     from pyuvdata import UVCal
 
@@ -147,8 +145,7 @@ def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     `pairs` are numbers of antennas that are in `cal`, whose convention is "divide".
     """
-    order = np.argsort(cal.ant_array)
-    first, second = (order[np.searchsorted(cal.ant_array, column, sorter=order)] for column in pairs.T)
+    first, second = positions(cal.ant_array, pairs).T
     products = cal.gain_array[first] * cal.gain_array[second].conj()
     return np.moveaxis(products, 2, 0), np.moveaxis(cal.flag_array[first] | cal.flag_array[second], 2, 0)
 
@@ -156,16 +153,13 @@ def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
     """Return the gains of the template's antennas, channels and polarizations.
 
+    Raises InputError if `cal` has delays, or lacks an antenna, a channel or a polarization of the template.
+
     Returns
     -------
     (Nants_telescope, Nfreqs, Ntimes of `cal`, Npols) complex128
         In the order of `template.telescope.antenna_numbers` and in the convention "divide"; NaN where they are flagged,
         and for antennas that are in no baseline of the template and not in `cal`.
-
-    Raises
-    ------
-    InputError
-        If `cal` has delays, or lacks an antenna, a channel or a polarization of the template.
     """
     known = template.telescope.antenna_numbers
     require_solutions(cal, np.unique(antenna_pairs(template)), template.freq_array, np.min(template.channel_width))

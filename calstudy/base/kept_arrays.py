@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from calstudy.base.downloads import default_directory
 from calstudy.base.files import digest_json, replacing
+from calstudy.base.package_files import default_directory
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
+from calstudy.base.visibilities import antenna_pairs, flag_cube, positions, require_rectangular, to_cube
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -31,8 +31,7 @@ class Frame:
         The two antennas (a, b) of each baseline as indices into `numbers`.
     frequencies : (Nfreqs,) float
         Channel centres, Hz.
-    n_times, n_polarizations
-        Numbers of integrations and polarizations.
+    n_times, n_polarizations : numbers of integrations and polarizations
     """
 
     def __init__(
@@ -104,6 +103,8 @@ class Frame:
 class Observation(Frame):
     """Visibilities of every baseline at every time, with their antennas, baselines and channels.
 
+    Raises InputError if the visibilities are not rectangular.
+
     Parameters
     ----------
     uvd
@@ -116,11 +117,6 @@ class Observation(Frame):
         Julian date of each integration.
     polarizations : (Npols,) int
         AIPS numbers, such as -5 for XX.
-
-    Raises
-    ------
-    InputError
-        If the visibilities are not rectangular.
     """
 
     def __init__(self, uvd: UVData) -> None:
@@ -129,8 +125,7 @@ class Observation(Frame):
         except ValueError as error:
             raise InputError(str(error)) from None
         numbers, antennas = np.unique(antenna_pairs(uvd), return_inverse=True)
-        order = np.argsort(uvd.telescope.antenna_numbers)
-        rows = order[np.searchsorted(uvd.telescope.antenna_numbers, numbers, sorter=order)]
+        rows = positions(uvd.telescope.antenna_numbers, numbers)
         super().__init__(
             numbers,
             uvd.telescope.get_enu_antpos()[rows],

@@ -122,15 +122,12 @@ class Registry(Kinds[P]):
 
     Parameters
     ----------
-    noun
-        Name of the kind, such as "calibrator".
+    noun : name of the kind, such as "calibrator"
     package
         Package whose modules contain the built-in ones; module `sky_based` contains ``sky-based``. Modules whose name
         starts with an underscore contain none.
-    base_path
-        ``module:class`` of the base class of the kind.
-    tag
-        The field of an experiment file that contains the name.
+    base_path : ``module:class`` of the base class of the kind
+    tag : the field of an experiment file that contains the name
     families
         Whether a module may have several classes or none, and a class several names (`Plugin.names`). Names that are
         defaults of the tag are read from the text of the modules, without importing them.

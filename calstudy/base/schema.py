@@ -158,21 +158,13 @@ class Kinds(Generic[S]):
     def make(self, block: Any, default: str | None = None, **context: Any) -> S:
         """Return the section that a block of settings describes.
 
+        Raises pydantic.ValidationError if the settings are invalid, and InputError if there is no such kind.
+
         Parameters
         ----------
-        block
-            A name or path, a block of settings with the tag, or a section or word, which is returned unchanged.
-        default
-            Name for a block without the tag.
-        context
-            Of the validation: `folder` is where relative paths of files start; the working directory without it.
-
-        Raises
-        ------
-        pydantic.ValidationError
-            If the settings are invalid.
-        InputError
-            If there is no such kind.
+        block : a name or path, a block of settings with the tag, or a section or word, which is returned unchanged
+        default : name for a block without the tag
+        context : of the validation: `folder` is where relative paths of files start; the working directory without it
         """
         if isinstance(block, self.base) or block in self.words:
             return block

@@ -1,4 +1,4 @@
-"""Visibilities as one rectangular cube: conversion between UVData and arrays.
+"""Visibilities as one rectangular cube: conversion between UVData and arrays, and metadata without data.
 
 Every data set of a study has all its baselines at all its times, ordered time-major (all baselines of the first
 integration, then of the second, and so on). The functions here check that and reshape, without unnecessary copies.
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from pyuvdata import UVData
+    from pyuvdata import Telescope, UVData
 
 
 @cache
@@ -87,6 +87,12 @@ def antenna_pairs(uvd: UVData) -> np.ndarray:
     return np.column_stack([uvd.ant_1_array[: uvd.Nbls], uvd.ant_2_array[: uvd.Nbls]])
 
 
+def positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the index in `values`, unique and in any order, (N,), of each of `wanted`, in the shape of `wanted`."""
+    order = np.argsort(values)
+    return order[np.searchsorted(values, wanted, sorter=order)]
+
+
 def rows_of(uvd: UVData, pairs: np.ndarray) -> list[int]:
     """Return the places of baselines (a, b), (n, 2), among `antenna_pairs`; raise KeyError if one is missing."""
     places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(uvd).tolist())}
@@ -95,15 +101,12 @@ def rows_of(uvd: UVData, pairs: np.ndarray) -> list[int]:
 
 def antenna_indices(uvd: UVData) -> np.ndarray:
     """Return `antenna_pairs` as indices into `uvd.telescope.antenna_numbers`, (Nbls, 2)."""
-    order = np.argsort(uvd.telescope.antenna_numbers)
-    return order[np.searchsorted(uvd.telescope.antenna_numbers, antenna_pairs(uvd), sorter=order)]
+    return positions(uvd.telescope.antenna_numbers, antenna_pairs(uvd))
 
 
 def antenna_rows(uvd: UVData) -> np.ndarray:
     """Return the indices in `uvd.telescope.antenna_numbers` of the antennas of the baselines, by ascending number."""
-    order = np.argsort(uvd.telescope.antenna_numbers)
-    numbers = np.unique(antenna_pairs(uvd))
-    return order[np.searchsorted(uvd.telescope.antenna_numbers, numbers, sorter=order)]
+    return positions(uvd.telescope.antenna_numbers, np.unique(antenna_pairs(uvd)))
 
 
 def baseline_vectors(uvd: UVData) -> np.ndarray:
@@ -111,3 +114,57 @@ def baseline_vectors(uvd: UVData) -> np.ndarray:
     enu = uvd.telescope.get_enu_antpos()
     first, second = antenna_indices(uvd).T
     return enu[second] - enu[first]
+
+
+def use_bundled_earth_orientation() -> None:
+    """Prevent astropy from downloading Earth orientation tables; the installed tables cover the simulated date.
+
+    Call it in every process that computes sidereal times or source positions.
+    """
+    from astropy.utils import iers
+
+    iers.conf.auto_download = False
+
+
+def new_observation(
+    telescope: Telescope,
+    antenna_pairs: np.ndarray,
+    times: np.ndarray,
+    frequencies: np.ndarray,
+    resolution: tuple[float, float],
+    polarizations: np.ndarray,
+) -> UVData:
+    """Return the metadata of an observation; `resolution` is the integration time in s and the channel width in Hz."""
+    from pyuvdata import UVData
+
+    use_bundled_earth_orientation()
+    integration, width = resolution
+    uvd = UVData.new(
+        telescope=telescope,
+        antpairs=antenna_pairs,
+        times=times,
+        freq_array=frequencies,
+        polarization_array=polarizations,
+        integration_time=float(integration),
+        channel_width=float(width),
+        do_blt_outer=True,
+        time_axis_faster_than_bls=False,
+        update_telescope_from_known=False,
+        vis_units="Jy",
+        pol_convention="sum",
+    )
+    # pyuvdata's own history contains the time of day. Equal settings must give equal templates.
+    uvd.history = "calstudy instrument template"
+    return uvd
+
+
+def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndarray) -> UVData:
+    """Return the observation of the template at other times (Julian dates) and frequencies (Hz)."""
+    return new_observation(
+        template.telescope.copy(),
+        np.column_stack([template.ant_1_array, template.ant_2_array])[: template.Nbls],
+        times=np.asarray(times_jd, dtype=float),
+        frequencies=np.asarray(frequencies, dtype=float),
+        resolution=(template.integration_time[0], template.channel_width[0]),
+        polarizations=template.polarization_array.copy(),
+    )

@@ -69,14 +69,10 @@ class Baselines:
 
     Attributes
     ----------
-    antennas
-        Rows of the two antennas among the gains, (Nbls, 2).
-    lengths
-        |b| in m, (Nbls,).
-    frequency
-        Channel centres, Hz, (Nfreqs,).
-    buffer
-        Delay, s, that is added to the horizon delay; the wedge ends there.
+    antennas : rows of the two antennas among the gains, (Nbls, 2)
+    lengths : |b| in m, (Nbls,)
+    frequency : channel centres, Hz, (Nfreqs,)
+    buffer : delay, s, that is added to the horizon delay; the wedge ends there
     """
 
     antennas: np.ndarray

@@ -30,10 +30,8 @@ class Bucket:
 
     Attributes
     ----------
-    half_width
-        Largest modelled delay, in s.
-    members
-        Indices of the models in this bucket, shape (Nmembers,).
+    half_width : largest modelled delay, in s
+    members : indices of the models in this bucket, shape (Nmembers,)
     vectors
         Orthonormal sequences, shape (Nfreqs, Nvec), float64; with a prior, a root of the covariance of the foregrounds.
     """
@@ -180,21 +178,16 @@ def make_basis(
 ) -> ForegroundBasis:
     """Build the foreground basis of models with the given baseline lengths (paper Eq. FGMODEL).
 
+    Raises InputError if channels do not lie on an even grid, a half-width is zero, or a basis has as many vectors as
+    there are channels.
+
     Parameters
     ----------
-    lengths
-        Baseline length of each model in m, shape (Nmodels,); zero for autocorrelations.
-    frequencies
-        Channel centres in Hz on an even grid, gaps allowed, shape (Nfreqs,).
+    lengths : baseline length of each model in m, shape (Nmodels,); zero for autocorrelations
+    frequencies : channel centres in Hz on an even grid, gaps allowed, shape (Nfreqs,)
     prior
         Use a root of the covariance of a flat wedge with variance one per channel (see `flat_wedge_root`) in place of
         orthonormal vectors.
-
-    Raises
-    ------
-    InputError
-        If channels do not lie on an even grid, a half-width is zero, or a basis has as many vectors as there are
-        channels.
     """
     n_frequencies = len(frequencies)
     grid = channel_grid(np.asarray(frequencies, float))

@@ -38,12 +38,9 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    models, baselines
-        First one and one past the last, in the solvers' order.
-    bases
-        The different bases of these models, (Nfreqs, Nvec) each, float64.
-    basis_index
-        Index of the basis of each model, (Nmodels,), ascending.
+    models, baselines : first one and one past the last, in the solvers' order
+    bases : the different bases of these models, (Nfreqs, Nvec) each, float64
+    basis_index : index of the basis of each model, (Nmodels,), ascending
     """
 
     models: tuple[int, int]
@@ -84,14 +81,10 @@ class Vectors:
 
     Parameters
     ----------
-    bases
-        Different A^T, (Nbases, Nvec, length), float64, padded with rows of zeros.
-    overlaps
-        A^T Q of each, (Nbases, Nvec, rank), with the batch's span Q, in the precision of the inner products.
-    widths
-        Numbers of vectors that are not padding, (Nbases,).
-    index
-        Index of the basis of each row, (Nrows,), ascending.
+    bases : different A^T, (Nbases, Nvec, length), float64, padded with rows of zeros
+    overlaps : A^T Q of each, (Nbases, Nvec, rank), with the batch's span Q, in the precision of the inner products
+    widths : numbers of vectors that are not padding, (Nbases,)
+    index : index of the basis of each row, (Nrows,), ascending
     """
 
     def __init__(self, bases: np.ndarray, overlaps: np.ndarray, widths: np.ndarray, index: np.ndarray) -> None:
@@ -163,10 +156,8 @@ class Piece(NamedTuple):
     ----------
     span
         Orthonormal basis Q of the span of the batch's vectors, (Nfreqs, rank), in the precision of the inner products.
-    owner
-        Position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model.
-    own
-        Vectors of the baselines, if they have their own coefficients besides the shared ones.
+    owner : position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model
+    own : vectors of the baselines, if they have their own coefficients besides the shared ones
     """
 
     batch: Batch

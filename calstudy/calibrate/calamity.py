@@ -51,23 +51,16 @@ def fit(
     """Solve for gains and foregrounds, independently for every polarization and every integration or group of them.
 
     Flagged samples have no influence. Autocorrelations are left out, also of the results, unless `settings.autos` is
-    set.
+    set. Raises InputError as for `calstudy.calibrate.preparation.prepare`.
 
     Parameters
     ----------
-    observation
-        Visibilities with parallel-hand polarizations only.
+    observation : visibilities with parallel-hand polarizations only
     assumed
         A sky model, whose weighted sum fixes the overall scale, and which is the foreground model if foregrounds are
         not fitted. Without a sky model the data take its place, which makes gains of about unity. Gains to start from
         override `settings.initial_gains`.
-    progress
-        Called after each solve with the number done and the total.
-
-    Raises
-    ------
-    InputError
-        As for `calstudy.calibrate.preparation.prepare`.
+    progress : called after each solve with the number done and the total
     """
     prepared = prepare(observation, settings, assumed)
     shape, used = prepared.data.shape, prepared.used

@@ -14,8 +14,7 @@ from calstudy.calibrate.settings import (
     GainFit,
     GaussNewtonSettings,
 )
-from calstudy.instrument.settings import Channels
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Channels, Size
 
 if TYPE_CHECKING:
     from calstudy.calibrate.problem import FitStructure

@@ -186,17 +186,13 @@ class _DelaySearch:
 
     Parameters
     ----------
-    scores
-        Of every baseline at every delay, of mean zero, (Nbls, Ndelays).
-    antennas
-        The two of each baseline, (Nbls, 2).
+    scores : of every baseline at every delay, of mean zero, (Nbls, Ndelays)
+    antennas : the two of each baseline, (Nbls, 2)
 
     Attributes
     ----------
-    delays
-        In steps of the grid, (Nants,), integer; zero until they are found.
-    evidence
-        Sum of the largest scores of the baselines of each antenna, (Nants,); zero where there are no data.
+    delays : in steps of the grid, (Nants,), integer; zero until they are found
+    evidence : sum of the largest scores of the baselines of each antenna, (Nants,); zero where there are no data
     """
 
     def __init__(self, scores: np.ndarray, antennas: np.ndarray, n_antennas: int) -> None:

@@ -77,12 +77,9 @@ def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, 
 
     Parameters
     ----------
-    problem
-        The fitted problem, whose foregrounds have a finite prior.
-    gains, model
-        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    seed
-        Seed of the probes, other numbers for other solves.
+    problem : the fitted problem, whose foregrounds have a finite prior
+    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
+    seed : seed of the probes, other numbers for other solves
     """
     sequences = _Sequences(problem)
     widest = max(problem.deviations) * math.sqrt(problem.weights.max())

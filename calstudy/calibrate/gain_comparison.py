@@ -27,16 +27,11 @@ class GainPair:
 
     Attributes
     ----------
-    antennas
-        Names, (Nants,).
-    positions
-        East and north, m, (Nants, 2).
-    frequency
-        Channel centres, Hz, (Nfreqs,).
-    polarization
-        Name of the feed.
-    first, second
-        Complex, (Ntimes, Nants, Nfreqs), of the convention "divide".
+    antennas : names, (Nants,)
+    positions : east and north, m, (Nants, 2)
+    frequency : channel centres, Hz, (Nfreqs,)
+    polarization : name of the feed
+    first, second : complex, (Ntimes, Nants, Nfreqs), of the convention "divide"
     """
 
     antennas: np.ndarray
@@ -53,14 +48,10 @@ class GainDifference:
 
     Attributes
     ----------
-    pair
-        The gains, the first aligned with the second.
-    as_given
-        Difference before the alignment, of all antennas together.
-    of_antenna, of_channel
-        (Nants,) and (Nfreqs,); NaN where there are no gains.
-    delay, of_delay
-        s, ascending, and the ratio of the Blackman-Harris tapered transforms, (Ndelays,).
+    pair : the gains, the first aligned with the second
+    as_given : difference before the alignment, of all antennas together
+    of_antenna, of_channel : (Nants,) and (Nfreqs,); NaN where there are no gains
+    delay, of_delay : s, ascending, and the ratio of the Blackman-Harris tapered transforms, (Ndelays,)
     """
 
     pair: GainPair

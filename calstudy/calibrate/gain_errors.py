@@ -62,24 +62,15 @@ class GainErrors:
 
     Attributes
     ----------
-    amplitude
-        Of |g|, in the unit of the gains, (Nants, Nfreqs).
-    phase
-        Of the phase of g, (Nants, Nfreqs).
-    noise_from
-        Whether the variance of the noise is that of the weights, or from the residual of this solve.
-    degrees
-        Degrees of freedom of the residual; None where they do not enter.
-    left_out
-        Names of the directions that are no part of the errors.
-    smooth_delay
-        Largest delay of ``smooth`` directions; zero if there are none.
-    smooth_fraction
-        Fraction of the numbers in the gains that are ``smooth``.
-    unevenness
-        Mean over median of the residual's power in channels: about one for noise, more for interference.
-    determined
-        Function that takes these directions out of a relative change of the gains, complex, (Nants, Nfreqs).
+    amplitude : of |g|, in the unit of the gains, (Nants, Nfreqs)
+    phase : of the phase of g, (Nants, Nfreqs)
+    noise_from : whether the variance of the noise is that of the weights, or from the residual of this solve
+    degrees : degrees of freedom of the residual; None where they do not enter
+    left_out : names of the directions that are no part of the errors
+    smooth_delay : largest delay of ``smooth`` directions; zero if there are none
+    smooth_fraction : fraction of the numbers in the gains that are ``smooth``
+    unevenness : mean over median of the residual's power in channels: about one for noise, more for interference
+    determined : function that takes these directions out of a relative change of the gains, complex, (Nants, Nfreqs)
     """
 
     amplitude: np.ndarray = field(metadata={"unit": ""})
@@ -115,12 +106,9 @@ def gain_errors(
 
     Parameters
     ----------
-    problem
-        The fitted problem, with the weights of its last pass.
-    gains, model
-        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    frequencies
-        Channel centres, Hz, (Nfreqs,).
+    problem : the fitted problem, with the weights of its last pass
+    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
+    frequencies : channel centres, Hz, (Nfreqs,)
     """
     structure = problem.structure
     if structure.gain_vectors is not None:

@@ -20,7 +20,7 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Frequency, Time
 from calstudy.calibrate.records import Solve
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal

@@ -39,20 +39,16 @@ class PreparedFit:
     data
         The calibrated visibilities: without the autocorrelations, unless they are fitted. Indices of antennas in the
         structure are those of `data.numbers`.
-    fitted
-        Mask of these baselines in the observation, bool, (Nbls,).
-    structure
-        Structure of the fit of one integration.
+    fitted : mask of these baselines in the observation, bool, (Nbls,)
+    structure : structure of the fit of one integration
     weights
         Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior. Weights that
         come from the gains are those of unity gains.
     used
         Mask of the calibrated samples, bool, of the same shape: all unflagged samples with weight, also on baselines
         outside the range to which gains are fitted.
-    start
-        Gains to start from, (Nants, Nfreqs, Ntimes, Npols).
-    sky
-        The sky model like the visibilities, or None.
+    start : gains to start from, (Nants, Nfreqs, Ntimes, Npols)
+    sky : the sky model like the visibilities, or None
     """
 
     data: Observation

@@ -30,13 +30,11 @@ class FitStructure:
 
     Attributes
     ----------
-    antennas
-        Antenna indices (a, b) of each baseline, shape (Nbls, 2), each in 0 ... n_antennas - 1.
+    antennas : antenna indices (a, b) of each baseline, shape (Nbls, 2), each in 0 ... n_antennas - 1.
     groups
         Index of each baseline's foreground model, shape (Nbls,): ``arange(Nbls)`` for per-baseline modelling
         (paper Eq. LOGLIKELIHOOD), the redundant group otherwise (Eq. LOGLIKELIHOODREDUNDANT).
-    conjugated
-        True where a baseline has the conjugate of its model because of its opposite direction, shape (Nbls,).
+    conjugated : true where a baseline has the conjugate of its model because of its opposite direction, shape (Nbls,)
     gain_vectors
         Orthonormal real functions of frequency whose span contains the gains, shape (Nfreqs, Ngain), float64; None for
         gains without restriction.
@@ -111,6 +109,9 @@ class FitStructure:
 class CalibrationProblem:
     """Data and weights of one integration and polarization.
 
+    Raises ValueError for wrong shapes, weights that are negative or not finite, data that are not finite where the
+    weight is not zero, data that are zero everywhere, or initial gains that are zero or not finite.
+
     Attributes
     ----------
     visibilities
@@ -119,8 +120,7 @@ class CalibrationProblem:
     weights
         Weights w of the likelihood, shape (Nbls, Nfreqs), float64, none negative; zero where flagged. The paper's are
         ``1 / (Nbls * Nfreqs)`` (see `flag_weights`).
-    initial_gains
-        Start of the solver, and reference for the phase of the solution, shape (Nants, Nfreqs), complex128.
+    initial_gains : start of the solver, and reference for the phase of the solution, shape (Nants, Nfreqs), complex128
     sky_model
         Visibilities m whose weighted sum fixes the overall scale, shape (Nbls, Nfreqs); None for the measured
         visibilities divided by the initial gains.
@@ -137,12 +137,6 @@ class CalibrationProblem:
         then be inverse variances.
     scale_weights
         Weights of the sums that fix the overall scale, like `weights`; None for those. They do not follow the gains.
-
-    Raises
-    ------
-    ValueError
-        For wrong shapes, weights that are negative or not finite, data that are not finite where the weight is not
-        zero, data that are zero everywhere, or initial gains that are zero or not finite.
     """
 
     structure: FitStructure

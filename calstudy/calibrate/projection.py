@@ -48,8 +48,7 @@ class Roots(NamedTuple):
     first
         S of the models of a batch, or of its baselines if they have their own coefficients besides the shared ones,
         (N, Nvec, rank).
-    shared
-        S of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise.
+    shared : s of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise
     """
 
     first: tf.Tensor
@@ -74,12 +73,9 @@ class Projection(NamedTuple):
     ----------
     loss
         sum w |V - G F|^2 at the best foregrounds, plus the squares of coefficients that have a prior; scalar, float64.
-    model
-        F on the baselines of consecutive stretches, each (2, Nbls, Nfreqs), float64.
-    descent
-        Minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64.
-    parts
-        Linearizations of the stretches.
+    model : f on the baselines of consecutive stretches, each (2, Nbls, Nfreqs), float64
+    descent : minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64
+    parts : linearizations of the stretches
     """
 
     loss: tf.Tensor
@@ -125,8 +121,7 @@ class Projector:
     stretches
         The batches with their vectors. In large fits each is processed by itself, so that its temporary arrays stay in
         the cache; in others the elementwise products are computed for all baselines at once, in fewer operations.
-    common
-        Orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`.
+    common : orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`
     """
 
     def __init__(

@@ -36,14 +36,10 @@ class Solve:
         ``converged``; ``max-steps`` or ``stalled`` for gains that are usable but short of the minimum; ``failed`` for
         none; ``skipped`` if there were no data to fit; ``by-file`` for gains of another program, of which nothing else
         is known.
-    message
-        One sentence on why it stopped.
-    steps
-        Steps taken; None if the calibrator does not iterate.
-    loss_history
-        The minimized quantity, before the first step and after each.
-    seconds
-        Wall time; None for an equal share of the whole.
+    message : one sentence on why it stopped
+    steps : steps taken; None if the calibrator does not iterate
+    loss_history : the minimized quantity, before the first step and after each
+    seconds : wall time; None for an equal share of the whole
     cpu_seconds
         Processor time, all threads together, also of programs that the calibrator starts; None for an equal share of
         the whole.
@@ -56,17 +52,13 @@ class Solve:
     decrement_rms
         Root mean square of that part of the calibrated residual R, in the unit of the data; NaN likewise. Two solves
         that stop at the same point have it in common, and their cross power rises by up to its square.
-    peak_memory
-        Largest resident memory of the process during the solve, bytes; None for that of the whole.
-    diagnostics
-        Any other numbers and texts that are worth keeping, JSON-able, by name.
+    peak_memory : largest resident memory of the process during the solve, bytes; None for that of the whole
+    diagnostics : any other numbers and texts that are worth keeping, JSON-able, by name
     integration, n_integrations
         Index of the first integration, and the number that were solved together. These and the next two are set by
         `calstudy.calibrate.execution.run_calibrator`.
-    time
-        Julian date of the first integration.
-    polarization
-        Polarization number of the AIPS convention, such as -5 for XX.
+    time : Julian date of the first integration
+    polarization : polarization number of the AIPS convention, such as -5 for XX
     """
 
     status: Status
@@ -136,12 +128,9 @@ class CalibrationResult:
     gains
         Gains g of each antenna, channel and integration, gain convention ``divide``: V = g_a g_b* m. Flagged where
         an antenna has no data in a channel, and where a solve was skipped or failed; unity there.
-    model
-        The intrinsic foregrounds F, in the unit of the data.
-    residual
-        R = V / (g_a g_b*) - F, zero where flagged.
-    solutions
-        One record per solve, polarization by polarization, each in the order of time.
+    model : the intrinsic foregrounds F, in the unit of the data
+    residual : r = V / (g_a g_b*) - F, zero where flagged
+    solutions : one record per solve, polarization by polarization, each in the order of time
     """
 
     gains: UVCal

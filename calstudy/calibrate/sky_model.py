@@ -18,24 +18,20 @@ if TYPE_CHECKING:
 def read_sky_model(path: Path, template: UVData) -> UVData:
     """Read visibilities, in Jy, at the samples of an observation.
 
+    Raises InputError if the file cannot be read or takes data from other files, lacks baselines, integrations, channels
+    or polarizations of the observation, or has flagged samples or values that are not finite among them.
+
     Parameters
     ----------
     path
         A file in any format of visibilities that pyuvdata reads, in Jy. Antennas are matched by number; their positions
         may differ from those of the template.
-    template
-        Metadata of the observation: rectangular, time-major, a drift scan.
+    template : metadata of the observation: rectangular, time-major, a drift scan
 
     Returns
     -------
     UVData
         The template's metadata with the visibilities of the file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or takes data from other files, lacks baselines, integrations, channels or
-        polarizations of the observation, or has flagged samples or values that are not finite among them.
     """
     from pyuvdata import UVData
 

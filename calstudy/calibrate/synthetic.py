@@ -21,14 +21,10 @@ class Case:
 
     Attributes
     ----------
-    extent
-        Diameter of a random array, m.
-    first, band
-        Centre of the first channel, and number of channels times their width, Hz; by default the paper's.
-    gain_scatter, noise, eor
-        Scatter of the gains per channel; noise and EoR over the rms of the foregrounds.
-    integration
-        Time between integrations, s.
+    extent : diameter of a random array, m
+    first, band : centre of the first channel, and number of channels times their width, Hz; by default the paper's
+    gain_scatter, noise, eor : scatter of the gains per channel; noise and EoR over the rms of the foregrounds
+    integration : time between integrations, s
     """
 
     antennas: int = 36

@@ -19,12 +19,10 @@ class Response:
 
     Attributes
     ----------
-    members
-        Indices of the baselines.
+    members : indices of the baselines
     common
         Sequences on all of them together, (Nmembers, Nfreqs, Nvec), real; orthonormal unless there is a finite prior.
-    own
-        Sequences of each baseline by itself, of the same kind; None if there are none.
+    own : sequences of each baseline by itself, of the same kind; None if there are none
     """
 
     members: np.ndarray
@@ -51,16 +49,11 @@ class TangentSpace:
 
     Attributes
     ----------
-    roots
-        Square root of D, (Nbls, Nfreqs).
-    slope
-        sqrt(D) F, the derivative of a baseline in a relative change of a gain, (Nbls, Nfreqs), complex.
-    conjugated
-        Baselines that have the conjugate of their model, (Nbls,) bool.
-    responses
-        Responses of the foregrounds, one for each model.
-    finite
-        Whether the foregrounds have a finite prior.
+    roots : square root of D, (Nbls, Nfreqs)
+    slope : sqrt(D) F, the derivative of a baseline in a relative change of a gain, (Nbls, Nfreqs), complex
+    conjugated : baselines that have the conjugate of their model, (Nbls,) bool
+    responses : responses of the foregrounds, one for each model
+    finite : whether the foregrounds have a finite prior
     """
 
     roots: np.ndarray

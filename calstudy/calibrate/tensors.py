@@ -71,19 +71,14 @@ class FitTensors:
 
     Attributes
     ----------
-    shared
-        Whether any baselines share a model.
-    model_index
-        Model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model.
-    slices
-        Range of models of each bucket.
-    bases
-        Basis of each bucket, shape (Nfreqs, Nvec), float64 arrays.
+    shared : whether any baselines share a model
+    model_index : model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model
+    slices : range of models of each bucket
+    bases : basis of each bucket, shape (Nfreqs, Nvec), float64 arrays
     batches
         Batches of models that are processed one after the other: the temporary arrays of one batch bound the memory,
         and the size of compiled graphs grows with the number of batches.
-    orientation
-        1, or -1 for reversed baselines, shape (Nbls, 1); None if there are none.
+    orientation : 1, or -1 for reversed baselines, shape (Nbls, 1); None if there are none
     """
 
     def __init__(self, structure: FitStructure) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from calstudy.results.reader import Results
 
 
-SIGMAS_95 = 1.96
 TINY = 1e-9
 """Tolerance of the limits of a range of k, h/Mpc: a bin belongs to one range, whatever the rounding of its centre."""
 

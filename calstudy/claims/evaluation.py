@@ -1,22 +1,29 @@
-"""Evaluation of the statements of papers on runs."""
+"""Evaluation of the statements of papers: on runs, on the folders of finished ones, and as a product of a study."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from calstudy.base.plugins import guarded
+from pydantic import ValidationError
+
+from calstudy.base.errors import InputError
+from calstudy.base.plugins import guarded, without_code_of_files
+from calstudy.base.resources import Cost
 from calstudy.calibrate.settings import GainFit
 from calstudy.claims.paper import Paper
 from calstudy.claims.realizations import PooledResults
 from calstudy.claims.run_times import RUN_TIME, RunTimes
-from calstudy.experiment.model import Experiment
+from calstudy.experiment.messages import sentences
+from calstudy.experiment.model import PAPERS, Experiment
+from calstudy.results.reader import Results, RunFolder, Tables
+from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.statement import Statement
-
-if TYPE_CHECKING:
-    from calstudy.results.reader import Results
+from calstudy.verdicts.tables import tally, write_claims, write_claims_by_solver
 
 
 @dataclass(frozen=True)
@@ -166,3 +173,200 @@ def refusal_of_role(papers: Sequence[Paper], role: str, experiment: Experiment) 
             with guarded(paper):
                 found.append(paper.refusal(role, experiment))
     return None if None in found else next(iter(found), None)
+
+
+INSTEAD = "name a paper by --paper, or use --run-code if you trust who wrote the folder"
+
+
+@dataclass(frozen=True)
+class EvaluatedRun:
+    """The claims of one run folder, its name, and a sentence for each paper in which it plays no role."""
+
+    title: str
+    claims: list[Verdict]
+    without_role: tuple[str, ...] = ()
+
+
+def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> EvaluatedRun:
+    """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
+
+    If members of a collection differ only in the paper's own solver, claims-by-solver.json and .md are written too.
+    Raises InputError if it is neither, names no paper or code that may not be run, or cannot be written.
+
+    Parameters
+    ----------
+    folder : of a run (``experiment.yaml``, ``tables/``), or of a collection, whose members' folders are beside it
+    papers : names of papers, or files, in place of those that the run names
+    run_code : whether Python files in the folder's experiments may be run; those of `papers` always are
+    """
+    run = RunFolder(folder)
+    if run.parts and not run.members:
+        part = next(iter(run.parts.values())).path
+        raise InputError(f"{folder}: is the folder of several runs; give that of one of them, such as {part}")
+    named = [_paper(name) for name in papers]
+    with nullcontext() if run_code else without_code_of_files(INSTEAD):
+        found, by_solver = _evaluated(run, named)
+    evaluated = EvaluatedRun(run.name, found.verdicts, found.without_role)
+    try:
+        write_claims(found.verdicts, folder, evaluated.title, run.manifest["stand_ins"], found.without_role)
+        if by_solver:
+            write_claims_by_solver(by_solver, folder, evaluated.title, run.manifest["stand_ins"])
+    except OSError as error:
+        raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
+    return evaluated
+
+
+def _evaluated(run: RunFolder, named: Sequence[Paper]) -> tuple[Evaluation, Mapping[str, list[Verdict]]]:
+    """Return the verdicts of a folder, and those by solver of a collection."""
+    if run.manifest.get("kind") == "runtime":
+        times = RunTimes.of(run.name, run.tables)
+        return evaluate_run_times(_named(named, run.content.get("papers", ()), run.path), times), {}
+    if "members" in run.manifest:
+        held_to, runs = _played(run, named)
+        return evaluate_members(held_to, runs), evaluate_by_solver(held_to, runs)
+    results = _results(run, named)
+    return evaluate_run(_named(named, results.experiment.papers, run.path), results), {}
+
+
+def _played(run: RunFolder, named: Sequence[Paper]) -> tuple[list[Paper], dict[str, Results | PooledResults]]:
+    """Return the papers of a collection, and its members by the role that they play."""
+    members = {name: _results(member, named) for name, member in run.members.items()}
+    own = {paper.reference: paper for member in members.values() for paper in member.experiment.papers}
+    chosen = _named(named, list(own.values()), run.path)
+    experiments = {name: member.experiment for name, member in members.items()}
+    roles = members_by_role(chosen, experiments, run.manifest["roles"])
+    return chosen, {role: members[name] for role, name in roles.items()}
+
+
+def _paper(block: Any) -> Paper:
+    try:
+        return PAPERS.make(block)
+    except ValidationError as error:
+        found = "; ".join(sentences(error, PAPERS.base, block))
+        raise InputError(f"paper {block!r}: {found}") from None
+
+
+def _named(named: Sequence[Paper], own: Sequence[Any], folder: Path) -> list[Paper]:
+    papers = list(named) or [_paper(paper) for paper in own]
+    if not papers:
+        names = ", ".join(PAPERS.names())
+        raise InputError(f"{folder}: its experiment names no papers; give one with --paper ({names}, or a file.py)")
+    return papers
+
+
+def _results(run: RunFolder, named: Sequence[Paper]) -> Results | PooledResults:
+    experiment = run.experiment(without=("papers",) if named else ())
+    if experiment.realizations:
+        return PooledResults.of(experiment, run.figures)
+    return Results(run.tables.folders, experiment)
+
+
+REALIZATIONS = "realizations"
+"""Figure with the measurements on all realizations of an experiment."""
+TABLES = ("spectra", "agreement", "transfer", "score", "sky_model")
+
+
+def _facts(experiment: Experiment) -> Experiment:
+    """Return the experiment without settings that no statement reads, to keep them out of the key of the claims."""
+    return experiment.with_defaults("description", "sweep", "scales", "outputs")
+
+
+class Evaluated(NamedTuple):
+    """A run as statements see it: its experiment, and its products by those of `TABLES`, or `REALIZATIONS` alone."""
+
+    experiment: Experiment
+    tables: Mapping[str, Task]
+
+
+def claims(run: Evaluated, notes: Sequence[str]) -> Task | None:
+    """Return the task that evaluates the statements of an experiment's papers on it alone; None without papers.
+
+    The notes are its substitutions for the papers' ingredients.
+    """
+    experiment = run.experiment
+    if not experiment.papers:
+        return None
+    return Claims(
+        "claims",
+        papers=list(experiment.papers),
+        title=experiment.name,
+        notes=list(notes),
+        experiments={"": _facts(experiment)},
+        tables=_inputs_of({"": run}),
+    )
+
+
+def combined_claims(
+    title: str, runs: Mapping[str, Evaluated], papers: Sequence[Paper], roles: Mapping[str, str], notes: Sequence[str]
+) -> Task | None:
+    """Return the task that evaluates the statements of papers on several runs by role; None without papers.
+
+    The notes are the substitutions of all members for the papers' ingredients.
+    """
+    playing = {name: runs[name] for name in roles.values()}
+    if not papers:
+        return None
+    return Claims(
+        "claims of all",
+        papers=list(papers),
+        title=title,
+        notes=list(notes),
+        roles=dict(roles),
+        experiments={name: _facts(run.experiment) for name, run in playing.items()},
+        tables=_inputs_of(playing),
+    )
+
+
+def _inputs_of(runs: Mapping[str, Evaluated]) -> dict[str, Task]:
+    return {f"{table}:{name}": task for name, run in runs.items() for table, task in run.tables.items()}
+
+
+def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Task | None:
+    """Return the task that evaluates the statements of papers on a table of run times; None without papers."""
+    return RunTimeClaims("claims", papers=list(papers), title=title, runtime=run_times) if papers else None
+
+
+class Claims(Task, stage="claims", version=12, cost=Cost(1, disk=1e5)):
+    """The statements of papers, evaluated on one run, or on the members of a collection in the roles that they play."""
+
+    papers: Sequence[Any]
+    title: str
+    notes: Sequence[str]
+    roles: Mapping[str, str] | None = None
+    experiments: Mapping[str, Experiment]
+    tables: Inputs
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the claims, and those by solver."""
+        results = {name: self._results(name, experiment) for name, experiment in self.experiments.items()}
+        if self.roles is None:
+            return _write(output, evaluate_run(self.papers, results[""]), self.title, self.notes)
+        runs = {role: results[name] for role, name in self.roles.items()}
+        if by_solver := evaluate_by_solver(self.papers, runs):
+            write_claims_by_solver(by_solver, output, self.title, self.notes)
+        return _write(output, evaluate_members(self.papers, runs), self.title, self.notes)
+
+    def _results(self, name: str, experiment: Experiment) -> Results | PooledResults:
+        if experiment.realizations:
+            return PooledResults.of(experiment, self.tables[f"{REALIZATIONS}:{name}"])
+        tables = (self.tables.get(f"{table}:{name}") for table in TABLES)
+        return Results(tuple(folder for folder in tables if folder is not None), experiment)
+
+
+class RunTimeClaims(Task, stage="runtime-claims", version=4, cost=Cost(1, disk=1e5)):
+    """The statements of papers, evaluated on a run-time study."""
+
+    papers: Sequence[Paper]
+    title: str
+    runtime: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write claims.json and claims.md."""
+        times = RunTimes.of(self.title, Tables((self.runtime,)))
+        return _write(output, evaluate_run_times(self.papers, times), self.title)
+
+
+def _write(output: Path, found: Evaluation, title: str, notes: Sequence[str] = ()) -> dict[str, Any]:
+    write_claims(found.verdicts, output, title, notes, found.without_role)
+    contradicted = [claim.name for claim in found.verdicts if claim.verdict == "contradicted"]
+    return {"verdicts": tally(found.verdicts), "contradicted": contradicted, "without_role": list(found.without_role)}

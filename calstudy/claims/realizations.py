@@ -24,8 +24,7 @@ class PooledResults:
 
     Attributes
     ----------
-    experiment
-        With its realizations.
+    experiment : with its realizations
     arrays
         Of the figure of the realizations, such as ``outside-wedge.values.bias`` (K, Nk) and ``outside-wedge.k``
         (Nk,).
@@ -55,20 +54,15 @@ class PooledResults:
     def mean(self, quantity: str, modes: str, k_min: float = 0.0, k_max: float = np.inf) -> Finding:
         """Return the mean of a quantity over bins of k and realizations.
 
+        Raises Unevaluated if there is no bin in which it is known in all realizations.
+
         Parameters
         ----------
         quantity
             Of `calstudy.power.realizations.QUANTITIES` or `TRANSFER_QUANTITIES`, or "eor" for P^S over the power
             that the sky was drawn from.
-        modes
-            "outside-wedge", "inside-wedge" or "all-modes".
-        k_min, k_max
-            Range of the bins, h/Mpc.
-
-        Raises
-        ------
-        Unevaluated
-            If there is no bin in which it is known in all realizations.
+        modes : "outside-wedge", "inside-wedge" or "all-modes"
+        k_min, k_max : range of the bins, h/Mpc
         """
         k, array = self.arrays[f"{modes}.k"], self.arrays.get(f"{modes}.values.{quantity}")
         if quantity == "eor":

@@ -47,8 +47,7 @@ def regress(
     folder that does not exist becomes a new reference.
     """
     from calstudy.base.package_files import reference_folder
-    from calstudy.regression.comparison import show, write_json
-    from calstudy.regression.reference import accept, find_references, remake
+    from calstudy.regression.comparison import accept, find_references, remake, show, write_json
     from calstudy.run.execution import Budget
 
     console = Console(soft_wrap=True, highlight=False)
@@ -78,8 +77,7 @@ def regress(
 
 
 def _compare(reference: Path, run: Path) -> Regression:
-    from calstudy.regression.comparison import Regression, compare_claims, compare_figures
-    from calstudy.regression.reference import read_reference, read_run
+    from calstudy.regression.comparison import Regression, compare_claims, compare_figures, read_reference, read_run
 
     old, new = read_reference(reference), read_run(run)
     claims = compare_claims(old.claims, new.claims, old.on_machines) if old.claims else []

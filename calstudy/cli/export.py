@@ -38,8 +38,7 @@ def export(
     """
     from calstudy.products.files import quiet_libraries
     from calstudy.run.execution import Budget
-    from calstudy.studies.blind import write_recipe
-    from calstudy.studies.export import CARRIER
+    from calstudy.studies.export import CARRIER, write_recipe
     from calstudy.studies.export import export as write
     from calstudy.studies.kinds.comparison import load_worlds
 

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import DiskError, ExperimentError, InputError, Terminated, exit_status, refusal_of_disk
-from calstudy.base.mwa_files import MWA_FILES
+from calstudy.base.package_files import MWA_FILES
 from calstudy.cli.calibrate import calibrate, compare_gains
 from calstudy.cli.checks import regress, validate
 from calstudy.cli.export import export, leaderboard, score
@@ -109,7 +109,7 @@ def run(
     changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
     study = load_study(file, scale, changes)
     if finished:
-        from calstudy.studies.finished import with_finished
+        from calstudy.studies.kinds.collection import with_finished
 
         study = with_finished(study, finished, console)
     show_run(run_study(study, Budget(workers, max_memory, scheduler), console, strict), console)
@@ -133,7 +133,7 @@ def plan(
 
     study = load_study(file, scale, overrides or ())
     if finished:
-        from calstudy.studies.finished import with_finished
+        from calstudy.studies.kinds.collection import with_finished
 
         # With JSON, nothing else is on standard output.
         study = with_finished(study, finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
@@ -162,7 +162,7 @@ def claims(
     Writes claims.json and claims.md into the folder. For a collection with studies by the paper's own solver and by
     another one, also writes claims-by-solver.json and claims-by-solver.md.
     """
-    from calstudy.claims.folders import evaluate_folder
+    from calstudy.claims.evaluation import evaluate_folder
     from calstudy.verdicts.tables import show_verdicts, to_json
 
     console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or (), run_code)

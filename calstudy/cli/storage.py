@@ -34,7 +34,7 @@ SECONDS = {"h": 3600.0, "d": 86_400.0}
 def runs(folder: RunsFolder = Path("runs")) -> None:
     """List finished runs: time, size, and number of products."""
     from calstudy.base.table import Table
-    from calstudy.results.folder import find_runs
+    from calstudy.results.reader import find_runs
 
     rows = [
         (
@@ -63,7 +63,7 @@ def store(
     deleted with --older-than. Without --delete nothing is changed; with it, at least one of --older-than,
     --larger-than, --unreferenced and --verify must choose the products.
     """
-    from calstudy.results.folder import find_runs
+    from calstudy.results.reader import find_runs
     from calstudy.run.store import Store, age_of, leftovers, products
     from calstudy.run.store import unreferenced as without_run
 

@@ -16,7 +16,7 @@ from calstudy.corrupt.drift import Drift
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
-    from calstudy.instrument.size import Size
+    from calstudy.instrument.settings import Size
 
 Truth = Mapping[str, np.ndarray]
 """Arrays of numbers, by name."""

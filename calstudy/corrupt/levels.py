@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.corrupt.noise import RadiometerNoise, effective_area
 
 if TYPE_CHECKING:
     from calstudy.corrupt.settings import CorruptionSettings
+    from calstudy.instrument.settings import InstrumentSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,25 @@ def rms(visibilities: np.ndarray) -> float:
     return float(np.sqrt(np.mean(visibilities.real**2 + visibilities.imag**2)))
 
 
+def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np.ndarray:
+    """Return the standard deviation of the complex noise, V_aa / sqrt(width integration nights), Jy, (Nfreqs, Npols).
+
+    The beam of the instrument gives the effective area where the noise settings do not.
+    """
+    from calstudy.instrument.beams import make_beam
+
+    channels = instrument.channels
+    frequencies = channels.first + channels.width * np.arange(channels.count)
+    if noise.effective_area is not None:
+        areas = [np.full(channels.count, noise.effective_area)] * len(instrument.polarizations)
+    else:
+        beam = make_beam(instrument.beam, channels)
+        solid_angles = (beam.solid_angles(frequencies, polarization)[0] for polarization in instrument.polarizations)
+        areas = [effective_area(frequencies, omega_p) for omega_p in solid_angles]
+    samples = channels.width * instrument.times.integration * noise.nights
+    return np.stack([noise.autocorrelations(frequencies, area) for area in areas], axis=-1) / np.sqrt(samples)
+
+
 def set_levels(
     foreground_rms: float, eor_rms: float, settings: CorruptionSettings, radiometer: np.ndarray | None = None
 ) -> Levels:
@@ -53,7 +74,7 @@ def set_levels(
     are -90 dB in the power spectrum. So rms of scaled EoR / rms of foregrounds = 10^(level / 10).
 
     The rms of the simulated visibilities and the standard deviation of radiometer noise, (Nfreqs, Npols)
-    (`calstudy.corrupt.noise.radiometer_std`), are in Jy. Raise InputError if a component that must be scaled, or scaled
+    (`radiometer_std`), are in Jy. Raise InputError if a component that must be scaled, or scaled
     to, is zero.
     """
     if eor_rms <= 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -10,10 +10,6 @@ from pydantic import AfterValidator, Field
 from calstudy.base.constants import BOLTZMANN, SPEED_OF_LIGHT
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Area, Frequency, Temperature
-
-if TYPE_CHECKING:
-    from calstudy.instrument.settings import InstrumentSettings
-
 
 WATTS_PER_JANSKY = 1e-26
 
@@ -133,25 +129,6 @@ Noise = Annotated[
     NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise,
     choice("kind", "times-eor"),
 ]
-
-
-def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np.ndarray:
-    """Return the standard deviation of the complex noise, V_aa / sqrt(width integration nights), Jy, (Nfreqs, Npols).
-
-    The beam of the instrument gives the effective area where the noise settings do not.
-    """
-    from calstudy.instrument.beams import make_beam
-
-    channels = instrument.channels
-    frequencies = channels.first + channels.width * np.arange(channels.count)
-    if noise.effective_area is not None:
-        areas = [np.full(channels.count, noise.effective_area)] * len(instrument.polarizations)
-    else:
-        beam = make_beam(instrument.beam, channels)
-        solid_angles = (beam.solid_angles(frequencies, polarization)[0] for polarization in instrument.polarizations)
-        areas = [effective_area(frequencies, omega_p) for omega_p in solid_angles]
-    samples = channels.width * instrument.times.integration * noise.nights
-    return np.stack([noise.autocorrelations(frequencies, area) for area in areas], axis=-1) / np.sqrt(samples)
 
 
 def thermal_noise(shape: tuple[int, ...], std: float | np.ndarray, seed: int) -> np.ndarray:

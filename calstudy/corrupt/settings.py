@@ -9,7 +9,6 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from calstudy.base.schema import Section, fault
 from calstudy.base.units import Decibel
-from calstudy.corrupt.effects.gains import PerChannelGains
 from calstudy.corrupt.interface import Effect, GainEffect
 from calstudy.corrupt.noise import Noise, NoiseRelativeToEor
 
@@ -34,7 +33,7 @@ class CorruptionSettings(Section):
             strict=False,
             description="What happens to the sum of foregrounds, EoR and noise, in this order; an empty list: nothing.",
         ),
-    ] = (PerChannelGains(),)
+    ] = (EFFECTS.make("per-channel-gains"),)
 
     @property
     def gains(self) -> GainEffect | None:

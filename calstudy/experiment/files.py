@@ -19,8 +19,8 @@ from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.yaml_files import parse_yaml, read_mapping
 from calstudy.instrument.interface import model_of
+from calstudy.instrument.layouts import antenna_count
 from calstudy.instrument.settings import InstrumentSettings, nominal_beams
-from calstudy.instrument.size import antenna_count
 
 M = TypeVar("M", bound=BaseModel)
 TAGS = {"solver": "name", "calibration": CALIBRATORS.tag}
@@ -211,21 +211,14 @@ class StudyFile:
 def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Experiment:
     """Read and validate an experiment file.
 
+    Raises InputError if the file cannot be read or an override cannot be applied, and ExperimentError if fields are
+    unknown or missing, or have invalid values.
+
     Parameters
     ----------
-    path
-        The YAML file.
-    scale
-        Name of a set of overrides in the file's `scales`.
-    overrides
-        ``path=value`` texts, applied after the scale.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or an override cannot be applied.
-    ExperimentError
-        If fields are unknown or missing, or have invalid values.
+    path : the YAML file
+    scale : name of a set of overrides in the file's `scales`
+    overrides : ``path=value`` texts, applied after the scale
     """
     return StudyFile.open(path, scale, overrides).experiment()
 

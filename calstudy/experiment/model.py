@@ -37,6 +37,10 @@ VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 Figures = Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)]
 StudyTables = Annotated[tuple[Annotated[SerializeAsAny[Plugin], TABLES.field()], ...], Field(strict=False)]
+Scales = Annotated[
+    dict[str, dict[str, Any]],
+    Field(description="Named sets of overrides (dotted path: value), chosen with --scale."),
+]
 Papers = Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)]
 
 
@@ -215,9 +219,7 @@ class Experiment(Section):
         description="Draw the EoR, the gains or the noise several times, and pool what is measured: a block, or a list "
         "of blocks that draw different things.",
     )
-    scales: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
-    )
+    scales: Scales = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _variants_have_their_components(self) -> Experiment:

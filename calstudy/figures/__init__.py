@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast
 
@@ -71,7 +72,9 @@ class StudyFigure(Plugin):
     needs_foregrounds
         True if the sky must have foregrounds.
     sections
-        Sections of the experiment that it reads; see `settings`.
+        Sections and fields (dotted path) of the experiment that it reads; see `settings`.
+    needs_products
+        False if the settings are sufficient: nothing is read from products.
     needs_injection
         True if a signal must be injected into measured data.
     shows_sky
@@ -91,6 +94,7 @@ class StudyFigure(Plugin):
     needs_least_squares: ClassVar[bool] = False
     needs_foregrounds: ClassVar[bool] = False
     sections: ClassVar[tuple[str, ...]] = ()
+    needs_products: ClassVar[bool] = True
     needs_injection: ClassVar[bool] = False
     shows_sky: ClassVar[bool] = True
     tolerances: ClassVar[Rules] = ()
@@ -138,11 +142,11 @@ class StudyFigure(Plugin):
         """
         from calstudy.products.spectra import spectra
 
-        return {"spectra": spectra(graph)}
+        return {"spectra": spectra(graph)} if self.needs_products else {}
 
     def settings(self, graph: Any) -> Mapping[str, Any]:
-        """Return what else the figure needs of a run, or of one member: by default its `sections`."""
-        return {name: getattr(graph.experiment, name) for name in self.sections}
+        """Return what else the figure needs of a run, or of one member: by default its `sections`, by their names."""
+        return {path.rpartition(".")[2]: attrgetter(path)(graph.experiment) for path in self.sections}
 
     @abstractmethod
     def draw(self, job: Job) -> Drawing:
@@ -152,9 +156,9 @@ class StudyFigure(Plugin):
         ----------
         job
             Its `inputs` are folders of products, by the names of the method `inputs`; those of members of a family
-            have names ``name:label`` (`members_of`). Its `settings` are those of the method `settings`, and ``notes``:
-            the stand-ins to print. Of a family, ``layouts`` has the array layout of each member, by label, and
-            ``members`` the settings of each if there are any.
+            have names ``name:label`` (`members_of`). Its `settings` are those of the method `settings`, and
+            ``notes``: the stand-ins, which are printed below the figure. Of a family, ``layouts`` has the array
+            layout of each member, by label, and ``members`` the settings of each if there are any.
         """
 
 
@@ -187,7 +191,7 @@ class CasesFigure(StudyFigure):
         cases
             By the labels of world and calibrator, in the order of the file; without those that a calibrator refuses.
         job
-            Its `settings` have ``calibrators`` and ``worlds``, their labels, and ``notes``: the stand-ins to print.
+            Its `settings` have ``calibrators`` and ``worlds``, their labels.
         """
 
     def draw(self, job: Job) -> Drawing:
@@ -230,14 +234,18 @@ class Draw(Task, stage="figure", version=4):
         return {"figure": self.figure, "notes": self.notes, **self.own}
 
     def drawing(self, output: Path) -> Drawing:
-        """Draw the figure; raises InputError if a user's figure fails, or returns anything but a drawing."""
+        """Draw the figure, with the stand-ins below it; raises InputError if it fails or returns no drawing."""
         from matplotlib.figure import Figure
+
+        from calstudy.plotting.style import journal_style, note_stand_ins
 
         with guarded(self.figure):
             found = self.figure.draw(Job(settings=self.settings, inputs=self.products, output=output))
         if not isinstance(found, Drawing) or not isinstance(found.figure, Figure):
             name = type(found).__name__
             raise InputError(f"figure {self.figure.label!r}: draw returned a {name}, expected a Drawing")
+        with journal_style():
+            note_stand_ins(found.figure, self.notes)
         return found
 
     def make(self, output: Path) -> Mapping[str, Any]:

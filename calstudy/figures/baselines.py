@@ -53,7 +53,7 @@ LINES: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 @style.journal_style()
-def draw_baselines(baselines: Sequence[BaselineSpectra], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_baselines(baselines: Sequence[BaselineSpectra]) -> Figure:
     """Draw one panel per baseline, at least one, on common axes, with the edges of the wedge.
 
     A single baseline fills one column.
@@ -77,7 +77,6 @@ def draw_baselines(baselines: Sequence[BaselineSpectra], stand_ins: Sequence[str
         lowest.tick_params(labelbottom=True)
     handles = grid[0, 0].get_lines()[: sum(getattr(baselines[0], name) is not None for name in LINES)]
     figure.legend(handles=handles, loc="outside upper center", ncols=3 if n_columns == 1 else 6)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -159,4 +158,4 @@ class Baselines(StudyFigure):
             BaselineSpectra(pair, length, delay, **{name: values[index] for name, values in shown.items()})
             for index, (pair, length) in enumerate(zip(pairs, lengths, strict=True))
         ]
-        return Drawing(draw_baselines(panels, stand_ins=job.settings["notes"]), panels)
+        return Drawing(draw_baselines(panels), panels)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -17,8 +17,7 @@ from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
 from calstudy.instrument.settings import Channels, InstrumentSettings
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
-from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.simulate.nodes import integration_times
 
 if TYPE_CHECKING:
@@ -103,7 +102,7 @@ def _rms(difference: np.ndarray) -> np.ndarray:
 
 
 @style.journal_style()
-def draw_interpolations(found: BeamInterpolation, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_interpolations(found: BeamInterpolation) -> Figure:
     """Draw differences of Jones components, relative to the zenith, against frequency."""
     figure = style.new_figure(style.ONE_COLUMN, 2.9)
     axes = figure.subplots()
@@ -119,7 +118,6 @@ def draw_interpolations(found: BeamInterpolation, stand_ins: Sequence[str] = ())
     axes.set(yscale="log", xlabel=style.FREQUENCY, ylabel=r"$|\Delta J|\,/\,|J_\mathrm{zenith}|$")
     axes.margins(x=0.01)
     figure.legend(loc="outside upper center", ncols=2)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -129,12 +127,8 @@ class BeamFitFigure(StudyFigure):
     kind: str = "beam-fit"
 
     caption = "Interpolations of the beam in frequency: differences of Jones components over the zenith."
+    needs_products = False
     sections = ("instrument",)
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: the beam is read again."""
-        del graph
-        return {}
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Refuse a beam in closed form."""
@@ -145,7 +139,7 @@ class BeamFitFigure(StudyFigure):
         found = compare_interpolations(job.settings["instrument"])
         rms = {name: float(np.sqrt(np.mean(values**2))) for name, values in found.others.items()}
         fit = {"rms": float(np.sqrt(np.mean(found.fit_rms**2))), "largest": float(found.fit_max.max())}
-        return Drawing(draw_interpolations(found, job.settings["notes"]), found, {"fit": fit, "rms_to_fit": rms})
+        return Drawing(draw_interpolations(found), found, {"fit": fit, "rms_to_fit": rms})
 
 
 PAPER_FLOOR = -45.0
@@ -175,7 +169,8 @@ def compare_floors(
 
     Every channel is simulated, so that only the beam is interpolated.
     """
-    from calstudy.instrument.telescope import make_template, subset_template
+    from calstudy.base.visibilities import subset_template
+    from calstudy.instrument.telescope import make_template
     from calstudy.simulate.chunks import simulate_visibilities
     from calstudy.sky.foregrounds import make_foregrounds
 
@@ -193,7 +188,7 @@ def compare_floors(
 
 
 def _measure(foregrounds: UVData) -> InterpolationFloor:
-    from calstudy.simulate.floor import MAIN_LOBES, delay_floor, delay_profile, floor_buffers
+    from calstudy.simulate.floor import MAIN_LOBES, delay_floor, delay_profile, floor_buffers, folded_spectrum
 
     buffers = floor_buffers(foregrounds)
     if len(buffers) < len(MAIN_LOBES):
@@ -210,16 +205,8 @@ def _measure(foregrounds: UVData) -> InterpolationFloor:
     )
 
 
-def folded_spectrum(delays: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return delays >= 0, (N // 2,), and the mean power of both signs of each, from the order of `numpy.fft`."""
-    half = delays.size // 2
-    return delays[:half], np.concatenate([power[:1], (power[1:half] + power[:-half:-1]) / 2])
-
-
 @style.journal_style()
-def draw_delay_floors(
-    floors: Mapping[str, InterpolationFloor], eor_level: float | None, stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_delay_floors(floors: Mapping[str, InterpolationFloor], eor_level: float | None) -> Figure:
     """Draw delay spectra of short baselines (left) and the floor beyond the horizon against baseline length (right).
 
     `eor_level` is marked, in amplitude dB, if it is not None.
@@ -246,7 +233,6 @@ def draw_delay_floors(
         right.plot([], [], color=style.BLACK, linewidth=0.6, label="EoR asked for")
     right.legend(loc="upper right")
     left.legend(loc="upper right")
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -262,23 +248,15 @@ class DelayFloorFigure(StudyFigure):
 
     caption = "Delay floor of the foregrounds for every interpolation of the beam in frequency."
     needs_foregrounds = True
-    sections = ("instrument", "sky", "simulation")
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: single integrations are simulated."""
-        del graph
-        return {}
+    needs_products = False
+    sections = ("instrument", "sky", "simulation", "corruption.eor_level")
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Refuse an experiment without foregrounds, or with a beam in closed form."""
         return super().refusal(experiment) or not_tabulated(experiment)
 
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return what is simulated, and the level of the EoR."""
-        return {**super().settings(graph), "eor_level": graph.experiment.corruption.eor_level}
-
     def draw(self, job: Job) -> Drawing:
         """Simulate with every interpolation."""
-        floors = compare_floors(**{name: job.settings[name] for name in self.sections})
+        floors = compare_floors(**{name: job.settings[name] for name in ("instrument", "sky", "simulation")})
         notes = {name: {taper: found.worst_db for taper, found in item.floors.items()} for name, item in floors.items()}
-        return Drawing(draw_delay_floors(floors, job.settings["eor_level"], job.settings["notes"]), floors, notes)
+        return Drawing(draw_delay_floors(floors, job.settings["eor_level"]), floors, notes)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import CasesFigure
-from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import SIGMAS, upper_limit
@@ -44,9 +44,7 @@ def look(place: int) -> dict[str, Any]:
 
 
 @style.journal_style()
-def draw_spectra(
-    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_spectra(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
     """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, outside the wedge, with 95 % bars.
 
     `cases` are by world and calibrator.
@@ -72,7 +70,6 @@ def draw_spectra(
         axes.set_xlabel(style.WAVENUMBER)
     handles = [Line2D([], [], linewidth=0.6, markersize=2.5, **look(place)) for place in range(len(calibrators))]
     figure.legend(handles, list(calibrators), loc="outside upper center", ncols=min(len(calibrators), 5))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -117,7 +114,7 @@ class ComparisonSpectra(CasesFigure):
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
         """Draw all cases."""
-        return draw_spectra(cases, job.settings["calibrators"], job.settings["notes"])
+        return draw_spectra(cases, job.settings["calibrators"])
 
 
 LINEAR_BIAS = 0.01
@@ -126,9 +123,7 @@ LABEL_WIDTH = 9
 
 
 @style.journal_style()
-def draw_curves(
-    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
     """Draw T above and the bias below for each band of k, calibrators from left to right, with 95 % bars.
 
     The calibrators are values of one setting, in order. `cases` are by world and calibrator.
@@ -157,7 +152,6 @@ def draw_curves(
     grid[1, 0].set_ylabel(r"bias $s^2 P^{R_0} / P^S$")
     handles = [Line2D([], [], linewidth=0.7, **look(place)) for place in range(len(worlds))]
     figure.legend(handles, worlds, loc="outside upper center", ncols=min(len(worlds), 5))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -174,7 +168,7 @@ class ComparisonCurves(CasesFigure):
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
         """Draw all cases."""
-        return draw_curves(cases, job.settings["calibrators"], job.settings["notes"])
+        return draw_curves(cases, job.settings["calibrators"])
 
 
 BANDS = 2
@@ -201,9 +195,7 @@ def _names(groups: Mapping[str, Mapping[str, str]]) -> list[str]:
 
 
 @style.journal_style()
-def draw_variants(
-    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
     """Draw a panel for each kind of world and band of k: calibrators from top to bottom, the bias from left to right.
 
     Colours are variants of calibrators, symbols those of worlds: the text after the last comma of a label names the
@@ -240,7 +232,6 @@ def draw_variants(
         Line2D([], [], color=style.GREY, marker="x", linestyle="", label="stalled"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -301,4 +292,4 @@ class ComparisonVariants(CasesFigure):
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
         """Draw all cases."""
-        return draw_variants(cases, job.settings["calibrators"], job.settings["notes"])
+        return draw_variants(cases, job.settings["calibrators"])

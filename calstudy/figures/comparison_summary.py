@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.base.table import number
 from calstudy.figures import CasesFigure
 from calstudy.figures.comparison import look
-from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import BAND, LIMIT, SIGMAS, Fault, faults, upper_limit
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-
-    from calstudy.products.graph import Graph
 
 
 LIMITS, COLOURS = (1e-2, 1e2), "YlOrRd"
@@ -43,9 +41,7 @@ ROOM_FOR_ERROR = 8
 
 
 @style.journal_style()
-def draw_matrix(
-    cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str], stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
     """Draw a matrix for each band of k: worlds from left to right, calibrators from top to bottom.
 
     The colour is the bias. For a bias within two standard deviations of zero, the 95 % upper limit is written and
@@ -68,7 +64,6 @@ def draw_matrix(
     _name_worlds(panels[-1], worlds)
     bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$; hatched: upper limit")
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -160,7 +155,7 @@ class ComparisonMatrix(CasesFigure):
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
         """Draw all cases."""
-        return draw_matrix(cases, job.settings["calibrators"], job.settings["notes"])
+        return draw_matrix(cases, job.settings["calibrators"])
 
 
 FAULT_HEIGHT = 1.7
@@ -175,7 +170,6 @@ def draw_tolerances(
     found: Sequence[Fault],
     cases: Mapping[str, Mapping[str, Case]],
     calibrators: Sequence[str],
-    stand_ins: Sequence[str] = (),
     eor_level: float | None = None,
 ) -> Figure:
     """Draw the bias on the left and T on the right against the severity of each fault, with 95 % bars.
@@ -184,14 +178,9 @@ def draw_tolerances(
 
     Parameters
     ----------
-    found
-        The faults.
-    cases
-        By world and calibrator.
-    calibrators
-        Their labels, in order.
-    stand_ins
-        See `calstudy.plotting.style.note_stand_ins`.
+    found : the faults
+    cases : by world and calibrator
+    calibrators : their labels, in order
     eor_level
         Amplitude of the EoR over that of the foregrounds in dB, to which the bias is relative; None if cases differ in
         it, or it is not known.
@@ -222,7 +211,6 @@ def draw_tolerances(
     looks = {name: look(place) for place, name in enumerate(calibrators) if name in scored}
     handles = [Line2D([], [], linewidth=0.7, **its) for its in looks.values()]
     figure.legend(handles, list(looks), loc="outside upper center", ncols=min(len(looks), 5))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -260,10 +248,7 @@ class ComparisonTolerances(CasesFigure):
         "Bias (left) and transfer function (right) against the severity of faults, with 95 % bars. The bias is in "
         "units of the EoR, whose level is written above."
     )
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the level of the EoR, to which all biases are relative."""
-        return {"eor_level": graph.experiment.corruption.eor_level}
+    sections = ("corruption.eor_level",)
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
         """Draw a row for each fault; raises InputError if the worlds name none."""
@@ -272,5 +257,4 @@ class ComparisonTolerances(CasesFigure):
             raise InputError(
                 f"figure {self.label!r}: no world has a label with a fault and a number, such as 'positions: 2 cm'"
             )
-        labels, notes = job.settings["calibrators"], job.settings["notes"]
-        return draw_tolerances(found, cases, labels, notes, job.settings.get("eor_level"))
+        return draw_tolerances(found, cases, job.settings["calibrators"], job.settings.get("eor_level"))

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.base.table import Table
 from calstudy.calibrate.agreement import ratio_over_antennas
 from calstudy.calibrate.settings import GainFit, GainWeights
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.convergence import PATHS, followed
 from calstudy.products.files import read_json
@@ -53,9 +53,7 @@ class ConvergencePath:
 
 
 @style.journal_style()
-def draw_convergence(
-    paths: Sequence[ConvergencePath], integrations: Sequence[int], stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[int]) -> Figure:
     """Draw the bias without EoR on the left, and with EoR on the right, against steps, of one to five solvers.
 
     Bars are 95 % (1.96 sigma, leaving out one antenna after the other); open markers are negative. Dashes are the
@@ -91,7 +89,6 @@ def draw_convergence(
         f"even x odd outside the wedge, {count} integration{'s' if count > 1 else ''}, each solved from unity gains",
         fontsize=8.5,
     )
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -167,7 +164,7 @@ class Convergence(StudyFigure):
             columns = (path.steps, path.bias, path.bias_error, path.with_eor, path.with_eor_error, path.predicted)
             rows += [[path.solver, *row] for row in zip(*(part.tolist() for part in columns), strict=True)]
         Table(COLUMNS, rows).write_csv(job.output / "convergence.csv")
-        figure = draw_convergence(paths, job.settings["integrations"], stand_ins=job.settings["notes"])
+        figure = draw_convergence(paths, job.settings["integrations"])
         notes = {path.solver: {"steps": int(path.steps[-1]), "bias": round(float(path.bias[-1]), 4)} for path in paths}
         return Drawing(figure, {"paths": paths}, notes)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -38,26 +38,17 @@ class Diagnostics:
 
     Attributes
     ----------
-    delay
-        s, ascending, (Ndelays,).
-    lengths
-        Baseline lengths in m, ascending, (Nbls,).
+    delay : s, ascending, (Ndelays,)
+    lengths : baseline lengths in m, ascending, (Nbls,)
     data, model, residual
         Delay transform after a Blackman-Harris taper, rms over integrations, (Nbls, Ndelays); flagged samples are zero.
-    frequency
-        Hz, (Nfreqs,).
-    antennas
-        Names of the antennas that are drawn, (Nshown,).
-    gains
-        Complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs).
-    losses
-        Loss after each step over the first loss of its own solve, one array for each solve.
-    converged
-        True for each solve that converged, (Nsolves,).
-    chi2_antennas
-        Names of all calibrated antennas, (Nants,).
-    chi2_by_antenna, chi2_by_channel, chi2_by_integration
-        As in `calstudy.realdata.quality.Quality`.
+    frequency : hz, (Nfreqs,)
+    antennas : names of the antennas that are drawn, (Nshown,)
+    gains : complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs)
+    losses : loss after each step over the first loss of its own solve, one array for each solve
+    converged : true for each solve that converged, (Nsolves,)
+    chi2_antennas : names of all calibrated antennas, (Nants,)
+    chi2_by_antenna, chi2_by_channel, chi2_by_integration : as in `calstudy.realdata.quality.Quality`
     """
 
     polarization: str
@@ -96,7 +87,7 @@ def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.nd
 
 
 @style.journal_style()
-def draw_diagnostics(found: Diagnostics, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_diagnostics(found: Diagnostics) -> Figure:
     """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 
     The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
@@ -118,7 +109,6 @@ def draw_diagnostics(found: Diagnostics, stand_ins: Sequence[str] = ()) -> Figur
         _label_between_powers(axes)
     # Above the axes: gains of measured data have peaks anywhere.
     grid["a"].legend(ncols=4, fontsize=style.SMALL_SIZE - 1, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -300,4 +290,4 @@ class DiagnosticsFigure(StudyFigure):
         """Draw the diagnostics of the first polarization."""
         data = read_visibilities(job.inputs["data"] / DATA)
         found = diagnose(data, read_result(job.inputs["calibration"]))
-        return Drawing(draw_diagnostics(found, job.settings["notes"]), found)
+        return Drawing(draw_diagnostics(found), found)

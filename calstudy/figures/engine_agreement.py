@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,6 @@ from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.corrupt.levels import rms
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.beam_fit import folded_spectrum
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
 from calstudy.products import simulation
@@ -107,7 +106,7 @@ def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreeme
 
 
 def _groups(reference: UVData, difference: UVData, taper: Taper) -> tuple[GroupAgreement, ...]:
-    from calstudy.simulate.floor import delay_profile, length_bins
+    from calstudy.simulate.floor import delay_profile, folded_spectrum, length_bins
 
     lengths = np.linalg.norm(baseline_vectors(reference), axis=1)
     edges, bins = length_bins(lengths, GROUPS)
@@ -142,7 +141,6 @@ def draw_engine_agreement(
     names: tuple[str, str],
     allowed: float,
     eor_level: float | None,
-    stand_ins: Sequence[str] = (),
 ) -> Figure:
     """Draw delay spectra of short and long baselines (left) and relative differences against baseline length (right).
 
@@ -166,7 +164,6 @@ def draw_engine_agreement(
     right.axhline(allowed, color=style.GREY, linestyle="-.", linewidth=0.8, label="sum of node tolerances")
     right.set(yscale="log", xlabel=style.BASELINE_LENGTH, ylabel=f"|{names[0]} − {names[1]}| / rms")
     right.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, columnspacing=1.0)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -225,7 +222,7 @@ class EngineAgreementFigure(StudyFigure):
         found = compare_simulations(own, other)
         first, second = job.settings["engines"]
         allowed, level = job.settings["node_tolerances"], job.settings["eor_level"]
-        figure = draw_engine_agreement(found, (first, second), allowed, level, job.settings["notes"])
+        figure = draw_engine_agreement(found, (first, second), allowed, level)
         beyond = self.tolerance is not None and found.largest > self.tolerance
         text = f"{first} and {second} differ by {found.largest:.1e} of the rms, more than {self.tolerance}"
         numbers = {"largest": found.largest, "rms": found.rms, "worst_slot": found.worst_slot}

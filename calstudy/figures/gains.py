@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -32,14 +32,10 @@ class GainComparison:
 
     Attributes
     ----------
-    antennas
-        The two antenna numbers.
-    true, recovered, residual
-        Injected gains, solutions as fitted and true - recovered, spectra of shape (2, Nfreqs).
-    aligned_residual
-        True gains less the solutions that are aligned with them, free of what no fit can know.
-    correction
-        The gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, as fitted, (Nfreqs,).
+    antennas : the two antenna numbers
+    true, recovered, residual : injected gains, solutions as fitted and true - recovered, spectra of shape (2, Nfreqs)
+    aligned_residual : true gains less the solutions that are aligned with them, free of what no fit can know
+    correction : the gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, as fitted, (Nfreqs,)
     """
 
     antennas: tuple[int, int]
@@ -59,10 +55,8 @@ def compare_gains(
 
     Parameters
     ----------
-    antennas
-        The two antenna numbers.
-    frequency
-        Channel centres, Hz, (Nfreqs,).
+    antennas : the two antenna numbers
+    frequency : channel centres, Hz, (Nfreqs,)
     true, recovered, aligned
         Gains: injected, as fitted, and fitted with the scale and the phase of each channel that come closest to the
         truth; complex, (2, Nfreqs).
@@ -82,7 +76,7 @@ def compare_gains(
 
 
 @style.journal_style()
-def draw_gains(comparison: GainComparison, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_gains(comparison: GainComparison) -> Figure:
     """Draw real parts against frequency (left) and transforms' amplitudes against delay (right).
 
     True gains are solid, recovered dashed, residuals as fitted dotted, and aligned thin and solid; the gain-correction
@@ -104,7 +98,6 @@ def draw_gains(comparison: GainComparison, stand_ins: Sequence[str] = ()) -> Fig
     aligned.set_ylabel("Re residual,\naligned", linespacing=1.0)
     delay_panel(delays, comparison.true.delay, r"$|\widetilde{g}(\tau)|$")
     _add_legend(figure, comparison.antennas)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -196,11 +189,11 @@ class Gains(StudyFigure):
             require_used(gains.fitted[row] != 0, [number], job.settings["integration"])
         shown = (values[rows] for values in (gains.true, gains.fitted, gains.aligned))
         comparison = compare_gains(tuple(numbers), gains.frequency, *shown)
-        return Drawing(draw_gains(comparison, stand_ins=job.settings["notes"]), comparison)
+        return Drawing(draw_gains(comparison), comparison)
 
 
 @style.journal_style()
-def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6) -> Figure:
     """Draw the amplitude of the transform of every antenna's gain, and their median, in one column.
 
     Gains are (Nants, Nfreqs), see `calstudy.plotting.domains.in_two_domains`. Delays from -max_delay / 4 to max_delay
@@ -219,7 +212,6 @@ def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6, stand_ins: Sequ
     axes.set_ylim(0.3 * np.quantile(amplitude[:, shown], 0.02), 3 * amplitude.max())
     axes.set_xlim(*nanoseconds[shown][[0, -1]])
     axes.legend(loc="upper right")
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -230,14 +222,11 @@ class Reflections(StudyFigure):
 
     caption = "Delay transform of the true gains."
     shows_sky = False
+    sections = ("outputs.inspect.integration",)
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the true gains."""
         return {"gains": corruption.gains(graph)}
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the shown integration."""
-        return {"integration": graph.experiment.outputs.inspect.integration}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the delay transforms of the true gains."""
@@ -245,4 +234,4 @@ class Reflections(StudyFigure):
 
         gains = read_gains(job.inputs["gains"])
         shown = in_two_domains(gains.frequency, gains.at(job.settings["integration"], gains.numbers))
-        return Drawing(draw_reflections(shown, stand_ins=job.settings["notes"]), shown)
+        return Drawing(draw_reflections(shown), shown)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.instrument.settings import Layout as LayoutSettings
 from calstudy.plotting import style
-from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +36,7 @@ class LayoutPanel:
 
 
 @style.journal_style()
-def draw_layouts(panels: Sequence[LayoutPanel], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_layouts(panels: Sequence[LayoutPanel]) -> Figure:
     """Draw one or two arrays, east to the right and north up, in equal scales.
 
     Raise ValueError for another number of panels, or if positions and numbers of a panel do not match.
@@ -48,7 +47,6 @@ def draw_layouts(panels: Sequence[LayoutPanel], stand_ins: Sequence[str] = ()) -
     figure = style.new_figure(width, height)
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         _draw_array(axes, panel)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -97,19 +95,13 @@ class Layout(StudyFigure):
 
     caption = "The array."
     shows_sky = False
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: the settings are sufficient."""
-        return {}
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the layout."""
-        return {"layout": graph.experiment.instrument.layout}
+    needs_products = False
+    sections = ("instrument.layout",)
 
     def draw(self, job: Job) -> Drawing:
         """Draw the array."""
         panel = layout_panel(job.settings["layout"])
-        return Drawing(draw_layouts([panel], stand_ins=job.settings["notes"]), panel)
+        return Drawing(draw_layouts([panel]), panel)
 
 
 class Layouts(StudyFigure):
@@ -121,13 +113,9 @@ class Layouts(StudyFigure):
     caption = "The two arrays."
     titles = TWO_ARRAYS
     shows_sky = False
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: the settings are sufficient."""
-        del graph
-        return {}
+    needs_products = False
 
     def draw(self, job: Job) -> Drawing:
         """Draw the arrays from left to right."""
         panels = [layout_panel(job.settings["layouts"][role], title) for role, title in self.titles.items()]
-        return Drawing(draw_layouts(panels, stand_ins=job.settings["notes"]), panels)
+        return Drawing(draw_layouts(panels), panels)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import Drawing, StudyFigure, members_of
 from calstudy.figures.comparison import look
-from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
@@ -43,7 +43,7 @@ def read_member(folder: Path) -> MemberBias:
 
 
 @style.journal_style()
-def draw_member_bias(members: Mapping[str, MemberBias], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_member_bias(members: Mapping[str, MemberBias]) -> Figure:
     """Draw |bias| against k, or, where it is within its 95 % error, the 95 % upper limit as an open symbol."""
     from matplotlib.lines import Line2D
 
@@ -65,7 +65,6 @@ def draw_member_bias(members: Mapping[str, MemberBias], stand_ins: Sequence[str]
     handles = [Line2D([], [], linewidth=0.6, **look(place)) for place in range(len(members))]
     handles.append(Line2D([], [], color=style.GREY, marker="o", markerfacecolor="white", linestyle=""))
     figure.legend(handles, [*members, "open: 95 % upper limit"], loc="outside right upper")
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -93,4 +92,4 @@ class MemberBiasFigure(StudyFigure):
     def draw(self, job: Job) -> Drawing:
         """Draw all members."""
         members = {name: read_member(found["score"]) for name, found in members_of(job).items()}
-        return Drawing(draw_member_bias(members, job.settings["notes"]), members)
+        return Drawing(draw_member_bias(members), members)

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
-from calstudy.figures.spherical import SIGMAS_95, Marking, draw_points
+from calstudy.figures.spherical import Marking, draw_points
 from calstudy.figures.wedge import draw_panels
 from calstudy.plotting import style
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
-from calstudy.products.expected_loss import EXPECTED
-from calstudy.products.files import spectrum_file
+from calstudy.products.files import EXPECTED, spectrum_file
+from calstudy.products.files import TRANSFER as FILE
 from calstudy.products.graph import required
 from calstudy.products.observed_injection import expected_loss, transfer
 from calstudy.products.observed_results import observed_spectra
-from calstudy.products.signal_loss import TRANSFER as FILE
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
@@ -42,9 +42,7 @@ COLUMNS = {"all-modes": "all modes", "outside-wedge": "outside wedge + {:.0f} ns
 
 
 @style.journal_style()
-def draw_observed(
-    columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer: float, stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer: float) -> Figure:
     """Draw |P| of measured data over all modes and outside the wedge, open where negative.
 
     Bars are 95 % by the noise; the grey line is one standard deviation of the noise of the residual. The columns
@@ -69,7 +67,6 @@ def draw_observed(
     open_marker = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
     handles.append(axes.plot([], [], linestyle="none", label=r"open: $P < 0$", **open_marker)[0])
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -110,7 +107,7 @@ class ObservedSpherical(StudyFigure):
             modes: {name: load_spectrum(folder / spectrum_file(name, modes), SphericalSpectrum) for name in MARKINGS}
             for modes in COLUMNS
         }
-        figure = draw_observed(columns, job.settings["wedge_buffer"], job.settings["notes"])
+        figure = draw_observed(columns, job.settings["wedge_buffer"])
         return Drawing(figure, {modes.replace("-", "_"): series for modes, series in columns.items()})
 
 
@@ -143,7 +140,7 @@ class ObservedWedge(StudyFigure):
         """Draw a panel for each spectrum."""
         folder = job.inputs["spectra"]
         found = {name: load_spectrum(folder / spectrum_file(name, "wedge"), CylindricalSpectrum) for name in TITLES}
-        figure = draw_panels(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY, job.settings["notes"])
+        figure = draw_panels(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY)
         return Drawing(figure, found)
 
 
@@ -165,7 +162,7 @@ class ObservedLoss:
 
 
 @style.journal_style()
-def draw_observed_loss(loss: ObservedLoss, buffer: float, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_observed_loss(loss: ObservedLoss, buffer: float) -> Figure:
     """Draw T per |k| on the left, with the expectation outside the wedge as a line, and per (|b|, tau) on the right.
 
     Bars are 95 % (1.96 sigma). The dashed line is the horizon plus `buffer`, s.
@@ -184,7 +181,6 @@ def draw_observed_loss(loss: ObservedLoss, buffer: float, stand_ins: Sequence[st
     left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, last), ylim=(-0.03, 1.15))
     left.legend(loc="lower right")
     draw_map(figure, right, loss.map, buffer, MAX_DELAY)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -221,6 +217,6 @@ class ObservedSignalLoss(StudyFigure):
         )
         by_length = load_spectrum(folder / spectrum_file(FILE, "wedge"), TransferMap)
         loss = ObservedLoss(outside, inside, by_length, prediction)
-        figure = draw_observed_loss(loss, job.settings["wedge_buffer"], job.settings["notes"])
+        figure = draw_observed_loss(loss, job.settings["wedge_buffer"])
         shown: dict[str, Any] = {"outside": outside, "inside": inside, "map": by_length}
         return Drawing(figure, shown if prediction is None else {**shown, "expected": prediction})

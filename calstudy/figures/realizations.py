@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.base.units import Wavenumber
 from calstudy.experiment.realizations import described
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure, members_of
-from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
+from calstudy.figures.signal_loss import TRANSFER
 from calstudy.plotting import style
 from calstudy.power.realizations import Design, Pooled, PooledRegion, mean_over_bins, pool_region, together
 from calstudy.products import realizations
@@ -41,7 +42,6 @@ def draw_realizations(
     results: Mapping[str, RegionResults],
     names: Sequence[str],
     max_k: float = 1.0,
-    stand_ins: Sequence[str] = (),
 ) -> Figure:
     """Draw statistics of realizations: T, its errors and their correlation, pulls, coverage, corrected power.
 
@@ -60,7 +60,6 @@ def draw_realizations(
     for panel in (transfer, errors, pulls, covered, corrected):
         panel.set(xlim=limits, xlabel=style.WAVENUMBER)
     _draw_correlation(figure, correlation, outside, limits)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -199,7 +198,7 @@ class Realizations(StudyFigure):
         results = read_results(job.settings, job.inputs)
         blocks = job.settings["blocks"]
         names = [f"{described(block['draw'])} ({len(block['members'])})" for block in blocks]
-        return Drawing(draw_realizations(results, names, self.max_k, job.settings["notes"]), _arrays(results))
+        return Drawing(draw_realizations(results, names, self.max_k), _arrays(results))
 
 
 def _arrays(results: Mapping[str, RegionResults]) -> dict[str, Any]:
@@ -228,9 +227,7 @@ CSV = "realizations-comparison.csv"
 
 
 @style.journal_style()
-def draw_comparison(
-    arrays: Mapping[str, PooledRegion], difference: Pooled, max_k: float = 1.0, stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_k: float = 1.0) -> Figure:
     """Draw T of two arrays with the scatter of one realization, and the mean difference with its 95 % error.
 
     `arrays` are two, by title, in the same bins; `difference` is T of the first less that of the second. The axis of k
@@ -249,7 +246,6 @@ def draw_comparison(
     lower.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
     lower.set(xlabel=style.WAVENUMBER, ylabel=r"difference of $T$, 95 %")
     lower.set_xlim(0, min(max_k, float(pooled.bin_edges[-1])))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -294,7 +290,7 @@ class RealizationsComparison(StudyFigure):
         _write(job.output / CSV, regions, differences)
         arrays = {"k": first.k, "bin_edges": first.bin_edges, "difference": differences}
         shown = {role: dict(region.total) for role, region in zip(self.titles, regions.values(), strict=True)}
-        figure = draw_comparison(regions, differences["transfer"], self.max_k, job.settings["notes"])
+        figure = draw_comparison(regions, differences["transfer"], self.max_k)
         return Drawing(figure, {**arrays, **shown})
 
 

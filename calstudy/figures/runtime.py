@@ -62,7 +62,6 @@ def draw_runtime(
     series: Sequence[RuntimeSeries],
     size_label: str,
     symbol: str = r"\mathrm{size}",
-    stand_ins: Sequence[str] = (),
     time_label: str = "time per step (s)",
 ) -> Figure:
     r"""Draw medians (markers), 95 % bands and fitted power laws (lines) on logarithmic axes, in one column.
@@ -83,7 +82,6 @@ def draw_runtime(
     axes.set(xscale="log", yscale="log", xlabel=size_label, ylabel=time_label)
     style.label_one_two_five(axes.xaxis)
     _add_legend(figure, series, symbol)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -119,7 +117,7 @@ class Runtime(StudyFigure):
         series = _series([read_json(folder / CASE) for folder in job.inputs.values()])
         label, symbol = AXES[self.panel]
         clock = "time" if len(series) > len(SHOWN) else "processor time"
-        figure = draw_runtime(series, label, symbol, job.settings["notes"], f"{clock} per step, or solve (s)")
+        figure = draw_runtime(series, label, symbol, f"{clock} per step, or solve (s)")
         notes = {item.label: f"{item.fit.exponent:.2f} ± {item.fit.error:.2f}" for item in series}
         return Drawing(figure, series, notes)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from calstudy.power.transfer import TransferFunction, TransferMap
 
 
-SIGMAS_95 = 1.96
-"""Half-width of a 95 % interval, in standard deviations."""
 TRANSFER = r"$T = P^{R}/P^{S}$"
 SCALE_FREE = "outside, free of the flux scale {:.3f}"
 MAP_COLOURS = "cividis"
@@ -52,9 +51,7 @@ class SignalLoss:
 
 
 @style.journal_style()
-def draw_signal_loss(
-    loss: SignalLoss, buffer: float = 100e-9, max_delay: float | None = 2e-6, stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_signal_loss(loss: SignalLoss, buffer: float = 100e-9, max_delay: float | None = 2e-6) -> Figure:
     """Draw T per |k| outside and inside the wedge on the left, per (|b|, tau) on the right.
 
     Bars are 95 % (1.96 sigma); a point without an error (one baseline in its bin) has none. The dashed line is the
@@ -67,7 +64,6 @@ def draw_signal_loss(
     left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     _draw_per_k(left, loss, buffer)
     draw_map(figure, right, loss.map, buffer, max_delay)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -146,6 +142,7 @@ class SignalLossFigure(StudyFigure):
     variants = SIGNAL_LOSS_VARIANTS
     needs_signal_loss = True
     needs_calibration = True
+    sections = ("power.wedge_buffer",)
     tolerances = (
         (r"map\..*", Drawn(typical_error, "its error bar, at least the median of its baseline length", largest=12.0)),
         (r".*\.(transfer|coherence|scale_free_transfer|retained)", Drawn(own_error, "its error bar", largest=12.0)),
@@ -158,16 +155,12 @@ class SignalLossFigure(StudyFigure):
         """Return the transfer functions."""
         return {"transfer": required(signal_loss.transfer(graph))}
 
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the buffer of the wedge."""
-        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
-
     def draw(self, job: Job) -> Drawing:
         """Draw T per k and per (|b|, tau)."""
         tables = Tables((job.inputs["transfer"],))
         outside, inside = (tables.transfer(region) for region in signal_loss.REGIONS)
         loss = SignalLoss(outside, inside, tables.transfer_map())
-        figure = draw_signal_loss(loss, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
+        figure = draw_signal_loss(loss, buffer=job.settings["wedge_buffer"])
         return Drawing(figure, loss)
 
 
@@ -188,7 +181,7 @@ class ExpectedLoss:
 
 
 @style.journal_style()
-def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9) -> Figure:
     """Draw T outside the wedge per |k| on the left, and against the delay for some baseline lengths on the right.
 
     Lines are expected, points measured, with 95 % bars. The wedge ends at the horizon plus `buffer`, s.
@@ -212,7 +205,6 @@ def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9, stand_ins: Se
     left.legend(loc="lower right")
     _draw_lengths(right, loss)
     left.set_ylim(-0.03, 1.15)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -253,6 +245,7 @@ class ExpectedLossFigure(StudyFigure):
     needs_signal_loss = True
     needs_least_squares = True
     needs_calibration = True
+    sections = ("power.wedge_buffer",)
     tolerances = (
         (r"map\..*", Drawn(typical_error, "its error bar, at least the median of its baseline length", largest=12.0)),
         (r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),
@@ -267,13 +260,9 @@ class ExpectedLossFigure(StudyFigure):
             "transfer": required(signal_loss.transfer(graph)),
         }
 
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the buffer of the wedge."""
-        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
-
     def draw(self, job: Job) -> Drawing:
         """Draw expected and measured T side by side."""
         tables = Tables((job.inputs["transfer"], job.inputs["expected"]))
         found = ExpectedLoss(tables.expected_transfer, tables.transfer("outside-wedge"), tables.transfer_map())
-        figure = draw_expected_loss(found, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
+        figure = draw_expected_loss(found, buffer=job.settings["wedge_buffer"])
         return Drawing(figure, found)

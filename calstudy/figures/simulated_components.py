@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
 from calstudy.corrupt.levels import rms, set_levels
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.spherical import SIGMAS_95
 from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, draw_horizon, label_axes
@@ -137,7 +137,7 @@ def _baselines(foregrounds: UVData, eor: UVData, factor: float, taper: str) -> t
 
 
 @style.journal_style()
-def draw_components(components: SimulatedComponents, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_components(components: SimulatedComponents) -> Figure:
     """Draw the wedge of F and P(k) of S above, and delay spectra of a short, a median and a long baseline below."""
     figure = style.new_figure(style.TWO_COLUMNS, 5.2)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.25, 1)).ravel()
@@ -150,7 +150,6 @@ def draw_components(components: SimulatedComponents, stand_ins: Sequence[str] = 
     panels[0].set_ylabel(r"rms $|\widetilde{V}(\tau)|$ (Jy Hz)")
     handles, labels = panels[0].get_legend_handles_labels()
     below.legend(handles, labels, loc="outside upper center", ncols=len(labels))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -221,4 +220,4 @@ class SimulatedComponentsFigure(StudyFigure):
         found = measure_components(foregrounds, eor, experiment)
         ratios = {f"{low:g} to {high:g}": found.ratio(low, high) for low, high in pairwise(WAVENUMBERS)}
         measured = {k: list(ratio) for k, ratio in ratios.items() if np.isfinite(ratio[0])}
-        return Drawing(draw_components(found, job.settings["notes"]), found, {"eor_over_input": measured})
+        return Drawing(draw_components(found), found, {"eor_over_input": measured})

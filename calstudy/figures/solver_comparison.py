@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.spherical import SIGMAS_95, Marking, SphericalColumn, draw_band, draw_points, read_column
+from calstudy.figures.spherical import Marking, SphericalColumn, draw_band, draw_points, read_column
 from calstudy.plotting import style
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
@@ -34,7 +35,7 @@ ARRAYS = {
 
 @style.journal_style()
 def draw_solver_comparison(
-    arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]], last_k: float = 1.0, stand_ins: Sequence[str] = ()
+    arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]], last_k: float = 1.0
 ) -> Figure:
     """Draw P^R, and below it P^R without EoR, of two solvers: a column for each array.
 
@@ -57,7 +58,6 @@ def draw_solver_comparison(
         row[0].set_ylabel(rf"{ROWS[name]} ({style.POWER_UNIT})")
         style.label_one_two_five(row[0].xaxis)
     _add_legend(figure)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -125,7 +125,7 @@ class SolverComparison(StudyFigure):
         """Draw a column for each array."""
         columns = {role: self._read(job, role) for role in self.roles(job.settings["layouts"])}
         arrays = {title: (columns[own], columns[minimum]) for title, (own, minimum) in ARRAYS.items() if own in columns}
-        return Drawing(draw_solver_comparison(arrays, stand_ins=job.settings["notes"]), columns)
+        return Drawing(draw_solver_comparison(arrays), columns)
 
     def _read(self, job: Job, role: str) -> SphericalColumn:
         found = read_column(job.inputs[f"spectra:{role}"], self.titles[role], "outside-wedge")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,8 +9,7 @@ import numpy as np
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.sky.counts import FREQUENCY, differential_counts
 
 if TYPE_CHECKING:
@@ -96,7 +94,7 @@ def _area() -> float:
 
 
 @style.journal_style()
-def draw_counts(counts: SourceCounts, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_counts(counts: SourceCounts) -> Figure:
     """Draw Euclidean-normalized counts above, and their ratio to Franzen et al. (2019) with a band of 5 % below."""
     figure = style.new_figure(style.ONE_COLUMN, 3.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
@@ -114,7 +112,6 @@ def draw_counts(counts: SourceCounts, stand_ins: Sequence[str] = ()) -> Figure:
     lower.errorbar(counts.flux, counts.ratio, counts.error, fmt="o", color=style.BLUE)
     largest = max(2 * TOLERANCE, 1.1 * float(np.abs(counts.ratio - 1).max() + counts.error.max()))
     lower.set(xlabel="flux density at 200 MHz (Jy)", ylabel="ratio", ylim=(1 - largest, 1 + largest))
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -125,12 +122,8 @@ class SourceCountsFigure(StudyFigure):
 
     caption = "Differential source counts at 200 MHz, and their ratio to those of Franzen et al. (2019)."
     needs_foregrounds = True
+    needs_products = False
     sections = ("sky", "instrument")
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return nothing: the sky is made again."""
-        del graph
-        return {}
 
     def draw(self, job: Job) -> Drawing:
         """Count the sources."""
@@ -140,4 +133,4 @@ class SourceCountsFigure(StudyFigure):
         frequencies = make_template(job.settings["instrument"]).freq_array
         counts = count_sources(make_foregrounds(job.settings["sky"].foregrounds, frequencies).sky)
         notes = {"largest_deviation": float(np.abs(counts.ratio - 1).max())}
-        return Drawing(draw_counts(counts, job.settings["notes"]), counts, notes)
+        return Drawing(draw_counts(counts), counts, notes)

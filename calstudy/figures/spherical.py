@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.products.graph import Graph
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calstudy.power.spectra import SphericalSpectrum
-
-
-SIGMAS_95 = 1.96
-"""Half-width of a 95 % interval, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,7 @@ ZOOMED = ("residual", "residual_without_eor", "noise")
 
 
 @style.journal_style()
-def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0) -> Figure:
     """Draw spherical power spectra: full range above, signal and residuals enlarged below.
 
     Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ. There are one
@@ -95,7 +91,6 @@ def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0, stan
         row[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
         style.label_one_two_five(row[0].xaxis)
     _add_legend(figure, columns)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -230,11 +225,8 @@ class Spherical(StudyFigure):
 
     caption = "Spherical power spectra with 95 % bars; open where negative."
     variants = ("eor",)
+    sections = ("power.wedge_buffer",)
     tolerances = SPHERICAL_RULES
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the buffer of the wedge."""
-        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
 
     def excised(self, job: Job) -> SphericalColumn:
         """Read the spectra over the modes outside the wedge."""
@@ -245,7 +237,7 @@ class Spherical(StudyFigure):
         """Draw a column for each choice of modes."""
         everything = read_column(job.inputs["spectra"], "all modes", "all-modes")
         columns = {"all_modes": everything, "excised": self.excised(job)}
-        return Drawing(draw_spherical(list(columns.values()), stand_ins=job.settings["notes"]), columns)
+        return Drawing(draw_spherical(list(columns.values())), columns)
 
 
 class SphericalExcised(Spherical):
@@ -258,14 +250,13 @@ class SphericalExcised(Spherical):
     def draw(self, job: Job) -> Drawing:
         """Draw one column."""
         column = self.excised(job)
-        return Drawing(draw_spherical([column], stand_ins=job.settings["notes"]), {"excised": column})
+        return Drawing(draw_spherical([column]), {"excised": column})
 
 
 def draw_spherical_comparison(
     minimally_redundant: SphericalColumn,
     redundant: SphericalColumn,
     zoom_k: float = 1.0,
-    stand_ins: Sequence[str] = (),
 ) -> Figure:
     """Draw both arrays as `draw_spherical` does, the minimally redundant one left and the redundant one right.
 
@@ -276,7 +267,7 @@ def draw_spherical_comparison(
         replace(minimally_redundant, title="Minimally redundant"),
         replace(redundant, title="Redundant"),
     )
-    return draw_spherical(columns, zoom_k, stand_ins)
+    return draw_spherical(columns, zoom_k)
 
 
 class SphericalComparison(StudyFigure):
@@ -295,7 +286,5 @@ class SphericalComparison(StudyFigure):
             role: read_column(job.inputs[f"spectra:{role}"], title, "outside-wedge")
             for role, title in self.titles.items()
         }
-        figure = draw_spherical_comparison(
-            columns["minimally_redundant"], columns["redundant"], stand_ins=job.settings["notes"]
-        )
+        figure = draw_spherical_comparison(columns["minimally_redundant"], columns["redundant"])
         return Drawing(figure, columns)

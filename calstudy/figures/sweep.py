@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.experiment.files import short_names
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.signal_loss import SIGMAS_95, TRANSFER
+from calstudy.figures.signal_loss import TRANSFER
 from calstudy.plotting import style
 from calstudy.products import signal_loss
 from calstudy.products.graph import Graph, required
@@ -50,7 +51,7 @@ class SweepPanel:
 
 
 @style.journal_style()
-def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_sweep(panels: Sequence[SweepPanel]) -> Figure:
     """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
 
     Dashes are T free of the flux scale, which is written above each value (see `calstudy.power.transfer`). There are at
@@ -76,7 +77,6 @@ def draw_sweep(panels: Sequence[SweepPanel], stand_ins: Sequence[str] = ()) -> F
     for axes in grid[:, 0]:
         axes.set_ylabel(TRANSFER)
     _add_legend(figure, grid.flat[0], edges, columns)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -155,7 +155,7 @@ class Sweep(StudyFigure):
     def draw(self, job: Job) -> Drawing:
         """Draw T against the varied fields."""
         panels = [_panel(block, job.inputs) for block in job.settings["blocks"]]
-        return Drawing(draw_sweep(panels, stand_ins=job.settings["notes"]), {"panels": panels})
+        return Drawing(draw_sweep(panels), {"panels": panels})
 
 
 def _bands(folder: Path) -> TransferFunction:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -65,7 +65,7 @@ def compare_visibilities(
     return VisibilityComparison(antennas, baseline_length, *spectra)
 
 
-def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str]) -> Figure:
     """Draw real parts against frequency (left) and amplitudes of transforms against delay (right).
 
     The reference is solid, the model dashed, the residual dotted, the noise dash-dotted. Vertical lines are the edges
@@ -87,14 +87,13 @@ def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str], s
     delay_panel(delays, comparison.reference.delay, r"$|\widetilde{V}(\tau)|$ (Jy)")
     name_baseline(delays, comparison.antennas, comparison.baseline_length)
     figure.legend(handles=delays.get_lines()[:4], loc="outside upper center", ncols=4)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
 @style.journal_style()
-def draw_model(comparison: VisibilityComparison, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_model(comparison: VisibilityComparison) -> Figure:
     """Draw true foregrounds F (the reference) and their fitted model F̂, both without gains."""
-    return draw_comparison(comparison, (r"true foregrounds $F$", r"fitted model $\widehat{F}$"), stand_ins)
+    return draw_comparison(comparison, (r"true foregrounds $F$", r"fitted model $\widehat{F}$"))
 
 
 def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[int, int], float, Visibilities]:
@@ -140,13 +139,13 @@ class Model(StudyFigure):
         gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], job.settings["integration"])
         shown = Visibilities(foregrounds, model / gains.scale**2, noise)
         comparison = compare_visibilities(pair, length, gains.frequency, shown)
-        return Drawing(draw_model(comparison, stand_ins=job.settings["notes"]), comparison)
+        return Drawing(draw_model(comparison), comparison)
 
 
 @style.journal_style()
-def draw_data(comparison: VisibilityComparison, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_data(comparison: VisibilityComparison) -> Figure:
     """Draw data V (the reference) and the model visibility ĝ_a ĝ_b* F̂, with the thermal noise of the data."""
-    return draw_comparison(comparison, (r"data $V$", r"model $\hat{g}_a\hat{g}_b^*\widehat{F}$"), stand_ins)
+    return draw_comparison(comparison, (r"data $V$", r"model $\hat{g}_a\hat{g}_b^*\widehat{F}$"))
 
 
 class Data(StudyFigure):
@@ -182,4 +181,4 @@ class Data(StudyFigure):
         corruption_factor, correction = (gains[0] * gains[1].conj() for gains in both)
         shown = Visibilities(data, correction * model, corruption_factor * noise)
         comparison = compare_visibilities(pair, length, fitted.frequency, shown)
-        return Drawing(draw_data(comparison, stand_ins=job.settings["notes"]), comparison)
+        return Drawing(draw_data(comparison), comparison)

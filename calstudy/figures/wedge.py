@@ -11,7 +11,6 @@ import numpy as np
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
-from calstudy.products.graph import Graph
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import Drawn, cylindrical_error
 
@@ -52,9 +51,7 @@ TITLES = {
 }
 
 
-def draw_wedge(
-    panels: WedgePanels, buffer: float = 100e-9, max_delay: float | None = 2e-6, stand_ins: Sequence[str] = ()
-) -> Figure:
+def draw_wedge(panels: WedgePanels, buffer: float = 100e-9, max_delay: float | None = 2e-6) -> Figure:
     """Draw the real parts of five cylindrical power spectra on one scale of colours, negative values in blue.
 
     Spectra have strictly increasing baseline lengths and delays >= 0, power in mK² h⁻³ Mpc³. The dashed line is
@@ -63,7 +60,7 @@ def draw_wedge(
     spectra differ.
     """
     spectra = {name: getattr(panels, name) for name in TITLES}
-    return draw_panels(spectra, TITLES, buffer, max_delay, stand_ins)
+    return draw_panels(spectra, TITLES, buffer, max_delay)
 
 
 @style.journal_style()
@@ -72,7 +69,6 @@ def draw_panels(
     titles: Mapping[str, str],
     buffer: float,
     max_delay: float | None,
-    stand_ins: Sequence[str] = (),
 ) -> Figure:
     """Draw the real parts of several cylindrical power spectra, by their names, as `draw_wedge` does."""
     from matplotlib.colors import LogNorm
@@ -94,7 +90,6 @@ def draw_panels(
     delay_axis(grid[-1], spectrum)
     grid[0].legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
     _colour_bars(figure, grid, norms)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -164,6 +159,7 @@ class Wedge(StudyFigure):
     caption = "Cylindrical power spectra; negative values in blue."
     variants = ("uncorrupted", "uncalibrated", "residual", "eor", "noise")
     needs_calibration = True
+    sections = ("power.wedge_buffer",)
     tolerances = (
         (
             r".*\.power",
@@ -172,15 +168,11 @@ class Wedge(StudyFigure):
         ),
     )
 
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the buffer of the wedge."""
-        return {"wedge_buffer": graph.experiment.power.wedge_buffer}
-
     def draw(self, job: Job) -> Drawing:
         """Draw a panel for each variant."""
         from calstudy.results.reader import Tables
 
         tables = Tables((job.inputs["spectra"],))
         panels = WedgePanels(**{name: tables.wedge(name) for name in self.variants})
-        figure = draw_wedge(panels, buffer=job.settings["wedge_buffer"], stand_ins=job.settings["notes"])
+        figure = draw_wedge(panels, buffer=job.settings["wedge_buffer"])
         return Drawing(figure, panels)

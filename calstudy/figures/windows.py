@@ -38,7 +38,7 @@ SHOWN_K = 0.6
 
 
 @style.journal_style()
-def draw_windows(found: Windows, spectrum: UnbiasedSpectrum, stand_ins: Sequence[str] = ()) -> Figure:
+def draw_windows(found: Windows, spectrum: UnbiasedSpectrum) -> Figure:
     """Draw the windows after calibration on the left, and the spectrum over that put in on the right."""
     figure = style.new_figure(style.TWO_COLUMNS, 2.9)
     left, right = figure.subplots(1, 2)
@@ -55,7 +55,6 @@ def draw_windows(found: Windows, spectrum: UnbiasedSpectrum, stand_ins: Sequence
     right.errorbar(found.k[rows], (spectrum.divided / spectrum.signal)[rows], label=DIVIDED, **HOLLOW)
     right.set(xlabel=style.WAVENUMBER, ylabel=RATIO, xlim=(0, LARGEST_K))
     right.legend()
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -81,7 +80,7 @@ class WindowsFigure(StudyFigure):
         """Draw the windows and the spectrum."""
         found, spectrum = _read(job.inputs["windows"])
         shown = {"windows": found, "spectrum": spectrum}
-        return Drawing(draw_windows(found, spectrum, job.settings["notes"]), shown)
+        return Drawing(draw_windows(found, spectrum), shown)
 
 
 def _read(folder: Path) -> tuple[Windows, UnbiasedSpectrum]:
@@ -141,7 +140,7 @@ def coverage(spectra: Sequence[UnbiasedSpectrum]) -> Coverage:
 
 
 @style.journal_style()
-def draw_unbiased(found: Mapping[str, Mapping[str, Coverage]], stand_ins: Sequence[str] = ()) -> Figure:
+def draw_unbiased(found: Mapping[str, Mapping[str, Coverage]]) -> Figure:
     """Draw both estimates over the power put in, by calibrator (rows) and kind of world (columns), with 95 % bars."""
     kinds = list(dict.fromkeys(kind for row in found.values() for kind in row))
     figure = style.new_figure(style.TWO_COLUMNS, 0.7 + 1.7 * len(found))
@@ -158,7 +157,6 @@ def draw_unbiased(found: Mapping[str, Mapping[str, Coverage]], stand_ins: Sequen
         axes.set_xlabel(style.WAVENUMBER)
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=2)
-    style.note_stand_ins(figure, stand_ins)
     return figure
 
 
@@ -215,4 +213,4 @@ class UnbiasedSpectra(StudyFigure):
             calibrator: {kind: coverage(several) for kind, several in kinds.items()}
             for calibrator, kinds in spectra.items()
         }
-        return Drawing(draw_unbiased(found, job.settings["notes"]), found)
+        return Drawing(draw_unbiased(found), found)

@@ -11,7 +11,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.mwa_files import BEAM
+from calstudy.base.package_files import BEAM
 
 # The tabulated MWA beam scatters from frequency to frequency by 2.4e-5 rms of the zenith value. A polynomial of order 8
 # over 36 MHz is the lowest that leaves no more than that; a higher one would follow the scatter. Narrower observations

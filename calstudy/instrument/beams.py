@@ -105,8 +105,7 @@ class GriddedBeam:
     fit_error
         Largest difference of a Jones component from the tabulated one within the band, relative to the zenith
         (`TabulatedBeam`).
-    tabulated_frequencies
-        Frequencies of the table in and next to the band, in Hz, (Ntab,).
+    tabulated_frequencies : frequencies of the table in and next to the band, in Hz, (Ntab,)
     """
 
     def __init__(self, table: TabulatedBeam | Tile, name: str, stand_in: str | None) -> None:

@@ -15,7 +15,7 @@ from pyuvdata import UVBeam
 from pyuvdata.uvbeam.mwa_beam import MWABeam
 
 from calstudy.base.errors import InputError
-from calstudy.base.mwa_files import BEAM
+from calstudy.base.package_files import BEAM
 from calstudy.instrument.as_built import FEEDS
 from calstudy.instrument.beam_frequencies import fit_range
 from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_element, tabulate, zenith_normalized

@@ -5,15 +5,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.schema import fault
-from calstudy.instrument.settings import LAYOUTS, Coordinates, InstrumentSettings, Site
+from calstudy.instrument.settings import LAYOUTS, Coordinates, InstrumentSettings, Site, Size
 
 if TYPE_CHECKING:
     from astropy.coordinates import EarthLocation
@@ -238,3 +241,44 @@ def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
         index[members] = number
         conjugated[members] = vectors[members] @ vectors[members[0]] < 0
     return RedundantGroups(index, conjugated)
+
+
+@dataclass(frozen=True)
+class _Extent:
+    """Number of antennas, longest and mean baseline (m)."""
+
+    antennas: int
+    longest: float
+    mean: float
+
+
+def _extent(layout: Plugin) -> _Extent:
+    return _extent_of(layout, digest_json(identity(layout)))
+
+
+@lru_cache(maxsize=256)
+def _extent_of(layout: Plugin, content: str) -> _Extent:
+    """Return the extent of a layout; `content` is a digest that changes with its files."""
+    del content
+    enu = make_layout(layout).enu
+    first, second = np.triu_indices(len(enu), 1)
+    lengths = np.linalg.norm(enu[first] - enu[second], axis=1)
+    return _Extent(len(enu), float(lengths.max()), float(lengths.mean()))
+
+
+def size_of_instrument(instrument: InstrumentSettings) -> Size:
+    """Return the size of an instrument's data."""
+    extent = _extent(instrument.layout)
+    return Size(
+        antennas=extent.antennas,
+        times=instrument.times.count,
+        channels=instrument.channels,
+        polarizations=len(instrument.polarizations),
+        longest=extent.longest,
+        mean=extent.mean,
+    )
+
+
+def antenna_count(layout: Plugin) -> int:
+    """Return the number of antennas of a layout. Raises InputError as `make_layout`."""
+    return _extent(layout).antennas

@@ -1,12 +1,14 @@
-"""The `instrument` section of an experiment file."""
+"""The `instrument` section of an experiment file, and the size of an instrument's data."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import Field, SerializeAsAny, model_validator
 
+from calstudy.base.observation import Frame
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
@@ -155,6 +157,44 @@ class InstrumentSettings(Section):
                 raise fault(f"antenna_beams.{name}.antennas", "contains an antenna that is already in a set")
             seen.update(group.antennas)
         return self
+
+
+@dataclass(frozen=True)
+class Size:
+    """Dimensions of a data set and of its array; `longest` and `mean` are estimates of baseline lengths, m."""
+
+    antennas: int
+    times: int
+    channels: Channels
+    polarizations: int
+    longest: float
+    mean: float
+
+    @classmethod
+    def of_frame(cls, frame: Frame) -> Size:
+        """Return the size of data with these antennas, baselines and channels."""
+        spacings = np.abs(np.diff(frame.frequencies))
+        channels = {"first": frame.frequencies.min(), "width": np.median(spacings) if spacings.size else 0.0}
+        lengths = frame.lengths[~frame.autos]
+        return cls(
+            antennas=frame.n_antennas,
+            times=frame.n_times,
+            # Measured data may have fewer channels than a simulation may.
+            channels=Channels.model_construct(**channels, count=frame.n_channels),
+            polarizations=frame.n_polarizations,
+            longest=float(lengths.max(initial=0.0)),
+            mean=float(lengths.mean()) if lengths.size else 0.0,
+        )
+
+    @property
+    def baselines(self) -> int:
+        """Number of baselines without autocorrelations."""
+        return self.antennas * (self.antennas - 1) // 2
+
+    @property
+    def samples(self) -> int:
+        """Number of visibilities."""
+        return self.baselines * self.times * self.channels.count * self.polarizations
 
 
 class AssignedBeam(NamedTuple):

@@ -15,7 +15,7 @@ from scipy.interpolate import interp1d
 
 from calstudy.base.errors import InputError
 from calstudy.base.kept_arrays import kept_arrays
-from calstudy.base.mwa_files import BEAM
+from calstudy.base.package_files import BEAM
 from calstudy.base.plugins import digest_file
 from calstudy.instrument import beam_frequencies
 from calstudy.instrument.beam_frequencies import FIT_BAND, choose_frequencies, fit_range, megahertz
@@ -35,7 +35,7 @@ def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpola
     """Make the zenith-pointed full embedded element beam of an MWA tile (Sokolowski et al. 2017).
 
     Reading the file and fitting its table is slow, so the fit is kept for later processes. The default file is that of
-    `calstudy.base.mwa_files.BEAM`. `band` is the lowest and highest frequency in Hz; the margin that a fit
+    `calstudy.base.package_files.BEAM`. `band` is the lowest and highest frequency in Hz; the margin that a fit
     needs is read as well. See `TabulatedBeam` for `interpolation`. Raises InputError if the file is missing or is not
     an MWA beam file of this band.
     """
@@ -107,8 +107,7 @@ class TabulatedBeam:
         In radians.
     tabulated_frequencies : (Ntab,) float
         Those in the band, and those next to its ends, in Hz.
-    fit_error
-        Largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`.
+    fit_error : largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`
     """
 
     def __init__(self, fitted: Mapping[str, Any]) -> None:

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 from astropy import units
 from astropy.coordinates import EarthLocation
-from astropy.utils import iers
 from pyuvdata import Telescope, UVData
 from pyuvdata import utils as uvutils
 
-from calstudy.base.visibilities import keep_compiled_pyuvdata
+from calstudy.base.visibilities import keep_compiled_pyuvdata, new_observation, use_bundled_earth_orientation
 from calstudy.instrument.as_built import position_offsets
 from calstudy.instrument.layouts import Layout, make_array
 from calstudy.instrument.settings import InstrumentSettings
@@ -22,14 +21,6 @@ REFERENCE_JD = 2457708.0
 SECONDS_PER_DAY = 86400.0
 SIDEREAL_DAY = 0.99726956633
 POLARIZATION_NUMBERS = {"xx": -5, "yy": -6}
-
-
-def use_bundled_earth_orientation() -> None:
-    """Prevent astropy from downloading Earth orientation tables; the installed tables cover the simulated date.
-
-    Call it in every process that computes sidereal times or source positions.
-    """
-    iers.conf.auto_download = False
 
 
 def make_template(settings: InstrumentSettings, autos: bool = False, as_built: bool = False) -> UVData:
@@ -48,25 +39,13 @@ def make_template(settings: InstrumentSettings, autos: bool = False, as_built: b
     first, second = np.triu_indices(len(layout.numbers), 0 if autos else 1)
     times, channels = settings.times, settings.channels
     start = time_of_lst(times.start_lst, layout.location)
-    return _metadata(
+    return new_observation(
         _telescope(layout),
         np.column_stack([layout.numbers[first], layout.numbers[second]]),
         times=start + np.arange(times.count) * times.integration / SECONDS_PER_DAY,
         frequencies=channels.first + np.arange(channels.count) * channels.width,
         resolution=(times.integration, channels.width),
         polarizations=np.array([POLARIZATION_NUMBERS[polarization] for polarization in settings.polarizations]),
-    )
-
-
-def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndarray) -> UVData:
-    """Return the observation of the template at other times (Julian dates) and frequencies (Hz)."""
-    return _metadata(
-        template.telescope.copy(),
-        np.column_stack([template.ant_1_array, template.ant_2_array])[: template.Nbls],
-        times=np.asarray(times_jd, dtype=float),
-        frequencies=np.asarray(frequencies, dtype=float),
-        resolution=(template.integration_time[0], template.channel_width[0]),
-        polarizations=template.polarization_array.copy(),
     )
 
 
@@ -102,33 +81,3 @@ def _telescope(layout: Layout) -> Telescope:
         mount_type="fixed",
         update_from_known=False,
     )
-
-
-def _metadata(
-    telescope: Telescope,
-    antenna_pairs: np.ndarray,
-    times: np.ndarray,
-    frequencies: np.ndarray,
-    resolution: tuple[float, float],
-    polarizations: np.ndarray,
-) -> UVData:
-    """Make the UVData; `resolution` is the integration time in s and the channel width in Hz."""
-    use_bundled_earth_orientation()
-    integration, width = resolution
-    uvd = UVData.new(
-        telescope=telescope,
-        antpairs=antenna_pairs,
-        times=times,
-        freq_array=frequencies,
-        polarization_array=polarizations,
-        integration_time=float(integration),
-        channel_width=float(width),
-        do_blt_outer=True,
-        time_axis_faster_than_bls=False,
-        update_telescope_from_known=False,
-        vis_units="Jy",
-        pol_convention="sum",
-    )
-    # pyuvdata's own history contains the time of day. Equal settings must give equal templates.
-    uvd.history = "calstudy instrument template"
-    return uvd

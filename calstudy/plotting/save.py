@@ -27,20 +27,16 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 def figure_arrays(data: Any) -> dict[str, np.ndarray]:
     """Return every array in a figure's data by name.
 
+    Raises ValueError if a value is neither an array, a number, a string nor None.
+
     Parameters
     ----------
-    data
-        Dataclasses, mappings and sequences, nested, that contain arrays, numbers and strings; None means absent.
+    data : dataclasses, mappings and sequences, nested, that contain arrays, numbers and strings; None means absent
 
     Returns
     -------
     Arrays by the path that leads to them, joined by dots: ``"excised.residual.power"``. A field of a dataclass may have
     another name there, under ``array`` in its metadata, so that published arrays keep their names.
-
-    Raises
-    ------
-    ValueError
-        If a value is neither an array, a number, a string nor None.
     """
     arrays: dict[str, np.ndarray] = {}
     _collect("", data, arrays)
@@ -76,23 +72,14 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
     """Write ``name.npz``, ``name.pdf`` and ``name.png`` (200 dpi) into `directory`, and return the three paths.
 
     Each file is written completely or not at all, and replaces an older one. The same figure and arrays give the same
-    bytes: no dates are written.
+    bytes: no dates are written. Raises ValueError if the name is not a plain file name, or an array is not plain, and
+    OSError if the directory cannot be written.
 
     Parameters
     ----------
-    arrays
-        Plain arrays (numbers, booleans, strings) by name; see `figure_arrays`.
-    directory
-        Created if it does not exist.
-    name
-        File name without extension: letters, digits, ``.``, ``_`` and ``-``.
-
-    Raises
-    ------
-    ValueError
-        If the name is not a plain file name, or an array is not plain.
-    OSError
-        If the directory cannot be written.
+    arrays : plain arrays (numbers, booleans, strings) by name; see `figure_arrays`
+    directory : created if it does not exist
+    name : file name without extension: letters, digits, ``.``, ``_`` and ``-``
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"figure name '{name}' is not a file name: use letters, digits, '.', '_' and '-'")

@@ -10,8 +10,7 @@ import numpy as np
 from astropy.time import Time
 from pyuvdata import UVData
 
-from calstudy.base.visibilities import require_rectangular
-from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.base.visibilities import positions, require_rectangular, use_bundled_earth_orientation
 
 SECONDS_PER_DAY = 86400.0
 
@@ -36,7 +35,7 @@ def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:
                     warnings.filterwarnings("ignore", message=message)
             averaged.downsample_in_time(n_times_to_avg=averaged.Ntimes, allow_drift=False)
     # pyuvdata sorts by baseline number; bring back the order of the input.
-    averaged.reorder_blts(order=_positions(averaged.baseline_array, uvd.baseline_array[: uvd.Nbls]))
+    averaged.reorder_blts(order=positions(averaged.baseline_array, uvd.baseline_array[: uvd.Nbls]))
     averaged.data_array = averaged.data_array.astype(np.complex128, copy=False)
     return averaged
 
@@ -81,9 +80,3 @@ def average_in_blocks(uvd: UVData, blocks: Sequence[Block]) -> UVData:
         for block in blocks
     ]
     return averages[0].fast_concat(averages[1:], "blt", inplace=False)
-
-
-def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the index in `values` of each of `wanted`, both 1D with unique entries."""
-    order = np.argsort(values)
-    return order[np.searchsorted(values, wanted, sorter=order)]

@@ -47,10 +47,8 @@ class Clusters:
 
     Attributes
     ----------
-    mode, share_mode
-        Sum to which each mode (Nu, Nd) and each antenna's share of a unit (Nm, Nd) belongs; -1 for none.
-    owner, weight
-        Bin of each sum over a sample, and the modes in it, each once per pair of baselines, (Nsums,).
+    mode, share_mode : sum to which each mode (Nu, Nd) and each antenna's share of a unit (Nm, Nd) belongs; -1 for none
+    owner, weight : bin of each sum over a sample, and the modes in it, each once per pair of baselines, (Nsums,)
     share_sample, share_antenna, share_weight
         Sum over a sample, antenna, and weight of each sum over the share of an antenna in a sample, (Nshares,). The
         weight counts the pairs that contain the antenna. Empty if the antennas are not known.

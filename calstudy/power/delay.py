@@ -42,26 +42,18 @@ def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: st
     """Transform visibilities from frequency to delay.
 
     V~(tau) = dnu sum_nu exp(2 pi i tau nu) V(nu) T(nu) (paper, third equation of §Reduction of Simulation Products).
+    Raises ValueError if the frequencies do not match the axis or are not equally spaced, or the taper is unknown.
 
     Parameters
     ----------
-    visibilities
-        Complex, any shape with frequency along `axis`, in Jy.
-    frequencies
-        Equally spaced ascending channel centres in Hz, shape (Nfreqs,).
-    taper
-        Name of the taper, see `TAPERS`.
-    axis
-        The frequency axis, replaced by delay in the order of `delays`.
+    visibilities : complex, any shape with frequency along `axis`, in Jy
+    frequencies : equally spaced ascending channel centres in Hz, shape (Nfreqs,)
+    taper : name of the taper, see `TAPERS`
+    axis : the frequency axis, replaced by delay in the order of `delays`
 
     Returns
     -------
     Complex array of the same shape, in Jy Hz.
-
-    Raises
-    ------
-    ValueError
-        If the frequencies do not match the axis or are not equally spaced, or the taper is unknown.
     """
     visibilities = np.moveaxis(np.asarray(visibilities), axis, -1)
     n_channels = frequencies.size

@@ -16,16 +16,12 @@ class ExpectedBins:
 
     Attributes
     ----------
-    k, bin_edges
-        Centres (Nk,) and edges (Nk + 1,), h/Mpc.
+    k, bin_edges : centres (Nk,) and edges (Nk + 1,), h/Mpc
     outside, outside_error
         T outside the wedge and its standard deviation from random probes, (Nk,); NaN in bins without modes.
-    length_edges
-        Lower and upper edge of each bin of baseline length, m, (Nb, 2).
-    delay
-        From zero up, s, (Nd,).
-    by_length
-        T per length and delay, both signs of the delay together, (Nb, Nd).
+    length_edges : lower and upper edge of each bin of baseline length, m, (Nb, 2)
+    delay : from zero up, s, (Nd,)
+    by_length : t per length and delay, both signs of the delay together, (Nb, Nd)
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})

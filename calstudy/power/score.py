@@ -47,25 +47,23 @@ class CalibratedSpectra:
     residual_without_eor: DelaySpectra
 
 
+SPECTRA = tuple(item.name for item in fields(CalibratedSpectra))
+
+
 @dataclass(frozen=True)
 class Score:
     """Scores of a calibration in Nk bins of |k|, outside the wedge. Bins without signal hold NaN.
 
     Attributes
     ----------
-    k, bin_edges
-        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
-    transfer, transfer_error
-        T s^2, free of the flux scale s, and its standard deviation, (Nk,); NaN if s is not known.
+    k, bin_edges : bin centres (Nk,) and edges (Nk + 1,), h/Mpc
+    transfer, transfer_error : t s^2, free of the flux scale s, and its standard deviation, (Nk,); NaN if s is not known
     cross_transfer
         C s, the coefficient of the regression of the response on the EoR, (Nk,); NaN if s is not known. At the minimum
         of a fit with free foregrounds and the weights of the spectra it equals T s^2; with a finite prior it is larger.
-    bias, bias_error
-        s^2 P^R0 / P^S, free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
-    recovered, recovered_error
-        P^R / P^S, (Nk,).
-    flux_scale
-        s: fitted gain products over the true ones; NaN if not known.
+    bias, bias_error : s^2 P^R0 / P^S, free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known
+    recovered, recovered_error : P^R / P^S, (Nk,)
+    flux_scale : s: fitted gain products over the true ones; NaN if not known
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})
@@ -87,12 +85,9 @@ class Difference:
 
     Attributes
     ----------
-    bin_edges
-        (Nk + 1,), h/Mpc.
-    transfer, transfer_error
-        T s^2 of the first less that of the second, and its standard deviation, (Nk,).
-    bias, bias_error
-        The same of s^2 P^R0 / P^S.
+    bin_edges : (Nk + 1,), h/Mpc
+    transfer, transfer_error : t s^2 of the first less that of the second, and its standard deviation, (Nk,)
+    bias, bias_error : the same of s^2 P^R0 / P^S
     """
 
     bin_edges: np.ndarray
@@ -137,19 +132,13 @@ def difference(
 ) -> Difference:
     """Return how the scores of two calibrations of the same data differ, of the units that both have.
 
+    Raises InputError if they have no unit in common.
+
     Parameters
     ----------
-    calibrations
-        Their spectra.
-    edges, buffer
-        As for `score`.
-    flux_scales
-        s of both; NaN if not known.
-
-    Raises
-    ------
-    InputError
-        If they have no unit in common.
+    calibrations : their spectra
+    edges, buffer : as for `score`
+    flux_scales : s of both; NaN if not known
     """
     limits = np.asarray(edges, dtype=float)
     names = [item.name for item in fields(CalibratedSpectra)]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.visibilities import positions
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.delay import horizon_delay
 from calstudy.power.settings import PowerSettings
@@ -30,24 +31,15 @@ class DelaySpectra:
 
     Attributes
     ----------
-    power
-        Even times odd, (Nu, Nd) complex, mK^2 h^-3 Mpc^3; its real part estimates P(k).
-    vectors
-        East, north, up in m, (Nu, 3): mean of the unit's baselines.
-    n_pairs
-        Baseline pairs in each unit, (Nu,).
-    n_polarizations
-        Polarizations averaged.
-    delay
-        s, ascending, (Nd,).
-    k_perp, k_parallel
-        h/Mpc, (Nu,) and (Nd,), at the band centre.
-    frequency
-        Band centre in Hz.
-    omega_pp
-        Integral of the squared power beam in sr, mean over band and polarizations.
-    taper
-        Name of the taper, see `calstudy.power.delay.TAPERS`.
+    power : even times odd, (Nu, Nd) complex, mK^2 h^-3 Mpc^3; its real part estimates P(k)
+    vectors : east, north, up in m, (Nu, 3): mean of the unit's baselines
+    n_pairs : baseline pairs in each unit, (Nu,)
+    n_polarizations : polarizations averaged
+    delay : s, ascending, (Nd,)
+    k_perp, k_parallel : h/Mpc, (Nu,) and (Nd,), at the band centre
+    frequency : band centre in Hz
+    omega_pp : integral of the squared power beam in sr, mean over band and polarizations
+    taper : name of the taper, see `calstudy.power.delay.TAPERS`
     share_unit, share_antenna, share_pairs, share_power
         The share of each antenna in each unit: unit and number of the antenna, (Nm,) int; number of the unit's pairs
         that contain the antenna, (Nm,) int; and the sum of the powers of these pairs, (Nm, Nd) complex. Errors by
@@ -130,18 +122,12 @@ class CylindricalSpectrum:
 
     Attributes
     ----------
-    baseline_length, k_perp
-        Mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
-    bin_edges
-        Lower and upper edge of each bin, (Nb, 2), m.
-    delay, k_parallel
-        (Nd,) ascending, s and h/Mpc; from zero up if folded.
-    power
-        Mean over the pairs of baselines in each bin, (Nb, Nd) complex; the real part estimates P(k).
-    n_pairs
-        Pairs of baselines averaged, (Nb,) int.
-    horizon_delay
-        |b|/c, the edge of the wedge, (Nb,), s.
+    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
+    bin_edges : lower and upper edge of each bin, (Nb, 2), m
+    delay, k_parallel : (Nd,) ascending, s and h/Mpc; from zero up if folded
+    power : mean over the pairs of baselines in each bin, (Nb, Nd) complex; the real part estimates P(k)
+    n_pairs : pairs of baselines averaged, (Nb,) int
+    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
     """
 
     baseline_length: np.ndarray = field(metadata={"unit": "m"})
@@ -162,17 +148,14 @@ class SphericalSpectrum:
     ----------
     k, bin_edges
         Bin centres (Nk,) and edges (Nk + 1,), h/Mpc. A bin holds modes above its lower and not above its upper edge.
-    power
-        Mean over modes, (Nk,) complex; the real part estimates P(k).
-    n_modes
-        Modes (baseline or redundant group, and delay) averaged, (Nk,) int.
+    power : mean over modes, (Nk,) complex; the real part estimates P(k)
+    n_modes : modes (baseline or redundant group, and delay) averaged, (Nk,) int
     noise_modes, sample_modes, cross_modes
         Independent modes of noise, of signal, and of the product of both among them, (Nk,); see
         `calstudy.power.errors`.
     noise_error, sample_error
         Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.errors.with_errors`.
-    wedge_excluded
-        True if modes inside the wedge were left out.
+    wedge_excluded : true if modes inside the wedge were left out
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})
@@ -304,12 +287,11 @@ def _units(uvp: UVPSpec, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    baselines, positions = np.unique(pairs, return_inverse=True)
-    first, second = positions.reshape(pairs.shape).T
+    baselines, places = np.unique(pairs, return_inverse=True)
+    first, second = places.reshape(pairs.shape).T
     graph = coo_array((np.ones(first.size), (first, second)), shape=(baselines.size, baselines.size))
     _, label = connected_components(graph, directed=False)
-    order = np.argsort(uvp.bl_array)
-    rows = order[np.searchsorted(uvp.bl_array, baselines, sorter=order)]
+    rows = positions(uvp.bl_array, baselines)
     # hera_pspec stores x_a - x_b.
     vectors = -uvp.get_ENU_bl_vecs()[rows]
     mean = np.stack([np.bincount(label, vectors[:, axis]) for axis in range(3)], axis=1) / np.bincount(label)[:, None]

@@ -45,6 +45,19 @@ Numerator and denominator contain the same sky, so that most of the sample varia
 the scatter of independent samples within a bin, where each baseline or redundant group is one sample (one patch of the
 uv plane, whose delays share the taper), and by leaving out antennas, for baselines share the gains of their antennas
 (`calstudy.power.clusters`).
+
+**Bins in which P^R can be divided by T.** T contains all of D, whatever D contains, and C the part of S in it. A
+projection of a white S has T = C. T - C is power from elsewhere: gain errors, or weights that vary between channels,
+multiply the EoR in frequency, and leak power of other delays into this one. Such power measures P(k') at those delays.
+Divided by T, it is the EoR at k only if the EoR has the same ratio of P(k') to P(k) as the simulated one that gave T.
+The simulated ones are flat, which alone makes their quotients right. A result is therefore given only where
+
+- T is above five times its error; otherwise there is nothing to correct;
+- C is above five times its error, for a leak correlates with S by chance. Errors are often from four draws, and
+  deviations over them have the wide tails of Student's t: with three degrees of freedom 3 % are above three errors, and
+  0.8 % above five;
+- C is above half of T: more than half of the power behaves as under a projection. Errors of C fall with every
+  realization, and a C of a tenth of T becomes significant, but the leak in P^R / T does not decrease.
 """
 
 from __future__ import annotations
@@ -57,7 +70,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, clusters_in_k, linear_error
-from calstudy.power.correctable import correctable
 from calstudy.power.delay import horizon_delay
 from calstudy.verdicts.measured import is_measured
 
@@ -66,6 +78,41 @@ if TYPE_CHECKING:
 
     from calstudy.power.clusters import Sums
     from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
+
+
+LEAST_SIGNIFICANCE = 5.0
+LEAST_SHARE = 0.5
+
+
+def _significant(values: ArrayLike, errors: ArrayLike) -> np.ndarray:
+    """Return where values are above `LEAST_SIGNIFICANCE` times their errors; False where an error is not known."""
+    return np.asarray(values) > LEAST_SIGNIFICANCE * np.asarray(errors)
+
+
+def correctable(
+    transfer: np.ndarray, transfer_error: np.ndarray, cross_transfer: np.ndarray, cross_transfer_error: np.ndarray
+) -> np.ndarray:
+    """Return where P^R can be divided by T, bool; T, C and their errors have the same shape."""
+    own = _significant(cross_transfer, cross_transfer_error) & (cross_transfer > LEAST_SHARE * transfer)
+    return _significant(transfer, transfer_error) & own
+
+
+def why_not(transfer: float, transfer_error: float, cross_transfer: float, cross_transfer_error: float) -> str:
+    """Explain in one sentence why P^R cannot be divided by T; return an empty text where it can."""
+    if not _significant(transfer, transfer_error):
+        return f"T = {transfer:.2f} is not above {LEAST_SIGNIFICANCE:g} times its error, {transfer_error:.2g}"
+    if not _significant(cross_transfer, cross_transfer_error):
+        return (
+            f"C = {cross_transfer:.2g} is not above {LEAST_SIGNIFICANCE:g} times its error, "
+            f"{cross_transfer_error:.2g}: nothing that is left is known to be the EoR at this k"
+        )
+    if not cross_transfer > LEAST_SHARE * transfer:
+        return (
+            f"C = {cross_transfer:.2g} is not above {LEAST_SHARE:g} T, T = {transfer:.2f}: most of the power is from "
+            "elsewhere"
+        )
+    return ""
+
 
 BANDS = (0.1, 0.2, 0.3, 0.5, 1.0)
 """Edges in h/Mpc of the wide bins in which studies are compared."""
@@ -81,23 +128,17 @@ class TransferFunction:
 
     Attributes
     ----------
-    k, bin_edges
-        Bin centres (Nk,) and edges (Nk + 1,), h/Mpc.
-    transfer, transfer_error
-        T = P^D / P^S and its standard deviation, (Nk,).
-    cross_transfer, cross_transfer_error
-        C = Re <S* D> / P^S and its standard deviation, (Nk,).
+    k, bin_edges : bin centres (Nk,) and edges (Nk + 1,), h/Mpc
+    transfer, transfer_error : t = P^D / P^S and its standard deviation, (Nk,)
+    cross_transfer, cross_transfer_error : c = Re <S* D> / P^S and its standard deviation, (Nk,)
     scale_free_transfer, scale_free_transfer_error
         T s^2, the transfer function free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     squared_coherence, squared_coherence_error
         C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,). For spectra of each
         baseline with itself it is the fraction of the power that is retained.
-    signal
-        Sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins.
-    n_samples
-        Baselines, or redundant groups, in each bin, (Nk,) int.
-    flux_scale
-        s: fitted gain products over the true ones; NaN if not known.
+    signal : sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins
+    n_samples : baselines, or redundant groups, in each bin, (Nk,) int
+    flux_scale : s: fitted gain products over the true ones; NaN if not known
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})
@@ -121,16 +162,12 @@ class TransferMap:
 
     Attributes
     ----------
-    baseline_length, k_perp
-        Mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
-    bin_edges
-        Lower and upper edge of each bin, (Nb, 2), m.
-    delay, k_parallel
-        (Nd,) ascending, s and h/Mpc.
+    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
+    bin_edges : lower and upper edge of each bin, (Nb, 2), m
+    delay, k_parallel : (Nd,) ascending, s and h/Mpc
     transfer, transfer_error, cross_transfer, cross_transfer_error
         As in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples.
-    horizon_delay
-        |b|/c, the edge of the wedge, (Nb,), s.
+    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
     """
 
     baseline_length: np.ndarray = field(metadata={"unit": "m"})
@@ -339,7 +376,7 @@ def correct(spectrum: SphericalSpectrum, transfer: TransferFunction) -> tuple[np
     """Return P^R / T and its standard deviation, (Nk,) each, in the unit of the spectrum.
 
     Errors of P^R and T are independent: (sigma / P)^2 adds. NaN where too little is left to be corrected, or where most
-    of it is not the EoR at this k (`calstudy.power.correctable`). Raise ValueError if the bins differ.
+    of it is not the EoR at this k (`correctable`). Raise ValueError if the bins differ.
     """
     if not np.array_equal(spectrum.bin_edges, transfer.bin_edges):
         raise ValueError("spectrum and transfer function have different bins, expected the same")

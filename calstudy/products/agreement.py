@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.instrument.size import Size
+from calstudy.instrument.layouts import size_of_instrument
+from calstudy.instrument.settings import Size
 from calstudy.products import calibration, corruption, simulation
-from calstudy.products.files import DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
+from calstudy.products.files import AGREEMENT, DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-AGREEMENT = "agreement.json"
 MOST_SAMPLES = 112 * 630 * 384
 """Maximum number of visibilities compared, twice the paper's: it limits the memory."""
 
@@ -35,7 +35,7 @@ def agreement(graph: Graph) -> Task | None:
         return None
     if not (residual.effects and residual.calibrate and {"foregrounds", "noise"} <= set(residual.components)):
         return None
-    power, size = graph.experiment.power, Size.of(graph.experiment.instrument)
+    power, size = graph.experiment.power, size_of_instrument(graph.experiment.instrument)
     compared = integrations_compared(size)
     return Agreement(
         "calibration against truth",

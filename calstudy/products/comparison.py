@@ -11,9 +11,9 @@ import numpy as np
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
-from calstudy.power.score import BANDS, CalibratedSpectra, Score, difference
-from calstudy.products import score, spectra
-from calstudy.products.files import COMPARISON, json_number, read_json
+from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra, Score, difference
+from calstudy.products import spectra
+from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, json_number, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
@@ -37,10 +37,8 @@ class Case:
 
     Attributes
     ----------
-    bins, bands
-        Its scores in the experiment's bins of k, and in wide bands.
-    summary
-        All of its numbers, as in score.json.
+    bins, bands : its scores in the experiment's bins of k, and in wide bands
+    summary : all of its numbers, as in score.json
     """
 
     bins: Score
@@ -53,23 +51,17 @@ def case_name(world: int, calibrator: int) -> str:
     return f"{world:03d}:{calibrator:03d}"
 
 
-def comparison(
-    title: str, labels: Mapping[str, Any], scores: Mapping[str, score.MeasureScore], notes: Sequence[str]
-) -> Task:
+def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Any], notes: Sequence[str]) -> Task:
     """Return the task of the table.
 
     Parameters
     ----------
-    title
-        Name of the study.
-    labels
-        ``calibrators`` and ``worlds`` in order, and ``refusals``: world, calibrator and why it cannot work there.
-    scores
-        Of all other cases, by `case_name`.
-    notes
-        What stands in for the papers' own ingredients.
+    title : name of the study
+    labels : ``calibrators`` and ``worlds`` in order, and ``refusals``: world, calibrator and why it cannot work there
+    scores : of all other cases, by `case_name`
+    notes : what stands in for the papers' own ingredients
     """
-    powers = {f"{case}:{name}": task.inputs[name] for case, task in scores.items() for name in score.SPECTRA}
+    powers = {f"{case}:{name}": task.inputs[name] for case, task in scores.items() for name in SPECTRA}
     # All cases are measured alike.
     buffer = max((task.power.wedge_buffer for task in scores.values()), default=0.0)
     inputs = {**scores, **powers}
@@ -93,8 +85,8 @@ def read_cases(
 def _read(folder: Path) -> Case:
     from calstudy.power.tables import load_spectrum
 
-    bins, bands = (load_spectrum(folder / name, Score) for name in (score.BINS, score.BANDS))
-    return Case(bins, bands, read_json(folder / score.SUMMARY))
+    bins, bands = (load_spectrum(folder / name, Score) for name in (SCORE_BINS, SCORE_BANDS))
+    return Case(bins, bands, read_json(folder / SCORE))
 
 
 def best(found: Mapping[str, Case], band: int) -> str | None:
@@ -173,14 +165,14 @@ class Comparison(Task, stage="comparison", version=4):
         return result
 
     def _spectra(self, case: str) -> CalibratedSpectra:
-        folders = {name: self.cases[f"{case}:{name}"] for name in score.SPECTRA}
+        folders = {name: self.cases[f"{case}:{name}"] for name in SPECTRA}
         return CalibratedSpectra(**{name: spectra.read_delay_spectra(folder) for name, folder in folders.items()})
 
     def _cost(self) -> Cost:
         cases = len(self.worlds) * len(self.calibrators)
         size = size_of(self)
         # Spectra of two cases, and what their units owe to two antennas each.
-        held = 2 * len(score.SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
+        held = 2 * len(SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
         return Cost(2 + cases * (0.5 + held * 1e-8), LIBRARIES_MEMORY + held, 1e6)
 
 
@@ -303,8 +295,7 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
 
     Parameters
     ----------
-    found
-        Contents of score.json by calibrator.
+    found : contents of score.json by calibrator
     """
     bands = [band["k"] for band in next(iter(found.values()))["bands"]]
     measured = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from calstudy.base.gains import make_uvcal, read_gains
 from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import antenna_rows, flag_cube, from_cube, to_cube
+from calstudy.base.visibilities import antenna_rows, flag_cube, from_cube, positions, to_cube
 from calstudy.corrupt.interface import Effect, GainEffect, apply_effect, draw_flags, draw_truth
 from calstudy.corrupt.noise import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Variant
@@ -208,8 +208,7 @@ class MeasureLevels(Task, stage="levels", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scales to levels.json."""
-        from calstudy.corrupt.levels import rms, set_levels
-        from calstudy.corrupt.noise import radiometer_std
+        from calstudy.corrupt.levels import radiometer_std, rms, set_levels
 
         foregrounds, eor = (
             0.0 if folder is None else rms(to_cube(read_visibilities(folder / VISIBILITIES)))
@@ -322,8 +321,7 @@ class Autocorrelate(Task, stage="autocorrelations", version=1):
         cube = draw(Observation(template).shape, sigma, samples, self.noise_seed)
         if self.gains is not None:
             true = read_gains(self.gains / GAINS, "true gains")
-            order = np.argsort(true.ant_array)
-            rows = order[np.searchsorted(true.ant_array, template.ant_1_array[: template.Nbls], sorter=order)]
+            rows = positions(true.ant_array, template.ant_1_array[: template.Nbls])
             cube = cube * np.moveaxis(np.abs(true.gain_array[rows]) ** 2, 2, 0)
         write_visibilities(from_cube(template, cube.astype(complex)), output / DATA, single=True)
         return {}

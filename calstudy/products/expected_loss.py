@@ -12,7 +12,7 @@ from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Variant
-from calstudy.instrument.size import Size
+from calstudy.instrument.layouts import size_of_instrument
 from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
 from calstudy.power.settings import PowerSettings
 from calstudy.products import calibration, corruption
@@ -83,7 +83,7 @@ def why_no_response(experiment: Experiment) -> str:
 
     A fit responds differently on different baselines of a group.
     """
-    fit, size = experiment.calibration, Size.of(experiment.instrument)
+    fit, size = experiment.calibration, size_of_instrument(experiment.instrument)
     if not (isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None):
         return "needs a calibrator that fits each integration by least squares, and gains that are not smoothed"
     if experiment.power.pairs == "redundant-group":

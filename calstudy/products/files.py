@@ -24,7 +24,11 @@ VISIBILITIES, DATA, GAINS, AVERAGE = "visibilities.uvh5", "data.uvh5", "gains.ca
 MODEL, RESIDUAL, SOLUTION = "model.uvh5", "residual.uvh5", "solution.json"
 """Files of simulated components, measurements, gains, averages and calibrations."""
 COMPARISON, REALIZATIONS = "comparison.json", "realizations.json"
-"""Scores of a comparison, and verdicts on the criteria for realizations, which reports read."""
+"""Scores of a comparison, and verdicts on the criteria for realizations."""
+AGREEMENT, SKY_MODEL_ERROR, EXPECTED = "agreement.json", "sky-model.json", "expected-loss.h5"
+SCORE_BINS, SCORE_BANDS, SCORE = "score-bins.h5", "score-bands.h5", "score.json"
+TRANSFER, TRANSFER_BANDS = "transfer", "transfer-bands"
+"""Names of transfer functions in `spectrum_file`, in bins and in bands of k."""
 
 
 def spectrum_file(name: str, kind: str) -> str:
@@ -32,10 +36,8 @@ def spectrum_file(name: str, kind: str) -> str:
 
     Parameters
     ----------
-    name
-        A variant, or one of the names in `calstudy.products.signal_loss`.
-    kind
-        "wedge" for the cylindrical spectrum; "all-modes", "outside-wedge" or "inside-wedge" for spherical ones.
+    name : a variant, or one of the names in `calstudy.products.signal_loss`
+    kind : "wedge" for the cylindrical spectrum; "all-modes", "outside-wedge" or "inside-wedge" for spherical ones
     """
     return f"{name}.{kind}.h5"
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import positions
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
@@ -99,8 +100,7 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
         # The solution is known, and a start of its own would cost more than the errors.
         settings = settings.model_copy(update={"initial_gains": UnityStart()})
         prepared, cube, records = prepared_fit(settings, *self.read()), to_cube(result.model), []
-        order = np.argsort(result.gains.ant_array)
-        rows = order[np.searchsorted(result.gains.ant_array, prepared.data.numbers, sorter=order)]
+        rows = positions(result.gains.ant_array, prepared.data.numbers)
         for solve in result.solutions:
             times = slice(solve.integration, solve.integration + solve.n_integrations)
             place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])

@@ -7,7 +7,8 @@ from functools import wraps
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from calstudy.experiment.model import Experiment
-from calstudy.instrument.size import Size
+from calstudy.instrument.layouts import size_of_instrument
+from calstudy.instrument.settings import Size
 from calstudy.run.task import Task
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def size_of(task: Task) -> Size:
 
 def _size_in(task: Task) -> Size | None:
     if (instrument := getattr(task, "instrument", None)) is not None:
-        return Size.of(instrument)
+        return size_of_instrument(instrument)
     if (size := getattr(task, "size", None)) is not None:
         return Size(**size)
     return next((found for found in map(_size_in, task.needs.values()) if found is not None), None)

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube, rows_of, to_cube
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube, positions, rows_of, to_cube
 from calstudy.calibrate.settings import GainFit
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products.calibration import prepared_fit, read_result
-from calstudy.products.expected_loss import EXPECTED, LABEL, NOT_OF_THE_FIT, PROBES, binned
+from calstudy.products.expected_loss import LABEL, NOT_OF_THE_FIT, PROBES, binned
 from calstudy.products.files import (
     AVERAGE,
     DATA,
+    EXPECTED,
     GAINS,
     MODEL,
     RESIDUAL,
@@ -152,9 +153,9 @@ class SimulateEor(Task, stage="observed-eor", version=3):
         """Write the EoR to visibilities.uvh5."""
         import numpy as np
 
+        from calstudy.base.visibilities import subset_template
         from calstudy.instrument.beams import make_beam
         from calstudy.instrument.interface import model_of
-        from calstudy.instrument.telescope import subset_template
         from calstudy.power.cosmology import make_cosmology
         from calstudy.simulate.chunks import assemble, plan_chunks, simulate_chunk
         from calstudy.sky.eor import EorField
@@ -328,8 +329,6 @@ class _OfData(Task):
         It is exact for arrays whose matrices are small, and from random vectors for others. The baselines are those of
         the model, repeated for each integration where several were solved together.
         """
-        import numpy as np
-
         from calstudy.calibrate.expected_loss import DENSE, DelayModes, jacobian_size
         from calstudy.calibrate.expected_loss import expected_transfer as expected_of
         from calstudy.calibrate.preparation import problem_at
@@ -341,8 +340,7 @@ class _OfData(Task):
         record = usable[len(usable) // 2]
         times = slice(record.integration, record.integration + record.n_integrations)
         prepared = prepared_fit(self.calibrator, *read_observed(self.data, self.calibrator, self.sky_model))
-        order = np.argsort(result.gains.ant_array)
-        rows = order[np.searchsorted(result.gains.ant_array, prepared.data.numbers, sorter=order)]
+        rows = positions(result.gains.ant_array, prepared.data.numbers)
         gains = result.gains.gain_array[rows, :, times.start, polarization]
         problem = problem_at(prepared, self.calibrator, times, polarization, gains, record)
         if isinstance(problem, str):

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
+import numpy as np
+
+from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
 from calstudy.base.schema import Section
 from calstudy.base.table import Table
-from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES, Dimensions, basis_vectors, solve_memory
-from calstudy.calibrate.settings import BasisSettings
+from calstudy.calibrate.interface import CALIBRATORS
+from calstudy.calibrate.settings import BasisSettings, GainFit
+from calstudy.instrument.layouts import antenna_count
 from calstudy.instrument.settings import Channels, Layout
-from calstudy.instrument.size import antenna_count
 from calstudy.products.files import read_json, write_json
 from calstudy.run.task import Input, Inputs, Task
-
-if TYPE_CHECKING:
-    import numpy as np
 
 CASE, LOSSES, DESCENT, RUNTIME = "case.json", "losses.npz", "descent.json", "runtime.json"
 # The paper's padded step, per byte of its basis.
@@ -29,7 +33,106 @@ EXCESSES = ("0.05", "0.01", "0.002")
 """Fractions above the minimum to which steps are counted."""
 QUANTILES = (0.025, 0.5, 0.975)
 """The limits of the central 95 %, and the median."""
+MEASURING = "calstudy.products.step_times"
+"""Module of the separate process in which solvers are timed: it has one thread, and its memory is that of this work."""
+THREADS = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "TF_NUM_INTRAOP_THREADS",
+    "TF_NUM_INTEROP_THREADS",
+)
+ENVIRONMENT = {
+    **dict.fromkeys(THREADS, "1"),
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "TF_CPP_MIN_LOG_LEVEL": "3",
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+}
+"""One thread, no start-up messages, and huge pages for large temporary arrays where the system has them: the allocation
+of small pages can take longer than the measured work."""
 COLUMNS = ("panel", "size", "device", "antennas", "baselines", "longest [m]", "vectors", "coefficients", "timed")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Numbers of samples: steps of the paper's solver, calls of our Adamax, and solves of the default solver.
+
+    A sample of a call is the mean of its `STEPS_PER_CALL` steps. Each solve is complete and cold, with its own noise.
+    """
+
+    steps: int
+    calls: int
+    solves: int
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """Run time and memory of the solvers for one array.
+
+    Attributes
+    ----------
+    longest : longest baseline, m
+    vectors : foreground vectors of the longest baseline, to which the paper pads all others
+    coefficients : foreground vectors of all baselines together
+    seconds
+        Samples by name: ``paper-step``, ``paper-sum`` (the sum over the basis alone), ``adamax-step``,
+        ``default-step``, ``default-solve``; processor seconds of one core, or elapsed seconds on a GPU.
+    basis_bytes : size of the paper's padded basis
+    paper_memory : bytes by which the paper's steps raised the memory of the process
+    """
+
+    antennas: int
+    baselines: int
+    longest: float
+    vectors: int
+    coefficients: int
+    seconds: dict[str, list[float]]
+    basis_bytes: int
+    paper_memory: int
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Losses of the paper's solver on one problem: before the first step and after each, and the minimum (`floor`)."""
+
+    antennas: int
+    floor: float
+    losses: np.ndarray
+
+    def steps_to(self, excess: float) -> int | None:
+        """Return the number of steps until the loss is within this fraction of the minimum, or None if it never is."""
+        reached = np.flatnonzero(self.losses <= (1 + excess) * self.floor)
+        return int(reached[0]) if reached.size else None
+
+
+def time_steps_apart(array: Mapping[str, Any], samples: Samples, device: str) -> StepTimes:
+    """Time the solvers in a separate process; raises InputError with the last line of its output if it fails.
+
+    The array has JSON-able sections `layout`, `channels` and `basis`, and every baseline its own foreground model. The
+    device is ``cpu`` (one core) or ``gpu``.
+    """
+    return StepTimes(**_run_apart({"array": dict(array), "samples": asdict(samples), "device": device}))
+
+
+def descend_apart(array: Mapping[str, Any], max_steps: int) -> Descent:
+    """Run `descend` in a separate process; array and errors as for `time_steps_apart`."""
+    answer = _run_apart({"array": dict(array), "max_steps": max_steps})
+    return Descent(**{**answer, "losses": np.array(answer["losses"])})
+
+
+def _run_apart(request: Mapping[str, Any]) -> dict[str, Any]:
+    result = subprocess.run(
+        [sys.executable, "-m", MEASURING, json.dumps(request)],
+        env={**os.environ, **ENVIRONMENT},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if result.returncode:
+        reason = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
+        raise InputError(f"the measurement of {json.dumps(request)} failed: {reason}")
+    return json.loads(result.stdout.splitlines()[-1])
 
 
 class TimedArray(Section):
@@ -60,6 +163,11 @@ class Timed(Task):
         return Dimensions(self.antennas, baselines, baselines, channels, vectors, baselines * vectors)
 
     @property
+    def memory(self) -> float:
+        """Memory of a solve, bytes."""
+        return solve_memory(self.dimensions, cast(GainFit, CALIBRATORS.make("calamity")))
+
+    @property
     def work(self) -> float:
         """Number of visibilities over that of the paper."""
         return self.dimensions.baselines * self.array.channels.count / PAPER_SAMPLES
@@ -76,10 +184,6 @@ class TimeSteps(Timed, stage="step-times", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Time the solvers, and write all samples to case.json."""
-        import numpy as np
-
-        from calstudy.products.step_times import Samples, time_steps_apart
-
         array = self.array.model_dump(mode="json")
         found = asdict(time_steps_apart(array, Samples(**self.samples), self.device))
         case = {name: getattr(self, name) for name in ("panel", "size", "device", "machine")}
@@ -91,7 +195,7 @@ class TimeSteps(Timed, stage="step-times", version=4):
         padded = 4 * dimensions.coefficients * self.array.channels.count
         solves = samples["solves"] * (0.4 + 1.3 * self.work)
         steps = PADDED_SECONDS * padded * samples["steps"] + 50 * ADAMAX_STEP * self.work * samples["calls"]
-        return Cost(30 + steps + solves, solve_memory(dimensions, Calamity()) + PADDED_COPIES * padded, 1e5)
+        return Cost(30 + steps + solves, self.memory + PADDED_COPIES * padded, 1e5)
 
 
 class CountSteps(Timed, stage="descent", version=2):
@@ -101,10 +205,6 @@ class CountSteps(Timed, stage="descent", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Run the solver for `max_steps`, and count the steps to each of `EXCESSES`."""
-        import numpy as np
-
-        from calstudy.products.step_times import descend_apart
-
         found = descend_apart(self.array.model_dump(mode="json"), self.max_steps)
         np.savez(output / LOSSES, allow_pickle=False, losses=found.losses, floor=found.floor)
         counted = {
@@ -117,7 +217,11 @@ class CountSteps(Timed, stage="descent", version=2):
         return counted
 
     def _cost(self) -> Cost:
-        return Cost(20 + ADAMAX_STEP * self.work * self.max_steps, solve_memory(self.dimensions, Calamity()), 1e6)
+        return Cost(
+            20 + ADAMAX_STEP * self.work * self.max_steps,
+            self.memory,
+            1e6,
+        )
 
 
 class RunTimes(Task, stage="runtime", version=2, cost=Cost(1, disk=1e5)):
@@ -149,8 +253,6 @@ class RunTimes(Task, stage="runtime", version=2, cost=Cost(1, disk=1e5)):
 
 
 def _quantiles(samples: Sequence[float]) -> dict[str, float]:
-    import numpy as np
-
     low, median, high = (float(value) for value in np.quantile(samples, QUANTILES))
     return {"median": median, "low": low, "high": high, "count": len(samples)}
 
@@ -173,8 +275,6 @@ def fit_power_law(size: np.ndarray, value: np.ndarray) -> PowerLaw:
 
     Raises ValueError if there are fewer sizes, or a number is not positive.
     """
-    import numpy as np
-
     if len(size) != len(value) or np.unique(size).size < 3 or min(*size, *value) <= 0:
         raise ValueError(f"a power law needs positive values at three sizes or more, got {len(value)} at {len(size)}")
     (exponent, logarithm), covariance = np.polyfit(np.log(size), np.log(value), 1, cov=True)

@@ -11,7 +11,19 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.products import calibration, corruption, expected_loss, signal_loss, sky_model, spectra
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import DATA, MODEL, SOLUTION, json_number, read_in_parts, read_json, write_json
+from calstudy.products.files import (
+    DATA,
+    MODEL,
+    SCORE,
+    SCORE_BANDS,
+    SCORE_BINS,
+    SKY_MODEL_ERROR,
+    SOLUTION,
+    json_number,
+    read_in_parts,
+    read_json,
+    write_json,
+)
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
@@ -23,11 +35,7 @@ if TYPE_CHECKING:
 
     from calstudy.power.score import CalibratedSpectra, Score
     from calstudy.power.settings import PowerSettings
-    from calstudy.products.selection import Gains
 
-SPECTRA = ("signal", "response", "cross", "residual", "residual_without_eor")
-"""What the scores are made from, and what differences of two of them are."""
-BINS, BANDS, SUMMARY = "score-bins.h5", "score-bands.h5", "score.json"
 MEASURED = 2
 """Version of T and the bias; scores of different versions are not ranked together."""
 SAMPLES_AT_A_TIME = 14 * 630 * 384
@@ -90,8 +98,7 @@ class MeasureScore(Task, stage="score", version=4):
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scores, and all numbers to score.json."""
         from calstudy.power.binned import make_bin_edges
-        from calstudy.power.score import BANDS as EDGES
-        from calstudy.power.score import CalibratedSpectra
+        from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra
         from calstudy.power.score import score as measure
         from calstudy.power.spectra import of_common_units
         from calstudy.power.tables import save_spectrum
@@ -100,10 +107,10 @@ class MeasureScore(Task, stage="score", version=4):
         measured = CalibratedSpectra(**of_common_units(delays))
         known = read_json(self.scale / signal_loss.SCALE)["flux_scale"]
         scale, power = math.nan if known is None else known, self.power
-        save_spectrum(output / BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
-        bands = measure(measured, EDGES, power.wedge_buffer, scale)
+        save_spectrum(output / SCORE_BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))
+        bands = measure(measured, BANDS, power.wedge_buffer, scale)
         linear = self._linear_transfer(measured)
-        save_spectrum(output / BANDS, bands)
+        save_spectrum(output / SCORE_BANDS, bands)
         summary = {
             "bands": _in_bands(bands, linear),
             "flux_scale": known,
@@ -112,7 +119,7 @@ class MeasureScore(Task, stage="score", version=4):
             "held_out_chi_squared": self._held_out_chi_squared(),
             **self._solves(),
         }
-        write_json(output / SUMMARY, summary)
+        write_json(output / SCORE, summary)
         return {}
 
     def _linear_transfer(self, measured: CalibratedSpectra) -> np.ndarray | None:
@@ -128,26 +135,17 @@ class MeasureScore(Task, stage="score", version=4):
         """Return the rms of the sky model's error over that of the true foregrounds; zero for a perfect sky model."""
         if self.sky_model_error is None:
             return 0.0
-        return read_json(self.sky_model_error / sky_model.ERROR)["relative_error"]
-
-    def _known_gains(self, parity: str) -> tuple[Gains, np.ndarray]:
-        """Return fitted gains, and the true ones of the same antennas and integrations."""
-        import numpy as np
-
-        from calstudy.products.selection import read_gains
-
-        fitted = read_gains(self.calibration[parity])
-        if self.gains is None:
-            return fitted, np.ones(fitted.values.shape)
-        return fitted, read_gains(self.gains).over(len(fitted.values), fitted.numbers)
+        return read_json(self.sky_model_error / SKY_MODEL_ERROR)["relative_error"]
 
     def _gain_errors(self) -> dict[str, float | None]:
         """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
         import numpy as np
 
         from calstudy.calibrate.agreement import aligned_gains, gain_errors
+        from calstudy.products.selection import read_gains, true_of
 
-        fitted, true = self._known_gains(PARITIES[0])
+        fitted = read_gains(self.calibration[PARITIES[0]])
+        true = true_of(self.gains, fitted)
         solved = ~fitted.flags.all(axis=(1, 2))
         if not solved.any():
             return {"gain_error_aligned": None, "gain_error_as_fitted": None}
@@ -165,16 +163,16 @@ class MeasureScore(Task, stage="score", version=4):
         """
         import numpy as np
 
-        from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+        from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
+        from calstudy.products.selection import read_gains
 
-        fitted, _ = self._known_gains(PARITIES[0])
+        fitted = read_gains(self.calibration[PARITIES[0]])
         paths = [self.data[parity] / DATA for parity in PARITIES]
         paths.append(self.calibration[PARITIES[0]] / MODEL)
         misfit = noise = 0.0
         for part, (even, odd, model) in read_in_parts(paths, SAMPLES_AT_A_TIME):
-            places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(even).tolist())}
-            rows = [places[tuple(pair)] for pair in antenna_pairs(model).tolist()]
-            first, second = (np.searchsorted(fitted.numbers, column) for column in np.array(antenna_pairs(model)).T)
+            rows = rows_of(even, antenna_pairs(model))
+            first, second = np.searchsorted(fitted.numbers, antenna_pairs(model)).T
             cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
             flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
             unsolved = flag_cube(model)[..., 0]

@@ -69,6 +69,11 @@ def read_gains(folder: Path) -> Gains:
     return Gains(cal.ant_array[order], cal.freq_array, values, flags)
 
 
+def true_of(true: Path | None, fitted: Gains) -> np.ndarray:
+    """Read the true gains of the antennas and integrations of fitted ones; unity without a product of such gains."""
+    return np.ones(fitted.values.shape) if true is None else read_gains(true).over(len(fitted.values), fitted.numbers)
+
+
 def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGains:
     """Read true and fitted gains, and align the fit with the truth.
 

@@ -29,6 +29,8 @@ from calstudy.products import calibration, corruption, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
     AVERAGE,
+    TRANSFER,
+    TRANSFER_BANDS,
     json_number,
     read_json,
     read_visibilities,
@@ -49,8 +51,6 @@ if TYPE_CHECKING:
 
 REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Parts of Fourier space; true for the part inside the wedge."""
-TRANSFER = "transfer"
-BAND = "transfer-bands"
 SCALE, SUMMARY = "scale.json", "summary.csv"
 NOTE = (
     "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR. "
@@ -141,7 +141,9 @@ class Injected(Task):
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return T and the squared coherence in bands of k."""
-        outside, inside = (load_spectrum(folder / spectrum_file(BAND, part), TransferFunction) for part in REGIONS)
+        outside, inside = (
+            load_spectrum(folder / spectrum_file(TRANSFER_BANDS, part), TransferFunction) for part in REGIONS
+        )
         columns = ("k (h/Mpc)", "T outside the wedge", "squared coherence outside", "T inside the wedge")
         rows = [
             (
@@ -187,7 +189,7 @@ def write_transfer(
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
-        for name, edges in ((TRANSFER, fine), (BAND, BANDS)):
+        for name, edges in ((TRANSFER, fine), (TRANSFER_BANDS, BANDS)):
             measured = spherical_transfer(injection, edges, buffer, inside, scale)
             found = where_measured(measured) if only_measured else measured
             save_spectrum(folder / spectrum_file(name, region), found)
@@ -217,7 +219,7 @@ class SweepSummary(Task, stage="sweep-summary", version=1, cost=Cost(1, disk=1e5
         for point in self.points:
             changes = "; ".join(f"{field} = {text}" for field, text in point["changes"].items())
             for region in REGIONS:
-                path = self.transfers[point["label"]] / spectrum_file(BAND, region)
+                path = self.transfers[point["label"]] / spectrum_file(TRANSFER_BANDS, region)
                 found = load_spectrum(path, TransferFunction)
                 columns = (values(found).tolist() for values in TRANSFER_COLUMNS.values())
                 rows += [[point["label"], changes, region, *row] for row in zip(*columns, strict=True)]
@@ -252,15 +254,12 @@ class FluxScale(Task, stage="flux-scale", version=1):
         import numpy as np
 
         from calstudy.power.delay import make_taper
-        from calstudy.products.selection import read_gains
+        from calstudy.products.selection import read_gains, true_of
 
         ratios = []
         for folder in (self.even, self.odd):
             fitted = read_gains(folder)
-            true = np.ones(fitted.values.shape)
-            if self.gains is not None:
-                true = read_gains(self.gains).over(len(fitted.values), fitted.numbers)
-            ratios.append(gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values)))
+            ratios.append(gain_ratio(true_of(self.gains, fitted), np.where(fitted.flags, np.nan, fitted.values)))
         scale = flux_scale(ratios[0], ratios[1], make_taper(self.taper, fitted.frequency.size) ** 2)
         write_json(output / SCALE, {"flux_scale": json_number(scale)})
         return {}

@@ -11,9 +11,8 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import from_cube, to_cube
-from calstudy.instrument.layouts import layout_of
+from calstudy.instrument.layouts import layout_of, size_of_instrument
 from calstudy.instrument.settings import beam_count
-from calstudy.instrument.size import Size
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, memoize
 from calstudy.run.task import Piece, Task
@@ -129,7 +128,7 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the visibilities to chunk.uvh5; a chunk beyond the last node stays empty."""
-        from calstudy.instrument.telescope import subset_template
+        from calstudy.base.visibilities import subset_template
         from calstudy.simulate.chunks import simulate_chunk as simulate
 
         component = self.component
@@ -144,7 +143,7 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
 
     def _cost(self) -> Cost:
         instrument, simulation, sky = self.instrument, self.simulation, self.sky
-        size, eor = Size.of(instrument), isinstance(sky, Eor)
+        size, eor = size_of_instrument(instrument), isinstance(sky, Eor)
         sources = 12 * sky.nside**2 if isinstance(sky, Eor) else _sources(self)
         kept = 0.0 if eor else DRAWN_SOURCE * _drawn(sky)
         accuracy = simulation.nodes.for_eor(True) if eor else simulation.nodes.for_foregrounds(True, smooth_sky=True)
@@ -200,7 +199,7 @@ class Simulate(_Simulated, stage="simulate", version=3):
         return {**quality, "stand_ins": component.stand_ins, "warnings": warnings}
 
     def _cost(self) -> Cost:
-        disk = Size.of(self.instrument).samples * COMPLEX128
+        disk = size_of_instrument(self.instrument).samples * COMPLEX128
         return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 4 * disk, disk)
 
 
@@ -221,7 +220,7 @@ def _coarse_pixels(task: _Simulated) -> list[str]:
     if task.diffuse is None:
         return []
     pixel = (4 * math.pi / (12 * task.diffuse.nside**2)) ** 0.5
-    longest = Size.of(task.instrument).longest
+    longest = size_of_instrument(task.instrument).longest
     fringe = SPEED_OF_LIGHT / (task.instrument.channels.band[1] * longest)
     if pixel <= fringe / 2:
         return []

@@ -13,12 +13,10 @@ from calstudy.experiment.assumed import SKY_MODEL, AssumedWorld, assumed_changes
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.products import simulation
-from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
+from calstudy.products.files import SKY_MODEL_ERROR, VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
-
-ERROR = "sky-model.json"
 
 
 @memoize
@@ -145,7 +143,7 @@ class SkyModelError(Task, stage="sky-model-error", version=1):
             "difference_rms_jy": difference,
             "relative_error": difference / true_rms if true_rms else None,
         }
-        write_json(output / ERROR, found)
+        write_json(output / SKY_MODEL_ERROR, found)
         if difference == 0:
             # This product exists only if the experiment asks for an error of the sky model.
             return {**found, "warnings": ["the sky model that the calibrator assumes is equal to the true foregrounds"]}

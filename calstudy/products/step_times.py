@@ -1,24 +1,18 @@
-"""Times of steps and solves of one array, in a separate process: ``python -m calstudy.products.step_times``.
-
-The process has one thread, and its memory is that of this work alone.
-"""
+"""Times of steps and solves of one array: ``python -m calstudy.products.step_times``, started by `run_times`."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
 
-from calstudy.base.errors import InputError
 from calstudy.base.resources import Usage, resident_memory
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
@@ -29,23 +23,8 @@ from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Channels, Layout
+from calstudy.products.run_times import Descent, Samples, StepTimes
 
-THREADS = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-    "TF_NUM_INTRAOP_THREADS",
-    "TF_NUM_INTEROP_THREADS",
-)
-ENVIRONMENT = {
-    **dict.fromkeys(THREADS, "1"),
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
-    "TF_CPP_MIN_LOG_LEVEL": "3",
-    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
-}
-"""One thread, no start-up messages, and huge pages for large temporary arrays where the system has them: the allocation
-of small pages can take longer than the measured work."""
 ROUNDS = 10
 """Number of rounds in which the samples of all solvers are taken, so that other load affects all of them equally."""
 FLOOR_TOLERANCE, FLOOR_STEPS = 1e-5, 200
@@ -127,92 +106,6 @@ class PaperStep:
         prior = tf.square(tf.reduce_sum(f_real * self._weights) - self._target[0])
         prior += tf.square(tf.reduce_sum(f_imaginary * self._weights) - self._target[1])
         return tf.reduce_sum(misfit * self._weights) + prior
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Numbers of samples: steps of the paper's solver, calls of our Adamax, and solves of the default solver.
-
-    A sample of a call is the mean of its `STEPS_PER_CALL` steps. Each solve is complete and cold, with its own noise.
-    """
-
-    steps: int
-    calls: int
-    solves: int
-
-
-@dataclass(frozen=True)
-class StepTimes:
-    """Run time and memory of the solvers for one array.
-
-    Attributes
-    ----------
-    longest
-        Longest baseline, m.
-    vectors
-        Foreground vectors of the longest baseline, to which the paper pads all others.
-    coefficients
-        Foreground vectors of all baselines together.
-    seconds
-        Samples by name: ``paper-step``, ``paper-sum`` (the sum over the basis alone), ``adamax-step``,
-        ``default-step``, ``default-solve``; processor seconds of one core, or elapsed seconds on a GPU.
-    basis_bytes
-        Size of the paper's padded basis.
-    paper_memory
-        Bytes by which the paper's steps raised the memory of the process.
-    """
-
-    antennas: int
-    baselines: int
-    longest: float
-    vectors: int
-    coefficients: int
-    seconds: dict[str, list[float]]
-    basis_bytes: int
-    paper_memory: int
-
-
-@dataclass(frozen=True)
-class Descent:
-    """Losses of the paper's solver on one problem: before the first step and after each, and the minimum (`floor`)."""
-
-    antennas: int
-    floor: float
-    losses: np.ndarray
-
-    def steps_to(self, excess: float) -> int | None:
-        """Return the number of steps until the loss is within this fraction of the minimum, or None if it never is."""
-        reached = np.flatnonzero(self.losses <= (1 + excess) * self.floor)
-        return int(reached[0]) if reached.size else None
-
-
-def time_steps_apart(array: Mapping[str, Any], samples: Samples, device: str) -> StepTimes:
-    """Time the solvers in a separate process; raises InputError with the last line of its output if it fails.
-
-    The array has JSON-able sections `layout`, `channels` and `basis`, and every baseline its own foreground model. The
-    device is ``cpu`` (one core) or ``gpu``.
-    """
-    return StepTimes(**_run_apart({"array": dict(array), "samples": asdict(samples), "device": device}))
-
-
-def descend_apart(array: Mapping[str, Any], max_steps: int) -> Descent:
-    """Run `descend` in a separate process; array and errors as for `time_steps_apart`."""
-    answer = _run_apart({"array": dict(array), "max_steps": max_steps})
-    return Descent(**{**answer, "losses": np.array(answer["losses"])})
-
-
-def _run_apart(request: Mapping[str, Any]) -> dict[str, Any]:
-    result = subprocess.run(
-        [sys.executable, "-m", "calstudy.products.step_times", json.dumps(request)],
-        env={**os.environ, **ENVIRONMENT},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if result.returncode:
-        reason = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
-        raise InputError(f"the measurement of {json.dumps(request)} failed: {reason}")
-    return json.loads(result.stdout.splitlines()[-1])
 
 
 def make_simulation(layout: Layout, channels: Channels) -> Simulation:

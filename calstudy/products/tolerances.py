@@ -52,10 +52,7 @@ class Fault:
 def faults(worlds: Sequence[str]) -> list[Fault]:
     """Return the faults in the labels of worlds, in their order, each in the unit of its first label.
 
-    Raises
-    ------
-    InputError
-        If the units of one fault cannot be converted into each other.
+    Raises InputError if the units of one fault cannot be converted into each other.
     """
     without = [(0.0, world, "") for world in worlds if ":" not in world]
     found: dict[str, list[tuple[float, str, str]]] = {}
@@ -90,8 +87,7 @@ class Tolerance:
 
     Attributes
     ----------
-    severity
-        In the fault's unit; NaN if it is not known.
+    severity : in the fault's unit; NaN if it is not known
     relation
         ``=``; ``<`` if the bias is above the limit at the lowest severity other than zero; ``>`` if it is below it at
         the highest; ``?`` if the noise is too large to tell.

@@ -12,8 +12,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
-from calstudy.instrument.settings import Channels
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Channels, Size
 from calstudy.realdata.selection import Selection, parse_values, select
 
 if TYPE_CHECKING:

@@ -11,10 +11,17 @@ from astropy.time import Time
 from pyuvdata import UVCal, UVData
 
 from calstudy.base.gains import gain_products
-from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, rows_of, to_cube
+from calstudy.base.visibilities import (
+    antenna_pairs,
+    flag_cube,
+    from_cube,
+    positions,
+    rows_of,
+    to_cube,
+    use_bundled_earth_orientation,
+)
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import ForegroundFit, GainFit
-from calstudy.instrument.telescope import use_bundled_earth_orientation
 from calstudy.realdata.noise import radiometer_variance
 
 if TYPE_CHECKING:
@@ -39,17 +46,13 @@ class Quality:
 
     Attributes
     ----------
-    antennas, frequency
-        Names of the antennas with solutions, (Nants,), and channels in Hz, (Nfreqs,).
-    gain_by_channel
-        |g| over the antenna's median, median over integrations, (Nants, Nfreqs).
-    gain_by_antenna
-        Median |g| of each antenna over the median of all antennas, (Nants,).
+    antennas, frequency : names of the antennas with solutions, (Nants,), and channels in Hz, (Nfreqs,)
+    gain_by_channel : |g| over the antenna's median, median over integrations, (Nants, Nfreqs)
+    gain_by_antenna : median |g| of each antenna over the median of all antennas, (Nants,)
     chi2_by_antenna, chi2_by_channel, chi2_by_integration
         Mean of |V - g g* F|^2 / sigma^2 over unflagged samples, (Nants,), (Nfreqs,), (Ntimes,). Parameters of the fit
         are not counted, so that it is slightly below one for noise.
-    noise
-        The source of sigma, in words.
+    noise : the source of sigma, in words
     """
 
     polarization: str
@@ -135,8 +138,7 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     """
     gains, pairs = result.gains, antenna_pairs(result.model)
     numbers = np.unique(pairs)
-    order = np.argsort(gains.ant_array)
-    rows = order[np.searchsorted(gains.ant_array, numbers, sorter=order)]
+    rows = positions(gains.ant_array, numbers)
     flags = gains.flag_array[rows, :, :, polarization]
     values = np.where(flags, np.nan, gains.gain_array[rows, :, :, polarization])
     by_channel, by_antenna = _gain_ratios(np.abs(values))

@@ -22,8 +22,8 @@ from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gains import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.calibrate.records import PARALLEL_HANDS
-from calstudy.instrument.array_layouts.csv import CsvLayout
 from calstudy.instrument.layouts import make_layout
+from calstudy.instrument.settings import LAYOUTS
 from calstudy.realdata.selection import Selection, select
 
 logger = logging.getLogger(__name__)
@@ -42,10 +42,7 @@ UNREADABLE = (OSError, ValueError, KeyError, IndexError, TypeError, AttributeErr
 def read_visibilities(paths: Sequence[Path], read_data: bool = True) -> UVData:
     """Read one data set from a file or folder, or from several that belong together; or its metadata alone.
 
-    Raises
-    ------
-    InputError
-        If a path does not exist, pyuvdata cannot read it, or its antennas have no positions.
+    Raises InputError if a path does not exist, pyuvdata cannot read it, or its antennas have no positions.
     """
     _require_readable(paths)
     names = ", ".join(map(str, paths))
@@ -124,6 +121,9 @@ def _first_sentence(error: Exception) -> str:
 def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:
     """Select, unphase, order and fill a data set; the given one is not changed.
 
+    Raises InputError if nothing is left, the polarizations are not of feeds, or less than half of the samples are at
+    common times.
+
     Returns
     -------
     data
@@ -131,11 +131,6 @@ def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, li
         missing or not finite are flagged.
     notes
         One sentence for each change.
-
-    Raises
-    ------
-    InputError
-        If nothing is left, the polarizations are not of feeds, or less than half of the samples are at common times.
     """
     notes: list[str] = []
     data = select(data, replace(selection, times=None)).copy()
@@ -261,7 +256,7 @@ def place_antennas(data: UVData, path: Path) -> str:
     if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
         raise InputError("observed.positions: the data are phased to a source, by the positions that they have")
     try:
-        layout = make_layout(CsvLayout(kind="csv", path=path))
+        layout = make_layout(LAYOUTS.make({"kind": "csv", "path": path}))
     except InputError as error:
         raise InputError(str(error).replace("instrument.layout.path", "observed.positions")) from None
     telescope = data.telescope

@@ -31,18 +31,12 @@ class Selection:
 
     Attributes
     ----------
-    antennas
-        Antenna numbers or names.
-    lengths
-        Baseline lengths in m.
-    times
-        Indices of integrations, counted from zero.
-    frequencies
-        Channel centres in Hz.
-    polarizations
-        Names such as ``xx`` or ``ee``.
-    autos
-        If true, a selection of lengths keeps the autocorrelations of the antennas that are left.
+    antennas : antenna numbers or names
+    lengths : baseline lengths in m
+    times : indices of integrations, counted from zero
+    frequencies : channel centres in Hz
+    polarizations : names such as ``xx`` or ``ee``
+    autos : if true, a selection of lengths keeps the autocorrelations of the antennas that are left
     """
 
     antennas: tuple[str, ...] | None = None
@@ -95,10 +89,7 @@ def _end(key: str, text: str) -> float | int | None:
 def select(data: UVData, selection: Selection) -> UVData:
     """Return the selected part of a data set; the data are not changed.
 
-    Raises
-    ------
-    InputError
-        If an antenna or polarization is not in the data, or nothing is left.
+    Raises InputError if an antenna or polarization is not in the data, or nothing is left.
     """
     chosen: dict[str, Any] = {}
     if selection.antennas is not None:

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.products.score import SUMMARY
-from calstudy.results.folder import RunFolder
+from calstudy.products.files import SCORE
+from calstudy.results.reader import RunFolder
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.measured import marked, why_not_measured
-from calstudy.verdicts.sentences import counts, outcomes_of_sentences
+from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
 BAND = (0.2, 0.5)
 """Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""
@@ -92,7 +92,7 @@ def read_signal(run: RunFolder) -> Signal | None:
     except InputError:
         return None
     band = int(np.argmin(np.abs(score.bin_edges[:-1] - BAND[0])))
-    bands = run.tables.summary["bands"] if run.tables.has(SUMMARY) else ()
+    bands = run.tables.summary["bands"] if run.tables.has(SCORE) else ()
     linear = next((entry.get("linear_transfer") for entry in bands if entry["k"][0] == score.bin_edges[band]), None)
     signal = Signal(
         float(score.transfer[band]),

@@ -3,20 +3,320 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
-from dataclasses import dataclass
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
 import yaml
 
 from calstudy.base.errors import InputError
 from calstudy.base.paths import leaves
 from calstudy.base.table import Table
-from calstudy.report.contents import CLAIMS_TITLE, Contents, Picture, read_contents
-from calstudy.results.folder import RunFolder
+from calstudy.report.headline import Number, read_headline, read_signal
+from calstudy.results.reader import EXPERIMENT, MANIFEST, RunFolder
+from calstudy.run.progress import duration
+from calstudy.verdicts.standing import answers, standing_table
+from calstudy.verdicts.tables import CLAIMS_JSON, tally, verdict_table
+
+# Series in the order of the legend: field, label, and name of the colour in page.css.
+SERIES = {
+    "eor": ("EoR, P^S", "grey"),
+    "uncorrupted": ("perfect gains, P^(S+F+N)", "black"),
+    "uncalibrated": ("uncalibrated, P^V", "red"),
+    "residual": ("residual, P^R", "orange"),
+    "residual_without_eor": ("residual without EoR", "cyan"),
+    "noise": ("noise, P^N", "magenta"),
+    "outside": ("outside the wedge", "orange"),
+    "inside": ("inside the wedge", "cyan"),
+}
+POWER = "P [mK² h⁻³ Mpc³]"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Curves over k, or maps over k_perp and k_parallel.
+
+    `data` is the input of the page's script: `kind`, labels and series, ready for JSON.
+    """
+
+    title: str
+    data: Mapping[str, Any]
+
+
+def read_charts(path: Path) -> list[Chart]:
+    """Return the charts of the arrays of a figure (``NAME.npz`` from `calstudy.plotting.save`); none for other arrays.
+
+    An entry ``GROUP.FIELD`` is a field of a spectrum: `power` over `k`, a transfer function over `k`, or either over
+    `k_perp` and `k_parallel`.
+    """
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    with np.load(path, allow_pickle=False) as arrays:
+        for name in arrays.files:
+            group, _, field = name.rpartition(".")
+            groups.setdefault(group, {})[field] = arrays[name]
+    return [chart for chart in (*_spectra(groups), _transfer(groups), _maps(groups)) if chart is not None]
+
+
+def _spectra(groups: Mapping[str, Mapping[str, np.ndarray]]) -> list[Chart]:
+    """Return a chart for each column of spherical power spectra."""
+    columns: dict[str, dict[str, Any]] = {}
+    for name, fields in groups.items():
+        column, _, series = name.rpartition(".")
+        if {"k", "power", "noise_error", "sample_error"} <= fields.keys():
+            error = np.hypot(fields["noise_error"], fields["sample_error"])
+            columns.setdefault(column, {})[series] = (fields["k"], fields["power"].real, error)
+    charts = []
+    for column, found in columns.items():
+        title = str(groups.get(column, {}).get("title", np.array("")))
+        charts.append(_curves(f"Power spectra, {title}" if title else "Power spectra", POWER, True, found))
+    return charts
+
+
+def _transfer(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
+    """Return the chart of transfer functions, free of the flux scale."""
+    found = {
+        name: (fields["k"], fields["scale_free_transfer"], fields["scale_free_transfer_error"])
+        for name, fields in groups.items()
+        if {"k", "scale_free_transfer", "scale_free_transfer_error"} <= fields.keys()
+    }
+    return _curves("T, free of the flux scale", "T", False, found) if found else None
+
+
+def _curves(title: str, label: str, logarithmic: bool, found: Mapping[str, tuple[np.ndarray, ...]]) -> Chart:
+    ordered = [name for name in SERIES if name in found] + [name for name in found if name not in SERIES]
+    series = []
+    for name in ordered:
+        k, value, error = found[name]
+        kept = np.isfinite(value)
+        text, colour = SERIES.get(name, (name.replace("_", " "), "grey"))
+        rounded = {key: _rounded(array[kept]) for key, array in (("x", k), ("y", value), ("error", error))}
+        series.append({"label": text, "colour": colour, **rounded})
+    data = {"kind": "curves", "x": "k [h/Mpc]", "y": label, "logarithmic": logarithmic, "series": series}
+    return Chart(title, data)
+
+
+def _maps(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
+    """Return the chart of cylindrical spectra, or of a cylindrical transfer function."""
+    series: list[dict[str, Any]] = []
+    logarithmic, label = True, POWER
+    for name in [*SERIES, *(name for name in groups if name not in SERIES)]:
+        fields = groups.get(name, {})
+        quantity = "power" if "power" in fields else "transfer"
+        if not {"k_perp", "k_parallel", "horizon_delay", "delay", quantity} <= fields.keys():
+            continue
+        values = np.asarray(fields[quantity].real, "<f4")
+        if quantity == "transfer":
+            logarithmic, label = False, "T"
+        axes = {key: _rounded(fields[key]) for key in ("k_perp", "k_parallel", "baseline_length")}
+        axes["horizon"] = _rounded(fields["horizon_delay"] / fields["delay"][-1])
+        encoded = base64.b64encode(values.tobytes()).decode("ascii")
+        series.append({"label": SERIES.get(name, (name,))[0], "values": encoded, **axes})
+    if not series:
+        return None
+    kind = {"kind": "maps", "value": label, "logarithmic": logarithmic, "series": series}
+    return Chart("Cylindrical power spectra" if logarithmic else "Cylindrical T", kind)
+
+
+def _rounded(values: np.ndarray) -> list[float | None]:
+    """Return numbers with five digits, None where they are not finite."""
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in np.asarray(values, float)]
+
+
+CLAIMS_TITLE = "Claims of the paper"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the report: the png, its other files relative to the run folder, and charts of its arrays."""
+
+    name: str
+    caption: str
+    path: Path
+    files: Sequence[str] = ()
+    charts: Sequence[Chart] = ()
+
+
+@dataclass(frozen=True)
+class Contents:
+    """All contents of a report.
+
+    Facts are short statements by name, such as the time, the machine and versions. Answers say which calibrators of a
+    comparison pass. Pictures and tables are in the order of the page, below the headline. Files, tables and records,
+    are relative to the run folder. Parts are the run folders of which this one consists: name and relative path of
+    their reports. The experiment is the resolved file, or empty.
+    """
+
+    title: str
+    description: str
+    setup: str
+    facts: Mapping[str, str]
+    stand_ins: Sequence[str]
+    warnings: Sequence[str]
+    pictures: Sequence[Picture]
+    tables: Sequence[Table]
+    headline: Sequence[Number] = ()
+    answers: Sequence[str] = ()
+    files: Sequence[str] = ()
+    parts: Sequence[tuple[str, str]] = field(default=())
+    experiment: str = ""
+
+
+def read_contents(run: RunFolder) -> Contents:
+    """Read the folder of a finished run of any study; raises InputError for others."""
+    manifest = run.manifest
+    experiment = run.path / EXPERIMENT
+    text = experiment.read_text(encoding="utf-8") if experiment.is_file() else ""
+    sky_model = f" Sky model: {manifest['sky_model']}." if "sky_model" in manifest else ""
+    found = run.standings()
+    tables = [
+        standing_table(found) if found else None,
+        _claims_table(run),
+        *run.shown,
+        _convergence(run.products, sky_model),
+        _simulation(run.products),
+        _stages(run.products),
+    ]
+    signal = read_signal(run)
+    excess = [] if signal is None or signal.excess is None else [signal.excess]
+    return Contents(
+        title=run.name,
+        description=manifest.get("description") or (run.content.get("description", "") if text else ""),
+        setup=manifest.get("setup", ""),
+        facts=_facts(manifest),
+        stand_ins=manifest.get("stand_ins", []),
+        warnings=[*excess, *(f"{label}: {text}" for label, text in _warnings(run.products))],
+        pictures=_pictures(run),
+        tables=[table for table in tables if table is not None],
+        headline=read_headline(run),
+        answers=answers(found),
+        files=_files(run.path),
+        parts=_parts(run),
+        experiment=text,
+    )
+
+
+def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
+    facts = {"finished": manifest.get("finished"), "commit": manifest.get("git_commit")}
+    facts["sky model of the calibrator"] = manifest.get("sky_model")
+    machine = manifest.get("machine", {})
+    if machine:
+        facts["machine"] = f"{machine['cores']} cores, {machine['memory_gb']} GB, {machine['system']}"
+    seeds = manifest.get("seeds", {})
+    facts["seeds"] = ", ".join(f"{name} {value}" for name, value in seeds.items())
+    versions = manifest.get("versions", {})
+    facts["versions"] = ", ".join(f"{name} {value}" for name, value in versions.items() if value)
+    return {name: str(value) for name, value in facts.items() if value}
+
+
+def _warnings(products: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    return [
+        (f"{item['stage']} ({item['label']})", text)
+        for item in products
+        for text in item.get("notes", {}).get("warnings", [])
+    ]
+
+
+def _pictures(run: RunFolder) -> list[Picture]:
+    """Return the pictures of the manifest in its order and with its captions, then others by name."""
+    found = {path.stem: path for path in sorted((run.path / "figures").glob("*.png"))}
+    drawn = [item for item in run.products if item["stage"] == "figure"]
+    captions = {item["label"]: item.get("notes", {}).get("caption", "") for item in drawn}
+    captions = run.manifest.get("captions", captions)
+    order = [name for name in captions if name in found]
+    order += [name for name in found if name not in captions]
+    return [_picture(name, captions.get(name, ""), found[name]) for name in order]
+
+
+def _picture(name: str, caption: str, path: Path) -> Picture:
+    others = [path.with_suffix(suffix) for suffix in (".pdf", ".npz")]
+    files = [f"figures/{other.name}" for other in others if other.is_file()]
+    return Picture(name, caption, path, files, read_charts(others[1]) if others[1].is_file() else ())
+
+
+def _files(folder: Path) -> list[str]:
+    tables = sorted(path for path in (folder / "tables").glob("*") if path.is_file())
+    records = [folder / name for name in ("claims.md", CLAIMS_JSON, EXPERIMENT, MANIFEST, "run.log")]
+    return [str(path.relative_to(folder)) for path in (*records, *tables) if path.is_file()]
+
+
+def _parts(run: RunFolder) -> list[tuple[str, str]]:
+    # Members may come from references, which have no page.
+    pages = {name: part.path.resolve() / "report.html" for name, part in run.parts.items()}
+    return [(name, os.path.relpath(page, run.path.resolve())) for name, page in pages.items() if page.is_file()]
+
+
+def _claims_table(run: RunFolder) -> Table | None:
+    """Return the verdicts on the papers' statements, or a sentence without a role in any paper; None without papers."""
+    if not run.has_claims:
+        return None
+    claims = run.claims
+    evaluated = [claim for claim in claims if claim.measured is not None]
+    if not evaluated:
+        reasons = [text for item in run.products for text in item.get("notes", {}).get("without_role", [])]
+        return Table((), (), CLAIMS_TITLE, " ".join(reasons)) if reasons else None
+    others = len(claims) - len(evaluated)
+    lacking = f" {others} further claims were not evaluated; claims.md says why." if others else ""
+    return verdict_table(evaluated, CLAIMS_TITLE, f"{tally(claims)}.{lacking}")
+
+
+def _convergence(products: Sequence[Mapping[str, Any]], sky_model: str) -> Table | None:
+    found = [item for item in products if item["stage"] == "calibrate"]
+    rows = [
+        (
+            item["label"],
+            ", ".join(f"{count} {status}" for status, count in item["notes"]["by_status"].items()),
+            f"{item['notes']['median_steps']:g}" if "median_steps" in item["notes"] else "",
+            f"{item['notes']['median_seconds_per_solve']:.2f} s",
+        )
+        for item in found
+    ]
+    columns = ("calibration of", "solves", "median steps", "median time per solve")
+    return Table(columns, rows, "Solver convergence", sky_model.strip()) if rows else None
+
+
+def _simulation(products: Sequence[Mapping[str, Any]]) -> Table | None:
+    rows = []
+    for item in products:
+        if item["stage"] == "simulate":
+            check = item["notes"].get("interpolation")
+            floors = item["notes"].get("delay_floor", {})
+            rows.append(
+                (
+                    item["label"],
+                    f"{check['max_error']:.1e}" if check else "not interpolated",
+                    ", ".join(f"{floor['worst_db']} dB ({taper})" for taper, floor in floors.items()),
+                )
+            )
+    columns = ("component", "largest interpolation error", "delay floor beyond the horizon")
+    note = "Errors relative to the rms; the floor is that of the worst baseline."
+    return Table(columns, rows, "Accuracy of the simulation", note) if rows else None
+
+
+def _stages(products: Sequence[Mapping[str, Any]]) -> Table | None:
+    stages: dict[str, list[Mapping[str, Any]]] = {}
+    for item in products:
+        if "cpu_seconds" in item:
+            stages.setdefault(item["stage"], []).append(item)
+    rows = [
+        (
+            stage,
+            str(len(items)),
+            str(sum(item["made_by_this_run"] for item in items)),
+            duration(sum(item["seconds"] for item in items)),
+            duration(sum(item["cpu_seconds"] for item in items)),
+            f"{max(item['peak_memory_bytes'] for item in items) / 1e9:.2f} GB",
+        )
+        for stage, items in stages.items()
+    ]
+    columns = ("stage", "products", "made by this run", "time", "cpu time", "peak memory of the process")
+    note = "Time and memory when each product was made, by this run or an earlier one."
+    return Table(columns, rows, "Stages", note) if rows else None
+
 
 REPORT = "report.html"
 ALWAYS_DIFFERENT = ("name", "description", "outputs")

@@ -25,9 +25,8 @@ from typing import Any, TypeGuard
 
 from pydantic import BaseModel
 
-from calstudy.base.downloads import default_directory
 from calstudy.base.files import digest_json, replacing
-from calstudy.base.package_files import PackageFile
+from calstudy.base.package_files import PackageFile, default_directory
 from calstudy.base.plugins import FILE_MODULE, parse
 from calstudy.run.task import Task
 

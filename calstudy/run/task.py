@@ -66,10 +66,8 @@ class Task(Declared, ABC):
 
     Attributes
     ----------
-    label
-        Description of the product in a few words.
-    temporary
-        Whether the product may be removed once the products that need it are made.
+    label : description of the product in a few words
+    temporary : whether the product may be removed once the products that need it are made
     """
 
     stage: ClassVar[Stage]

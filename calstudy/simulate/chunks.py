@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.visibilities import subset_template
 from calstudy.instrument.antenna_beams import make_beams
 from calstudy.instrument.interface import model_of
-from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.instrument.telescope import make_template
 from calstudy.power.cosmology import make_cosmology
 from calstudy.simulate.interface import BeamSource, Engine, simulate_with
 from calstudy.simulate.nodes import Accuracy, Axis, frequency_axis, frequency_blocks, integration_times, time_axis
@@ -171,12 +172,9 @@ def check_interpolation(
         engine's `simulate` with the sky and beam of the simulation.
     cube : (Ntimes, Nbls, Nfreqs, Npols)
         Interpolated visibilities at all channels.
-    chunk
-        Any chunk of the simulation, for its nodes.
-    channels
-        Channels to choose from: those of the sky, if it is given channel by channel.
-    count
-        Number of integrations, and of channels, spread over the observation; each is as far from nodes as possible.
+    chunk : any chunk of the simulation, for its nodes
+    channels : channels to choose from: those of the sky, if it is given channel by channel
+    count : number of integrations, and of channels, spread over the observation; each is as far from nodes as possible
     """
     times, frequencies = integration_times(template), template.freq_array
     nodes = time_axis(template, chunk.accuracy).nodes

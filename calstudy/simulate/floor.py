@@ -65,6 +65,12 @@ def delay_profile(foregrounds: UVData, taper: Taper) -> tuple[np.ndarray, np.nda
     return np.fft.fftfreq(cube.shape[2], width), np.mean(np.abs(spectrum) ** 2, axis=(0, 3))
 
 
+def folded_spectrum(delays: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return delays >= 0, (N // 2,), and the mean power of both signs of each, from the order of `numpy.fft`."""
+    half = delays.size // 2
+    return delays[:half], np.concatenate([power[:1], (power[1:half] + power[:-half:-1]) / 2])
+
+
 def floor_buffers(foregrounds: UVData) -> dict[Taper, float]:
     """Return the delay beyond the horizon at which the main lobe of each taper ends, at least 100 ns, in s.
 
@@ -92,23 +98,18 @@ def delay_floor(
 ) -> DelayFloor:
     """Measure the delay floor of simulated foregrounds.
 
+    Raises ValueError if no delay is beyond horizon + buffer for the longest baseline.
+
     Parameters
     ----------
-    foregrounds
-        Visibilities of foregrounds alone, with equally spaced channels.
+    foregrounds : visibilities of foregrounds alone, with equally spaced channels
     buffer
         Delay beyond the horizon from which the floor is measured, s. The main lobe of the taper extends to 4 /
         bandwidth (130 ns for 30.72 MHz) for Blackman-Harris, and to 8 / bandwidth (250 ns) for Dolph-Chebyshev.
     taper
         `blackman-harris` has sidelobes of -46 dB here and gives the floor of a power spectrum; `dolph-chebyshev`
         (-100 dB) gives the floor of the simulation below these sidelobes.
-    peaks
-        Visibilities that define the peaks, of the same shape; by default `foregrounds`.
-
-    Raises
-    ------
-    ValueError
-        If no delay is beyond horizon + buffer for the longest baseline.
+    peaks : visibilities that define the peaks, of the same shape; by default `foregrounds`
     """
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
     delays, power = delay_profile(foregrounds, taper)

@@ -108,7 +108,7 @@ class Engine(Plugin, ABC):
         By default sources that stay above the horizon are simulated at time nodes and interpolated. Sources that rise
         or set are discontinuous in time, and are simulated at every integration.
         """
-        from calstudy.instrument.telescope import subset_template
+        from calstudy.base.visibilities import subset_template
         from calstudy.simulate.sources import SourceTracks, split_by_horizon
 
         axis, integrations = time_axis(template, accuracy), integration_times(template)

@@ -40,10 +40,8 @@ class Accuracy:
     tolerance
         Interpolation error of the visibilities, relative to their rms, if all fringes were as fast as the fastest one;
         with 0 nothing is interpolated.
-    beam_extent
-        Length in m added to each baseline for the structure of the beam in fringe rate and delay.
-    smooth_beam, smooth_sky
-        Whether the beam, and the fluxes of the sky, vary smoothly with frequency.
+    beam_extent : length in m added to each baseline for the structure of the beam in fringe rate and delay
+    smooth_beam, smooth_sky : whether the beam, and the fluxes of the sky, vary smoothly with frequency
     """
 
     tolerance: float

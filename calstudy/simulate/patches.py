@@ -101,12 +101,9 @@ class Patches:
     ----------
     components : (N,) int
         The components in the order of the patches.
-    tracks
-        Tracks of these components, in this order.
-    members
-        Slice of the components of each patch.
-    centres
-        Tracks of the mean directions of the patches, which are fixed points of the sky, as sources are.
+    tracks : tracks of these components, in this order
+    members : slice of the components of each patch
+    centres : tracks of the mean directions of the patches, which are fixed points of the sky, as sources are
     radii : (Npatches,) float
         Largest distance of a source from the centre of its patch, rad.
     """

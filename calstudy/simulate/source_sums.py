@@ -65,12 +65,10 @@ class PairSums:
         First and second antenna of each baseline.
     frequencies : (Nfreqs,) float
         Frequencies in Hz, ascending.
-    patterns
-        Distinct beams at these frequencies.
+    patterns : distinct beams at these frequencies
     index : (Nants,) int
         Index of the beam of each antenna.
-    dtype
-        Precision of the products, float64 or float32.
+    dtype : precision of the products, float64 or float32
     """
 
     delays: np.ndarray

@@ -15,7 +15,7 @@ from pyradiosky import SkyModel
 from pyradiosky.utils import jy_to_ksr
 
 from calstudy.base.errors import InputError
-from calstudy.instrument.telescope import use_bundled_earth_orientation
+from calstudy.base.visibilities import use_bundled_earth_orientation
 from calstudy.simulate.nodes import (
     EARTH_ROTATION_RATE,
     SECONDS_PER_DAY,
@@ -34,28 +34,22 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | sl
     """Return Stokes I of a sky in Jy, with the same conventions as pyuvsim.
 
     HEALPix pixels count as points that hold the pixel's integral, and brightness temperatures are converted at the
-    reference frequency of a spectral-index or flat component, or else at each frequency (Rayleigh-Jeans).
+    reference frequency of a spectral-index or flat component, or else at each frequency (Rayleigh-Jeans). Raises
+    InputError if a spectral index is not a number, a `full` sky lacks one of the frequencies, or a `subband` sky does
+    not span them.
 
     Parameters
     ----------
-    sky
-        Points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type.
+    sky : points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type
     frequencies : (Nfreqs,) float
         Frequencies in Hz.
-    components
-        Indices of the components, all by default.
+    components : indices of the components, all by default
 
     Returns
     -------
     (Nfreqs, Ncomponents) float
         Flux densities in Jy. If they are the same at all frequencies, a read-only view that does not repeat them in
         memory.
-
-    Raises
-    ------
-    InputError
-        If a spectral index is not a number, a `full` sky lacks one of the frequencies, or a `subband` sky does not
-        span them.
     """
     if sky.spectral_type == "subband":
         sky = sky.at_frequencies(frequencies * units.Hz, inplace=False, run_check=False)

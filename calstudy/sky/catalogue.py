@@ -14,9 +14,9 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from pyradiosky import SkyModel
 
-from calstudy.base.downloads import default_directory, download
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
+from calstudy.base.package_files import default_directory, download
 from calstudy.sky.counts import FREQUENCY, SPECTRAL_INDEX
 from calstudy.sky.settings import GLEAM_FILE, CatalogueErrors, CsvColumns, PointSources
 

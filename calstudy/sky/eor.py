@@ -39,8 +39,7 @@ class EorField:
     ----------
     frequencies : (Nfreqs,) float
         All channel centres of the study in Hz, at least two, increasing and equally spaced; ValueError otherwise.
-    cosmology
-        Converts P(k) to brightness; the power spectrum estimator must use the same cosmology.
+    cosmology : converts P(k) to brightness; the power spectrum estimator must use the same cosmology
     """
 
     def __init__(self, settings: Eor, frequencies: np.ndarray, cosmology: FLRW = Planck15) -> None:

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from calstudy.base.downloads import default_directory
 from calstudy.base.errors import InputError
+from calstudy.base.package_files import default_directory
 from calstudy.base.plugins import load_function
 from calstudy.base.schema import Section, choice, fault, folder_of_files
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature

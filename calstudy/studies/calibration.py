@@ -110,6 +110,7 @@ class DataStudy(Study):
 
     def __init__(self, file: Any, data: Parts) -> None:
         self.file, self.data = file, data
+        self.graph = MeasuredGraph(file, data)
 
     @cached_property
     def frames(self) -> list[Frame]:
@@ -153,10 +154,6 @@ class CalibrationFile(DataFile):
 
 class DataCalibration(DataStudy):
     """The calibration of all data together, in their own unit."""
-
-    def __init__(self, file: CalibrationFile, data: Parts) -> None:
-        super().__init__(file, data)
-        self.graph = MeasuredGraph(file, data)
 
     @classmethod
     def load(cls, file: StudyFile) -> DataCalibration:

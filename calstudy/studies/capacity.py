@@ -13,7 +13,7 @@ from calstudy.base.plugins import guarded
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
 from calstudy.calibrate.interface import Calibrator
 from calstudy.experiment.model import Experiment, Folders
-from calstudy.instrument.size import Size
+from calstudy.instrument.layouts import size_of_instrument
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.simulation import SimulateChunk
 from calstudy.run.execution import Budget
@@ -47,16 +47,11 @@ File = TypeVar("File", bound=Contents)
 def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -> tuple[File, int]:
     """Choose the number of workers, and cut simulations into enough chunks for them, within the memory.
 
-    The number of chunks of a simulation changes its visibilities by less than the tolerance of their interpolation,
-    and does not change their key in the store. The result is the file, perhaps with more `simulation.chunks`
-    and a calibrator that needs less memory, and the number of workers that fit into the memory, or the requested
-    number if no memory was given.
-
-    Raises
-    ------
-    InputError
-        If a single task is estimated to need more memory than there is, or `max_memory` is not an amount of memory;
-        before any work starts.
+    The number of chunks of a simulation changes its visibilities by less than the tolerance of their interpolation, and
+    does not change their key in the store. The result is the file, perhaps with more `simulation.chunks` and a
+    calibrator that needs less memory, and the number of workers that fit into the memory, or the requested number if no
+    memory was given. Raises InputError if a single task is estimated to need more memory than there is, or `max_memory`
+    is not an amount of memory; before any work starts.
     """
     workers, scheduler = budget.workers, budget.scheduler
     _require_sane(budget)
@@ -76,7 +71,7 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
     if budget.scheduler is not None:
         return
     memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    samples = Size.of(experiment.instrument).samples
+    samples = size_of_instrument(experiment.instrument).samples
     need = samples * COMPLEX128
     if need > ABSURD * memory:
         raise InputError(

@@ -1,38 +1,38 @@
-"""Export: the data and assumptions of an experiment in files for other programs, without the truth."""
+"""Export: the data and assumptions of an experiment for other programs, without the truth, and blind challenges."""
 
 from __future__ import annotations
 
+import os
+import secrets
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import yaml
 from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
-from calstudy.base.files import digest_json
+from calstudy.base.files import sha256
 from calstudy.base.gains import CASACORE
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
-from calstudy.products import corruption, sky_model
-from calstudy.products.corruption import LEVELS, PARITIES
+from calstudy.experiment.model import Experiment
+from calstudy.products.corruption import LEVELS
 from calstudy.products.files import DATA, VISIBILITIES, read_json, read_visibilities, write_visibilities
-from calstudy.products.graph import Graph
 from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Product, Store
-from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import log_to, write
-from calstudy.studies.kinds.comparison import Comparison
+from calstudy.studies.kinds.comparison import Comparison, WorldData
 from calstudy.studies.study import make
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
+
 
 FORMATS = ("uvh5", "uvfits", "ms")
 README, LOG = "README.md", "export.log"
@@ -80,68 +80,18 @@ other is not calibration.
 """
 
 
-@dataclass(frozen=True)
-class Contents:
-    """The tasks of the exported products of one experiment, which calibrates data with the EoR and without.
-
-    Data sets are in the order of their digests, which does not reveal their content. The sky model is None if the
-    calibrator has none, and so are the levels without noise; the salt of a blind challenge may be empty.
-    """
-
-    experiment: Experiment
-    data: tuple[Task, ...]
-    sky_model: Task | None
-    levels: Task | None
-    salt: str = ""
-
-    @classmethod
-    def of(cls, experiment: Experiment, salt: str = "") -> Contents:
-        """Return the exported products of an experiment."""
-        graph = Graph(experiment)
-        variants = [experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS[:2]]
-        data = {
-            task.key: task
-            for task in (corruption.data(graph, variant, parity) for variant in variants for parity in PARITIES)
-        }
-        noisy = any("noise" in variant.components for variant in variants)
-        return cls(
-            experiment,
-            tuple(data[key] for key in sorted(data, key=lambda key: salted(key, salt))),
-            sky_model.sky_model(graph),
-            corruption.levels(graph) if noisy else None,
-            salt,
-        )
-
-    @property
-    def digest(self) -> str:
-        """Digest of all data sets and the sky model."""
-        whole = digest_json([*sorted(task.key for task in self.data), self.sky_model and self.sky_model.key])
-        return salted(whole, self.salt)
-
-    @property
-    def tasks(self) -> list[Task]:
-        """All tasks."""
-        return [*self.data, *(task for task in (self.sky_model, self.levels) if task is not None)]
-
-
 def export(
     worlds: Comparison, folder: Path, file_format: str, overwrite: bool, budget: Budget, console: Console
 ) -> list[Path]:
     """Write the data of every world, make products that are missing in the store, and return the folders.
 
+    Raises InputError if files would be replaced without `overwrite`, or the data cannot be made or written.
+
     Parameters
     ----------
-    worlds
-        From `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`.
-    folder
-        That of a single world; several worlds have subfolders ``world-1`` and so on.
-    file_format
-        One of `FORMATS`.
-
-    Raises
-    ------
-    InputError
-        If files would be replaced without `overwrite`, or the data cannot be made or written.
+    worlds : from `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`
+    folder : that of a single world; several worlds have subfolders ``world-1`` and so on
+    file_format : one of `FORMATS`
     """
     if file_format not in FORMATS:
         raise InputError(f"--format {file_format}: not a format of visibilities (allowed: {', '.join(FORMATS)})")
@@ -150,8 +100,8 @@ def export(
     several = len(worlds.cases) > 1
     folders = [folder / f"world-{place + 1}" if several else folder for place in range(len(worlds.cases))]
     _require_free(folders, overwrite)
-    fits = [fit(case.experiment, budget, lambda wanted: Contents.of(wanted).tasks) for case in worlds.cases]
-    contents = [Contents.of(experiment, worlds.file.salt) for experiment, _ in fits]
+    fits = [fit(case.experiment, budget, lambda wanted: WorldData.of(wanted).tasks) for case in worlds.cases]
+    contents = [WorldData.of(experiment, worlds.file.salt) for experiment, _ in fits]
     runs = worlds.outputs.runs.expanduser()
     runs.mkdir(parents=True, exist_ok=True)
     with log_to(runs / LOG):
@@ -172,7 +122,7 @@ def _require_free(folders: Sequence[Path], overwrite: bool) -> None:
             raise InputError(f"--output {folder}: holds files already; use --overwrite or another folder")
 
 
-def _write_world(content: Contents, products: Mapping[str, Product], folder: Path, file_format: str) -> None:
+def _write_world(content: WorldData, products: Mapping[str, Product], folder: Path, file_format: str) -> None:
     from calstudy.instrument.telescope import make_template
 
     template = make_template(assumed_world(content.experiment).instrument, as_built=True)
@@ -253,3 +203,57 @@ def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
         if manifest.noise is None
         else f"The standard deviation of their complex noise, before any gains, is {manifest.noise:.6g} Jy.",
     )
+
+
+SEEDS = ("seed", "seeds", "seeds_without_eor")
+DRAWN = ("sky.foregrounds", "sky.eor", "sky.diffuse", "corruption.noise")
+"""Blocks that always get new seeds; of others, those that differ from their defaults."""
+BITS = 128
+
+
+def write_recipe(worlds: Comparison, path: Path) -> str:
+    """Write a comparison with secret seeds and a secret salt, for its owner alone; return the SHA-256 of the file.
+
+    Data with the EoR and without have separate noise. Only the seeds of the comparison are replaced; `export` and
+    `score` accept the new YAML file in its place. Raises InputError if the file exists already, or cannot be written.
+    """
+    experiments = {case.world: case.experiment for case in worlds.cases}
+    drawn = {
+        world: {**worlds.resolved["worlds"].get(world, {}), **_drawn(experiment)}
+        for world, experiment in experiments.items()
+    }
+    recipe = {**worlds.resolved, "worlds": drawn, "salt": secrets.token_hex(BITS // 8)}
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+            yaml.safe_dump(recipe, file, sort_keys=False, allow_unicode=True, width=100)
+    except FileExistsError:
+        raise InputError(
+            f"--blind {path}: is there already; export it as it is with 'calstudy export {path}', or use another name"
+        ) from None
+    except OSError as error:
+        raise InputError(f"--blind {path}: cannot be written ({error.strerror})") from None
+    return sha256(path)
+
+
+def _drawn(experiment: Experiment) -> dict[str, Any]:
+    """Return new seeds of all random draws of an experiment, by dotted path."""
+    full = experiment.model_dump(mode="json", include={"instrument", "sky", "corruption"})
+    other = experiment.model_dump(mode="json", include=set(full), exclude_defaults=True)
+    changed = {block for block, _ in _walk(other, "")}
+    found: dict[str, Any] = {}
+    for block, content in _walk(full, ""):
+        if block in DRAWN or block in changed:
+            for name in SEEDS:
+                if name in content:
+                    two = [secrets.randbits(BITS) for _ in range(2)]
+                    found[f"{block}.{name}"] = two[0] if name == "seed" else two
+    return found
+
+
+def _walk(value: Any, path: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield all blocks in nested settings, with their dotted paths."""
+    if isinstance(value, Mapping):
+        yield path, value
+    pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in pairs:
+        yield from _walk(item, f"{path}.{key}" if path else str(key))

@@ -15,7 +15,7 @@ from typing import Any
 from uuid import uuid4
 
 from calstudy.base.errors import InputError, exit_status
-from calstudy.results.folder import EXPERIMENT, MANIFEST
+from calstudy.results.reader import EXPERIMENT, MANIFEST
 from calstudy.run.provenance import git_commit, machine, of_other_code, other_code, package_versions
 from calstudy.run.store import Product
 from calstudy.run.task import Task, unique

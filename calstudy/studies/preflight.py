@@ -13,9 +13,8 @@ from calstudy.corrupt.interface import require_usable
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.interface import model_of
-from calstudy.instrument.layouts import Layout, make_array, make_layout
+from calstudy.instrument.layouts import Layout, make_array, make_layout, size_of_instrument
 from calstudy.instrument.settings import InstrumentSettings, nominal_beams
-from calstudy.instrument.size import Size
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.products.sky_model import sky_model
@@ -33,7 +32,7 @@ def require_possible(experiment: Experiment) -> None:
         from calstudy.sky.eor import read_power_table
 
         read_power_table(experiment.sky.eor.path)
-    require_usable(experiment.corruption.effects, Size.of(experiment.instrument))
+    require_usable(experiment.corruption.effects, size_of_instrument(experiment.instrument))
     require_calibration(experiment)
 
 

@@ -157,10 +157,7 @@ def _any_of(kinds: Kinds[Any], path: str, listed: dict[str, str]) -> Iterator[st
 def plugin_reference(path: Path) -> str:
     """Return the Markdown reference of the plug-ins (calibrators, figures and others) in a Python file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be run, or contains none.
+    Raises InputError if the file cannot be run, or contains none.
     """
     module = load_file(path)
     own = [thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__]
@@ -183,10 +180,7 @@ def plugin_reference(path: Path) -> str:
 def section_reference(section: str) -> str:
     """Return the part of the reference with one section, such as ``calibration.basis``, and the sections inside it.
 
-    Raises
-    ------
-    InputError
-        If there is no such section.
+    Raises InputError if there is no such section.
     """
     sections: list[str] = []
     for kind_of_file in re.split(r"^(?=# )", field_reference(), flags=re.MULTILINE):

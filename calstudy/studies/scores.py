@@ -22,16 +22,15 @@ from calstudy.calibrate.records import Status
 from calstudy.experiment.model import Experiment
 from calstudy.power.score import BANDS
 from calstudy.products.comparison import score_table
-from calstudy.products.files import read_json
+from calstudy.products.files import SCORE, read_json
 from calstudy.products.graph import Graph, required
-from calstudy.products.score import MEASURED, SUMMARY
+from calstudy.products.score import MEASURED
 from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import COUNTS, upper_limit
 from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store
-from calstudy.studies.export import Contents
 from calstudy.studies.folder import log_to
-from calstudy.studies.kinds.comparison import Comparison
+from calstudy.studies.kinds.comparison import Comparison, WorldData
 from calstudy.studies.study import make
 from calstudy.verdicts.measured import LARGEST_ERROR, is_measured
 from calstudy.verdicts.standing import standing_table, standings
@@ -153,9 +152,9 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
         Row(
             world=case.world,
             calibrator=case.calibrator,
-            digest=Contents.of(case.experiment, study.file.salt).digest,
+            digest=WorldData.of(case.experiment, study.file.salt).digest,
             scoring=scoring_of(case.experiment),
-            scores=read_json(made.products[task.key].path / SUMMARY),
+            scores=read_json(made.products[task.key].path / SCORE),
         )
         for case, task in zip(cases, tasks, strict=True)
     ]
@@ -229,11 +228,8 @@ class _Standing:
 def leaderboard(folder: Path) -> str:
     """Return a page (Markdown) that ranks all files of `calstudy score --output` in a folder.
 
-    Raises
-    ------
-    InputError
-        If there are none, or they do not belong together: other data under the same name of a world, or a calibrator
-        that occurs twice in a world.
+    Raises InputError if there are none, or they do not belong together: other data under the same name of a world, or a
+    calibrator that occurs twice in a world.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")

@@ -14,7 +14,7 @@ from calstudy.base.table import Table
 from calstudy.products.files import REALIZATIONS
 from calstudy.report.headline import PLACE, measured_numbers, read_signal
 from calstudy.report.page import REPORT
-from calstudy.results.folder import MANIFEST, RunFolder
+from calstudy.results.reader import MANIFEST, RunFolder
 from calstudy.run.execution import Budget, largest_disk, schedule
 from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
@@ -41,10 +41,7 @@ def _gigabytes(count: float) -> str:
 def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[str, Any]:
     """Return the products and the cost of a run as plain JSON types; seconds on one core, and bytes.
 
-    Raises
-    ------
-    InputError
-        If the study does not fit, or store or run folders cannot be written.
+    Raises InputError if the study does not fit, or store or run folders cannot be written.
     """
     study, workers = study.sized_to(budget)
     store = Store(study.outputs.store)

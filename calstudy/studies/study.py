@@ -21,7 +21,7 @@ from calstudy.base.table import to_json
 from calstudy.experiment.files import StudyFile, dump
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
-from calstudy.results.folder import SHOWN
+from calstudy.results.reader import SHOWN
 from calstudy.run.execution import Budget, Lifetimes, Schedule, Workers, execute, found_of, schedule
 from calstudy.run.leases import Lease
 from calstudy.run.progress import report

@@ -17,10 +17,8 @@ class Finding(NamedTuple):
 
     Attributes
     ----------
-    value
-        The number.
-    uncertainty
-        One standard deviation, or the scatter that the quantity names.
+    value : the number
+    uncertainty : one standard deviation, or the scatter that the quantity names
     kind
         "error" if `uncertainty` is the standard deviation of the number; "scatter" if it is that of the values whose
         median the number is; "at least" or "at most" if the number is a bound of the measured quantity.
@@ -139,28 +137,17 @@ class Verdict:
 
     Attributes
     ----------
-    name
-        Short and unique.
-    section, sentence
-        The tested sentence, and its section.
-    quantity
-        The measured quantity, in words.
-    measured, uncertainty
-        The number and its uncertainty; None if there is none.
-    threshold, why
-        The condition for the number, and the reason for it.
-    runs
-        Names of the runs that it was measured on.
-    reason
-        Why there is no number, or empty.
-    kind
-        Meaning of number and uncertainty, as in `Finding`.
-    smallest_effect
-        Of an undecided statement: the smallest distance of the number from it that the data could show.
-    sentence_id
-        Id of the paper's sentence, which may have several statements; empty for criteria of our own.
-    tests_simulation
-        True if the number does not depend on a calibration, so that it tests the simulated data alone.
+    name : short and unique
+    section, sentence : the tested sentence, and its section
+    quantity : the measured quantity, in words
+    measured, uncertainty : the number and its uncertainty; None if there is none
+    threshold, why : the condition for the number, and the reason for it
+    runs : names of the runs that it was measured on
+    reason : why there is no number, or empty
+    kind : meaning of number and uncertainty, as in `Finding`
+    smallest_effect : of an undecided statement: the smallest distance of the number from it that the data could show
+    sentence_id : id of the paper's sentence, which may have several statements; empty for criteria of our own
+    tests_simulation : true if the number does not depend on a calibration, so that it tests the simulated data alone
     """
 
     name: str

@@ -131,12 +131,9 @@ def standings(
 
     Parameters
     ----------
-    scores
-        The content of comparison.json: scores by world and calibrator.
-    refusals
-        World, calibrator and reason of those that cannot work.
-    limit
-        Largest tolerated bias, over the EoR.
+    scores : the content of comparison.json: scores by world and calibrator
+    refusals : world, calibrator and reason of those that cannot work
+    limit : largest tolerated bias, over the EoR
     """
     found: dict[tuple[tuple[float, float], str], list[InWorld]] = {}
     calibrators = dict.fromkeys(name for cases in scores.values() for name in cases)

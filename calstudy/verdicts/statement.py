@@ -38,16 +38,11 @@ class Statement(Criterion):
 
     Attributes
     ----------
-    name, section, sentence, quantity, threshold, why
-        As in `Criterion`; `section` is that of the paper.
-    roles
-        The roles of the runs that are compared.
-    measure
-        Measures the number on the runs that play `roles`, in their order.
-    sentence_id, tests_simulation
-        As in `Verdict`.
-    pooled
-        Measures the number on runs that pool realizations, or None if it exists only for single runs.
+    name, section, sentence, quantity, threshold, why : as in `Criterion`; `section` is that of the paper
+    roles : the roles of the runs that are compared
+    measure : measures the number on the runs that play `roles`, in their order
+    sentence_id, tests_simulation : as in `Verdict`
+    pooled : measures the number on runs that pool realizations, or None if it exists only for single runs
     """
 
     roles: tuple[str, ...]
@@ -123,18 +118,12 @@ class Source:
 
         Parameters
         ----------
-        sentence
-            The sentence of the paper; a `Sentence` if it has several statements.
-        quantity
-            The measured quantity, in words.
-        threshold
-            The condition for it.
-        why
-            The reason for this threshold.
-        roles
-            Roles of the runs that the function takes; by default those of the source.
-        pooled
-            As in `Statement`.
+        sentence : the sentence of the paper; a `Sentence` if it has several statements
+        quantity : the measured quantity, in words
+        threshold : the condition for it
+        why : the reason for this threshold
+        roles : roles of the runs that the function takes; by default those of the source
+        pooled : as in `Statement`
         """
 
         def make(measure: Callable[..., Finding]) -> Statement:

@@ -37,12 +37,9 @@ class Drawn:
     error
         Function of the reference arrays and the array's name that returns the standard deviation σ of each element
         (of the real part, if they are complex), in a shape that broadcasts.
-    why
-        Description of the error bar.
-    largest
-        Largest deviation of an element, σ.
-    rms
-        Largest root mean square of the deviations, σ.
+    why : description of the error bar
+    largest : largest deviation of an element, σ
+    rms : largest root mean square of the deviations, σ
     shift
         Largest mean deviation in its own standard errors, as if the elements were independent; a common shift of the
         whole array shows here first.

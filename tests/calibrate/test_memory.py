@@ -18,9 +18,8 @@ from calstudy.calibrate.cost import (
     solve_memory,
 )
 from calstudy.calibrate.synthetic import Case, Simulation
-from calstudy.instrument.layouts import make_layout
+from calstudy.instrument.layouts import make_layout, size_of_instrument
 from calstudy.instrument.settings import InstrumentSettings
-from calstudy.instrument.size import Size
 
 DEFAULT = Calamity()
 LARGE = Dimensions(antennas=350, baselines=61_075, models=61_075, channels=384, widest=53, coefficients=1.95e6)
@@ -70,7 +69,7 @@ def test_plans_without_a_layout_are_those_with_it(layout):
     frequencies = channels.first + channels.width * np.arange(channels.count)
     basis = make_basis(lengths, frequencies, DEFAULT.basis)
     widest = max(bucket.vectors.shape[1] for bucket in basis.buckets)
-    size = Size.of(instrument)
+    size = size_of_instrument(instrument)
     guessed = dimensions_of(size, DEFAULT)
     exact = Dimensions(len(enu), len(lengths), len(lengths), channels.count, widest, basis.n_coefficients)
     assert guessed.coefficients == pytest.approx(exact.coefficients, rel=0.3)
@@ -79,7 +78,7 @@ def test_plans_without_a_layout_are_those_with_it(layout):
 
 
 def test_every_solver_has_its_own_time():
-    size = Size.of(InstrumentSettings())
+    size = size_of_instrument(InstrumentSettings())
 
     def seconds(solver) -> float:
         return Calamity.model_validate({"solver": solver}).cost(size).seconds

@@ -14,9 +14,8 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.calibrators.least_squares import SkyBased
-from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.execution import run_calibrator, smooth
 from calstudy.calibrate.interface import DpssSmoothing, PolynomialSmoothing, SmoothCal
-from calstudy.calibrate.smoothing import smooth
 from calstudy.experiment.files import checked, validate
 from calstudy.products.calibration import calibration
 from calstudy.products.graph import Graph

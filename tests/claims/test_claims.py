@@ -10,8 +10,7 @@ from tiny import of_the_paper
 
 from calstudy.base.errors import InputError
 from calstudy.claims.bins import RecoveredPower, bias_extent, difference_of_ratios, fraction_within, recovered
-from calstudy.claims.evaluation import evaluate_members, evaluate_run, refusals_of_run
-from calstudy.claims.folders import evaluate_folder
+from calstudy.claims.evaluation import evaluate_folder, evaluate_members, evaluate_run, refusals_of_run
 from calstudy.experiment.files import dump, override, validate
 from calstudy.experiment.model import PAPERS
 from calstudy.power.tables import save_spectrum

@@ -7,9 +7,7 @@ import pytest
 from test_claims import ADAMAX, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_folder, verdicts
 
 from calstudy.base.errors import InputError
-from calstudy.claims.evaluation import evaluate_by_solver
-from calstudy.claims.folders import evaluate_folder
-from calstudy.claims.product import Claims
+from calstudy.claims.evaluation import Claims, evaluate_by_solver, evaluate_folder
 from calstudy.figures.solver_comparison import SolverComparison
 from calstudy.plotting.save import figure_arrays
 from calstudy.run.task import Job

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from calstudy.base.observation import Observation
 from calstudy.corrupt.effects.gains import CoarseChannels
 from calstudy.corrupt.interface import draw_truth
-from calstudy.instrument.size import Size
+from calstudy.instrument.layouts import size_of_instrument
 from calstudy.instrument.telescope import make_template
 
 COARSE = 1.28e6
@@ -97,7 +97,7 @@ def test_the_same_seed_draws_the_same_and_the_shape_does_not_change_the_levels()
 
 def test_channels_that_are_too_wide_for_the_passband_are_refused():
     def refusal(width: str) -> str | None:
-        return CoarseChannels().refusal(Size.of(small_instrument(channels={"width": width})))
+        return CoarseChannels().refusal(size_of_instrument(small_instrument(channels={"width": width})))
 
     assert refusal("426.6667 kHz") is None
     told = "width: 1.28 MHz: a coarse channel holds 2 channels of 0.64 MHz; its passband takes at least 3"

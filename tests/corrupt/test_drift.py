@@ -21,7 +21,7 @@ from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.experiment.files import override, validate
 from calstudy.instrument.telescope import make_template
 from calstudy.products import agreement, corruption, signal_loss
-from calstudy.products.files import read_json
+from calstudy.products.files import AGREEMENT, read_json
 from calstudy.products.graph import Graph
 from calstudy.products.selection import read_gains
 
@@ -245,7 +245,7 @@ def test_a_run_with_drifting_gains_is_compared_with_the_gains_of_each_integratio
     true = read_gains(products[2])
     assert len(true.values) == 2
     assert np.median(abs(true.values[1] / true.values[0] - 1)) > 0.3
-    found = read_json(products[0] / agreement.AGREEMENT)["measurements"]
+    found = read_json(products[0] / AGREEMENT)["measurements"]
     # EoR and noise are 1e-4 and 2e-4 of the data.
     assert found["gains_aligned"]["value"] < 1e-3
     assert read_json(products[1] / signal_loss.SCALE)["flux_scale"] == pytest.approx(1, abs=1e-3)

@@ -15,8 +15,8 @@ from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.settings import AutoWeights
 from calstudy.calibrate.weights import make_weights
-from calstudy.corrupt.levels import Levels
-from calstudy.corrupt.noise import SystemTemperature, effective_area, radiometer_std, thermal_noise
+from calstudy.corrupt.levels import Levels, radiometer_std
+from calstudy.corrupt.noise import SystemTemperature, effective_area, thermal_noise
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import Variant

@@ -22,6 +22,7 @@ from calstudy.figures.visibilities import (
     draw_model,
 )
 from calstudy.figures.wedge import WedgePanels, draw_wedge
+from calstudy.plotting import style
 from calstudy.plotting.domains import in_two_domains
 from calstudy.power.delay import delays
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
@@ -143,26 +144,29 @@ def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra)
     steps = [summarize_runtime(label, np.array([8, 16, 32]), seconds / speed) for label, speed in (("A", 1), ("B", 30))]
 
     def draw(stand_ins: tuple[str, ...] = (), only: tuple[str, ...] | None = None) -> dict[str, Figure]:
-        note = {"stand_ins": stand_ins}
         drawings = {
-            "layouts": lambda: draw_layouts(arrays, **note),
-            "layout": lambda: draw_layouts(arrays[:1], **note),
-            "wedge": lambda: draw_wedge(wedge_panels, **note),
-            "spherical": lambda: draw_spherical([make_column(1), excised], **note),
-            "spherical one column": lambda: draw_spherical([excised], **note),
-            "spherical comparison": lambda: draw_spherical_comparison(excised, make_column(3, empty=1), **note),
+            "layouts": lambda: draw_layouts(arrays),
+            "layout": lambda: draw_layouts(arrays[:1]),
+            "wedge": lambda: draw_wedge(wedge_panels),
+            "spherical": lambda: draw_spherical([make_column(1), excised]),
+            "spherical one column": lambda: draw_spherical([excised]),
+            "spherical comparison": lambda: draw_spherical_comparison(excised, make_column(3, empty=1)),
             "solver comparison": lambda: draw_solver_comparison(
-                {"one": (make_column(4), excised), "two": (excised, make_column(3, empty=1))}, **note
+                {"one": (make_column(4), excised), "two": (excised, make_column(3, empty=1))}
             ),
-            "gains": lambda: draw_gains(compare_gains((0, 1), FREQUENCY, *gains, gains[1]), **note),
-            "model": lambda: draw_model(visibility_comparison, **note),
-            "data": lambda: draw_data(visibility_comparison, **note),
-            "baselines": lambda: draw_baselines(baseline_spectra, **note),
-            "three baselines": lambda: draw_baselines(baseline_spectra[:3], **note),
-            "baseline": lambda: draw_baselines(baseline_spectra[:1], **note),
-            "reflections": lambda: draw_reflections(in_two_domains(FREQUENCY, gains[0]), **note),
-            "runtime": lambda: draw_runtime(steps, "number of antennas", r"N_\mathrm{ant}", **note),
+            "gains": lambda: draw_gains(compare_gains((0, 1), FREQUENCY, *gains, gains[1])),
+            "model": lambda: draw_model(visibility_comparison),
+            "data": lambda: draw_data(visibility_comparison),
+            "baselines": lambda: draw_baselines(baseline_spectra),
+            "three baselines": lambda: draw_baselines(baseline_spectra[:3]),
+            "baseline": lambda: draw_baselines(baseline_spectra[:1]),
+            "reflections": lambda: draw_reflections(in_two_domains(FREQUENCY, gains[0])),
+            "runtime": lambda: draw_runtime(steps, "number of antennas", r"N_\mathrm{ant}"),
         }
-        return {name: drawings[name]() for name in only or drawings}
+        drawn = {name: drawings[name]() for name in only or drawings}
+        with style.journal_style():
+            for figure in drawn.values():
+                style.note_stand_ins(figure, stand_ins)
+        return drawn
 
     return draw

@@ -21,7 +21,7 @@ def regions() -> dict[str, RegionResults]:
 
 
 def test_the_figure_shows_mean_scatter_and_quoted_error_of_t(regions):
-    figure = draw_realizations(regions, ["ten", "four"], stand_ins=["synthetic sky"])
+    figure = draw_realizations(regions, ["ten", "four"])
     transfer, errors, correlation, pulls, coverage, corrected = figure.axes[:6]
     total = regions["outside-wedge"].pooled.total["transfer"]
     points = transfer.containers[0]

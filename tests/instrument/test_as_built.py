@@ -14,7 +14,7 @@ from scipy.stats import binom
 
 from calstudy.base.errors import InputError
 from calstudy.base.identity import identity
-from calstudy.base.mwa_files import BEAM
+from calstudy.base.package_files import BEAM
 from calstudy.instrument import as_built as section
 from calstudy.instrument.antenna_beams import MisalignedBeam, make_beams
 from calstudy.instrument.as_built import Misalignment, dipole_amplitudes, misalignments, position_offsets

@@ -15,7 +15,7 @@ from scipy.signal.windows import blackmanharris
 from scipy.special import j1
 
 from calstudy.base.errors import InputError
-from calstudy.base.mwa_files import BEAM
+from calstudy.base.package_files import BEAM
 from calstudy.instrument import settings as section
 from calstudy.instrument import tabulated
 from calstudy.instrument.beam_frequencies import mwa_frequencies

@@ -7,11 +7,11 @@ import pytest
 from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
 
-from calstudy.base.visibilities import antenna_pairs, baseline_vectors, require_rectangular
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, require_rectangular, subset_template
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Channels, InstrumentSettings, Times
-from calstudy.instrument.telescope import REFERENCE_JD, make_template, subset_template, time_of_lst
+from calstudy.instrument.telescope import REFERENCE_JD, make_template, time_of_lst
 
 
 def small(**changes):

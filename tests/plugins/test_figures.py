@@ -17,10 +17,9 @@ from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.model import FIGURES
-from calstudy.regression.comparison import compare_figures, rules_of
-from calstudy.regression.reference import accept, read_reference, read_run
-from calstudy.report.contents import read_contents
-from calstudy.results.folder import RunFolder
+from calstudy.regression.comparison import accept, compare_figures, read_reference, read_run, rules_of
+from calstudy.report.page import read_contents
+from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Run, run_study

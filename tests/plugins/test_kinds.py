@@ -13,7 +13,7 @@ from tiny import tiny
 
 from calstudy.base.errors import InputError
 from calstudy.experiment.files import load
-from calstudy.results.folder import RunFolder
+from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study

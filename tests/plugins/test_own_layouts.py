@@ -7,9 +7,8 @@ import pytest
 from plugin_files import Plugged
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.instrument.layouts import make_array, make_layout
+from calstudy.instrument.layouts import make_array, make_layout, size_of_instrument
 from calstudy.instrument.settings import InstrumentSettings
-from calstudy.instrument.size import Size
 from calstudy.products import simulation
 from calstudy.products.graph import Graph
 from calstudy.studies.reference import field_reference, plugin_reference
@@ -46,7 +45,7 @@ def test_antennas_are_where_it_says(plugged):
     assert np.sum(abs(spiral) ** 2) == pytest.approx(24 * 60**2 / 2)
     np.testing.assert_allclose(array.enu[:, 0] + 1j * array.enu[:, 1], spiral - spiral.mean(), atol=1e-9)
     apart = abs(spiral[:, None] - spiral)
-    size = Size.of(instrument)
+    size = size_of_instrument(instrument)
     assert (size.antennas, size.longest) == (24, pytest.approx(apart.max()))
     assert size.mean == pytest.approx(apart.sum() / (24 * 23))
 

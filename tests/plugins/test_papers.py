@@ -15,11 +15,11 @@ from test_extending_page import sections
 from tiny import tiny
 
 from calstudy.base.errors import InputError
-from calstudy.claims.folders import evaluate_folder
+from calstudy.claims.evaluation import evaluate_folder
 from calstudy.experiment.files import override, validate
-from calstudy.regression.reference import accept, read_reference
-from calstudy.report.contents import read_contents
-from calstudy.results.folder import RunFolder
+from calstudy.regression.comparison import accept, read_reference
+from calstudy.report.page import read_contents
+from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.show import show_run

@@ -10,7 +10,7 @@ from plugin_files import example
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.results.folder import RunFolder
+from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study

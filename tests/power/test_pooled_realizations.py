@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from realization_samples import BINS, INPUT, LOSS, design_of, draw, transfer_function
 
-from calstudy.power.corrected import correct_realizations, transfer_of_others
-from calstudy.power.realizations import coverage, error_ratio, inside_bars, mean_over_bins, pool, pool_region, together
+from calstudy.power.realizations import (
+    correct_realizations,
+    coverage,
+    error_ratio,
+    inside_bars,
+    mean_over_bins,
+    pool,
+    pool_region,
+    together,
+    transfer_of_others,
+)
 
 EVERYTHING = design_of((("eor", "gains", "noise"), 8))
 TWO_BLOCKS = design_of((("gains", "noise"), 7), (("eor",), 6))

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from calstudy.instrument.settings import Channels
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Channels, Size
 from calstudy.products.agreement import integrations_compared, spread
 
 

@@ -17,15 +17,8 @@ from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.array_layouts.geometric import LinearLayout
 from calstudy.instrument.settings import Channels
-from calstudy.products.step_times import (
-    Descent,
-    PaperStep,
-    Samples,
-    descend,
-    make_simulation,
-    time_steps,
-    time_steps_apart,
-)
+from calstudy.products.run_times import Descent, Samples, time_steps_apart
+from calstudy.products.step_times import PaperStep, descend, make_simulation, time_steps
 
 CHANNELS = Channels(first="120.3 MHz", width="600 kHz", count=100)
 LINE = LinearLayout(kind="linear", count=4, spacing="33 m")

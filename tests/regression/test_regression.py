@@ -17,8 +17,18 @@ from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.cli.main import app
 from calstudy.experiment.files import load, override
-from calstudy.regression.comparison import Regression, compare_array, compare_claims, compare_figures, show
-from calstudy.regression.reference import accept, find_references, read_reference, read_run, remake
+from calstudy.regression.comparison import (
+    Regression,
+    accept,
+    compare_array,
+    compare_claims,
+    compare_figures,
+    find_references,
+    read_reference,
+    read_run,
+    remake,
+    show,
+)
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study

@@ -10,10 +10,10 @@ import pytest
 
 from calstudy.power.score import Score
 from calstudy.power.tables import save_spectrum
-from calstudy.products.score import BANDS, SUMMARY
-from calstudy.report.charts import read_charts
+from calstudy.products.files import SCORE, SCORE_BANDS
 from calstudy.report.headline import read_headline, read_signal
-from calstudy.results.folder import RunFolder
+from calstudy.report.page import read_charts
+from calstudy.results.reader import RunFolder
 
 EDGES = np.array([0.1, 0.2, 0.5, 1.0])
 SCALE = 1.1
@@ -45,7 +45,7 @@ def run_of(folder: Path, **manifest) -> RunFolder:
 
 def finished_run(folder: Path, score: Score) -> RunFolder:
     (folder / "tables").mkdir(exist_ok=True)
-    save_spectrum(folder / "tables" / BANDS, score)
+    save_spectrum(folder / "tables" / SCORE_BANDS, score)
     return run_of(folder)
 
 
@@ -79,7 +79,7 @@ def test_a_run_without_scores_has_no_headline(tmp_path):
 def test_the_yardstick_for_the_transfer_is_beside_it(tmp_path):
     run = finished_run(tmp_path, scores())
     bands = [{"k": [low, 2 * low], "linear_transfer": value} for low, value in ((0.1, 0.3), (0.2, 0.7489))]
-    (tmp_path / "tables" / SUMMARY).write_text(json.dumps({"bands": bands}))
+    (tmp_path / "tables" / SCORE).write_text(json.dumps({"bands": bands}))
     assert read_headline(run)[0].text == "0.757 ± 0.012 (linear response of the fit 0.749)"
 
 

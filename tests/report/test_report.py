@@ -18,9 +18,8 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
 from calstudy.products.signal_loss import SweepSummary, Transfer
-from calstudy.report.contents import read_contents
-from calstudy.report.page import write_report
-from calstudy.results.folder import RunFolder
+from calstudy.report.page import read_contents, write_report
+from calstudy.results.reader import RunFolder
 
 # One red pixel.
 PNG = base64.b64decode(

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from tiny import tiny
 
-from calstudy.results.folder import find_runs
+from calstudy.results.reader import find_runs
 from calstudy.run.store import Store, products
 
 MEMBERS, TOGETHER = 20, 4

@@ -21,8 +21,7 @@ from tiny import tiny
 
 from calstudy.base.errors import InputError
 from calstudy.run import store as store_module
-from calstudy.run.execution import Workers, execute, schedule
-from calstudy.run.perform import WorkOrder, perform
+from calstudy.run.execution import Workers, WorkOrder, execute, perform, schedule
 from calstudy.run.store import Store, leftovers, products
 from calstudy.run.task import Task
 from calstudy.studies.folder import LOG, log_to, open_folder
@@ -190,7 +189,7 @@ def test_sigterm_ends_a_run_as_an_interrupt_with_a_status_of_its_own(tmp_path):
 @pytest.mark.parametrize("content", ["null", "[1]", '[{"verdict": "PA', '[{"section": "x"}]', "", "{}"])
 def test_damaged_claims_are_named(content, tmp_path):
     from calstudy.report.headline import read_headline
-    from calstudy.results.folder import RunFolder
+    from calstudy.results.reader import RunFolder
 
     (tmp_path / "manifest.json").write_text(json.dumps({"name": "study"}))
     (tmp_path / "claims.json").write_text(content)

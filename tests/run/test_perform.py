@@ -14,9 +14,8 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import UserCodeError
 from calstudy.base.resources import Cost
 from calstudy.run import execution
-from calstudy.run.execution import Lifetimes, Workers, execute, largest_disk, schedule
+from calstudy.run.execution import Lifetimes, Workers, WorkOrder, execute, largest_disk, perform, schedule
 from calstudy.run.leases import Lease
-from calstudy.run.perform import WorkOrder, perform
 from calstudy.run.store import Store, products
 from calstudy.run.task import Inputs, Piece, Task
 

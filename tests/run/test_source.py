@@ -9,13 +9,13 @@ from tiny import of_the_paper
 
 from calstudy.base.plugins import load_file
 from calstudy.experiment.files import validate
-from calstudy.run import perform as performing
-from calstudy.run.perform import WorkOrder, perform
+from calstudy.run import execution as performing
+from calstudy.run.execution import WorkOrder, perform
 from calstudy.run.source import reached, source_of
 from calstudy.run.store import Store
 from calstudy.studies.kinds.experiment import ExperimentStudy
 
-RUNNER = ("calstudy.run.perform", "calstudy.run.task", "calstudy.base.resources")
+RUNNER = ("calstudy.run.execution", "calstudy.run.task", "calstudy.base.resources")
 CODE = '''
 """A module."""
 import numpy as np

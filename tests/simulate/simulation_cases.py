@@ -9,9 +9,10 @@ from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
 from pyradiosky import SkyModel
 
+from calstudy.base.visibilities import subset_template
 from calstudy.instrument import settings as instrument
 from calstudy.instrument.array_layouts.observatories import MwaLayout
-from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.instrument.telescope import make_template
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine, missing_package
 

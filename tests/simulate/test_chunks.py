@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from simulation_cases import healpix_sky, observe, random_sky, relative_error
 
+from calstudy.base.visibilities import subset_template
 from calstudy.experiment.files import validate
-from calstudy.instrument.telescope import subset_template
 from calstudy.products import simulation
 from calstudy.products.graph import Graph
 from calstudy.simulate.chunks import (

@@ -18,7 +18,7 @@ from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.other_packages import PyuvsimEngine
 from calstudy.simulate.nodes import Accuracy
 from calstudy.simulate.settings import SimulationSettings
-from calstudy.sky import diffuse
+from calstudy.sky import foregrounds
 from calstudy.sky import settings as section
 
 HASLAM = section.HaslamMap(kind="haslam", nside=16)
@@ -26,8 +26,8 @@ HASLAM = section.HaslamMap(kind="haslam", nside=16)
 
 def kelvin_map(settings, frequencies) -> SkyModel:
     """Return the map as HEALPix brightness temperatures channel by channel: pyradiosky's units and geometry."""
-    temperature = diffuse.brightness_temperature(settings)
-    scale = (np.asarray(frequencies) / diffuse.reference_frequency(settings)) ** settings.spectral_index
+    temperature = foregrounds.brightness_temperature(settings)
+    scale = (np.asarray(frequencies) / foregrounds.reference_frequency(settings)) ** settings.spectral_index
     stokes = np.zeros((4, len(frequencies), temperature.size))
     stokes[0] = scale[:, None] * temperature
     return SkyModel(
@@ -46,14 +46,14 @@ def kelvin_map(settings, frequencies) -> SkyModel:
 def test_a_diffuse_map_agrees_with_pyuvsim(beam, request):
     template, beam = observe(count=4, channels=2, times=2), request.getfixturevalue(beam)
     expected = PyuvsimEngine().simulate(kelvin_map(HASLAM, template.freq_array), beam, template)
-    assert relative_error(DenseEngine().simulate(diffuse.make_diffuse(HASLAM), beam, template), expected) < 1e-9
+    assert relative_error(DenseEngine().simulate(foregrounds.make_diffuse(HASLAM), beam, template), expected) < 1e-9
 
 
 def test_map_and_sources_add_up(dipole_beam):
     """Through nodes in time and frequency, with pixels that rise and set."""
     template = observe(channels=8, width="1 MHz", times=12, integration="9 s")
-    points, pixels = random_sky(template), diffuse.make_diffuse(HASLAM)
-    both = diffuse.add_skies(points, pixels, template.freq_array)
+    points, pixels = random_sky(template), foregrounds.make_diffuse(HASLAM)
+    both = foregrounds.add_skies(points, pixels, template.freq_array)
     cube = simulate_visibilities(DenseEngine(), both, dipole_beam, template, Accuracy(1e-9, beam_extent=20.0))
     parts = [DenseEngine().simulate(sky, dipole_beam, template) for sky in (points, pixels)]
     assert relative_error(cube, sum(parts)) < 1e-7
@@ -86,7 +86,7 @@ def test_fine_pixels_stand_for_the_map(dipole_beam):
     assert lengths.max() < 62
     coarse, fine = (
         DenseEngine().simulate(
-            diffuse.make_diffuse(section.HaslamMap(kind="haslam", nside=nside)), dipole_beam, template
+            foregrounds.make_diffuse(section.HaslamMap(kind="haslam", nside=nside)), dipole_beam, template
         )
         for nside in (128, 256)
     )
@@ -94,6 +94,6 @@ def test_fine_pixels_stand_for_the_map(dipole_beam):
 
 
 def test_pixels_cover_the_sky():
-    sky = diffuse.make_diffuse(section.SyntheticDiffuse(kind="synthetic", nside=16, mean="1 K", rms="0 K"))
+    sky = foregrounds.make_diffuse(section.SyntheticDiffuse(kind="synthetic", nside=16, mean="1 K", rms="0 K"))
     vectors = healpy.pix2vec(16, np.arange(3072))
     np.testing.assert_allclose(sky.skycoord.cartesian.xyz.value, np.array(vectors), atol=1e-12)

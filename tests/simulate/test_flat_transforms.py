@@ -7,12 +7,13 @@ import pytest
 from simulation_cases import healpix_sky, random_sky
 
 from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.visibilities import subset_template
 from calstudy.instrument import settings as instrument
 from calstudy.instrument.array_layouts.csv import CsvLayout
 from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.instrument.array_layouts.observatories import HeraLayout
 from calstudy.instrument.layouts import make_layout
-from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.instrument.telescope import make_template
 from calstudy.simulate import patches
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.other_packages import PyuvsimEngine

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulation_cases import observe, relative_error
 
-from calstudy.instrument.telescope import subset_template
+from calstudy.base.visibilities import subset_template
 from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.engines.other_packages import PyuvsimEngine
 from calstudy.sky.foregrounds import make_foregrounds

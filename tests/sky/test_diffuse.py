@@ -10,9 +10,9 @@ from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
 from pyradiosky.utils import jy_to_ksr
 
-from calstudy.base import mwa_files, package_files
+from calstudy.base import package_files
 from calstudy.base.errors import InputError
-from calstudy.sky import diffuse
+from calstudy.sky import foregrounds
 from calstudy.sky import settings as section
 from calstudy.sky.foregrounds import make_foregrounds
 
@@ -22,7 +22,7 @@ FINEST = section.HaslamMap(kind="haslam")
 
 @pytest.fixture(scope="module")
 def haslam():
-    return diffuse.brightness_temperature(FINEST)
+    return foregrounds.brightness_temperature(FINEST)
 
 
 def around(direction: SkyCoord, radius: float) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_temperatures_are_absolute(haslam):
 
 
 def test_coarser_maps_are_means_of_the_finest(haslam):
-    coarse = diffuse.brightness_temperature(section.HaslamMap(kind="haslam", nside=16))
+    coarse = foregrounds.brightness_temperature(section.HaslamMap(kind="haslam", nside=16))
     assert coarse.size == 12 * 16**2
     assert coarse.mean() == pytest.approx(haslam.mean(), rel=1e-12)
 
@@ -69,8 +69,8 @@ def test_coarser_maps_are_means_of_the_finest(haslam):
 def test_pixels_have_the_flux_of_a_power_law_in_temperature(frequency):
     """pyradiosky's conversion of kelvin, at the frequency itself."""
     settings = section.HaslamMap(kind="haslam", nside=16, spectral_index=-2.6)
-    sky = diffuse.make_diffuse(settings)
-    temperature = diffuse.brightness_temperature(settings) * (frequency / 408e6) ** -2.6
+    sky = foregrounds.make_diffuse(settings)
+    temperature = foregrounds.brightness_temperature(settings) * (frequency / 408e6) ** -2.6
     expected = temperature * healpy.nside2pixarea(16) / jy_to_ksr(frequency * units.Hz).value
     found = sky.at_frequencies(np.array([frequency]) * units.Hz, inplace=False).stokes[0, 0].to_value("Jy")
     np.testing.assert_allclose(found, expected, rtol=1e-10)
@@ -79,7 +79,7 @@ def test_pixels_have_the_flux_of_a_power_law_in_temperature(frequency):
 def test_the_synthetic_map_has_its_spectrum_and_temperatures():
     """Band powers of 8 octaves of l within five standard deviations of their chance, 1/sqrt(modes) each."""
     settings = section.SyntheticDiffuse(kind="synthetic", nside=128, rms="10 K", mean="100 K", angular_index=1.0)
-    field = diffuse.brightness_temperature(settings)
+    field = foregrounds.brightness_temperature(settings)
     assert field.mean() == pytest.approx(100, abs=1e-4)
     lmax = 300
     found = healpy.anafast(field, lmax=lmax, iter=5)[1:]
@@ -95,13 +95,13 @@ def test_the_synthetic_map_has_its_spectrum_and_temperatures():
 def test_large_scales_of_the_synthetic_map_do_not_depend_on_nside():
     coarse, fine = (
         healpy.map2alm(
-            diffuse.brightness_temperature(section.SyntheticDiffuse(kind="synthetic", nside=nside)), lmax=20, iter=5
+            foregrounds.brightness_temperature(section.SyntheticDiffuse(kind="synthetic", nside=nside)), lmax=20, iter=5
         )
         for nside in (32, 128)
     )
     # The quadrature of the coarse map lets some of its small scales in.
     assert np.abs(coarse - fine).max() < 1e-3 * np.abs(fine[1:]).max()
-    other = diffuse.brightness_temperature(section.SyntheticDiffuse(kind="synthetic", nside=32, seed=22))
+    other = foregrounds.brightness_temperature(section.SyntheticDiffuse(kind="synthetic", nside=32, seed=22))
     assert np.abs(healpy.map2alm(other, lmax=20) - coarse)[1:].max() > 0.1 * np.abs(fine[1:]).max()
 
 
@@ -111,7 +111,7 @@ def points_and_map(**fields) -> tuple[SkyModel, SkyModel, SkyModel]:
     both = make_foregrounds(sources, FREQUENCIES, mapped)
     assert "synthetic sources" in both.stand_in
     assert "diffuse emission: a synthetic map at nside 16" in both.stand_in
-    return both.sky, make_foregrounds(sources, FREQUENCIES).sky, diffuse.make_diffuse(mapped)
+    return both.sky, make_foregrounds(sources, FREQUENCIES).sky, foregrounds.make_diffuse(mapped)
 
 
 @pytest.mark.parametrize("spectrum", ["flat", "catalogue"])
@@ -134,7 +134,7 @@ def test_a_catalogue_channel_by_channel_makes_the_map_so(tmp_path):
     mapped = section.SyntheticDiffuse(kind="synthetic", nside=16)
     both = make_foregrounds(file, FREQUENCIES, mapped).sky
     assert both.spectral_type == "full"
-    pixels = diffuse.make_diffuse(mapped).at_frequencies(FREQUENCIES * units.Hz, inplace=False, run_check=False)
+    pixels = foregrounds.make_diffuse(mapped).at_frequencies(FREQUENCIES * units.Hz, inplace=False, run_check=False)
     np.testing.assert_allclose(both.stokes[0][:, -3072:].value, pixels.stokes[0].value)
 
 
@@ -146,6 +146,6 @@ def test_a_map_alone():
 
 def test_a_missing_map_is_told(monkeypatch, tmp_path):
     monkeypatch.setattr(package_files, "find_spec", lambda name: None)
-    monkeypatch.setattr(mwa_files, "default_directory", lambda: tmp_path)
+    monkeypatch.setattr(package_files, "default_directory", lambda: tmp_path)
     with pytest.raises(InputError, match=r"data fetch haslam'.*use sky.diffuse: synthetic"):
-        diffuse.make_diffuse(FINEST)
+        foregrounds.make_diffuse(FINEST)

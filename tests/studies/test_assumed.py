@@ -21,8 +21,8 @@ from calstudy.experiment.files import dump, load, override, validate
 from calstudy.instrument.telescope import make_template
 from calstudy.products import calibration, simulation, sky_model
 from calstudy.products.graph import Graph
-from calstudy.report.contents import read_contents
-from calstudy.results.folder import RunFolder
+from calstudy.report.page import read_contents
+from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Workers
 from calstudy.run.store import Store
 from calstudy.run.task import Task

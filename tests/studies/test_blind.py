@@ -11,9 +11,8 @@ from calstudy.base.errors import InputError
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, find_returned, salted
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
-from calstudy.studies.blind import BITS, write_recipe
-from calstudy.studies.export import CARRIER, Contents
-from calstudy.studies.kinds.comparison import load_worlds
+from calstudy.studies.export import BITS, CARRIER, write_recipe
+from calstudy.studies.kinds.comparison import WorldData, load_worlds
 
 CHALLENGE = Path(__file__).parents[2] / "experiments" / "challenge.yaml"
 
@@ -99,7 +98,7 @@ def test_digests_of_a_blind_challenge_do_not_tell_what_was_digested(blind_worlds
     salt = blind_worlds.file.salt
     assert len(salt) == BITS // 4
     for case in blind_worlds.cases:
-        plain, hidden = Contents.of(case.experiment), Contents.of(case.experiment, salt)
+        plain, hidden = WorldData.of(case.experiment), WorldData.of(case.experiment, salt)
         assert hidden.digest == salted(plain.digest, salt) != plain.digest
         assert {task.key for task in plain.data} == {task.key for task in hidden.data}
         order = [salted(task.key, salt) for task in hidden.data]
@@ -108,7 +107,7 @@ def test_digests_of_a_blind_challenge_do_not_tell_what_was_digested(blind_worlds
 
 def test_gains_come_back_by_the_salted_digests(blind_worlds, recipe, tmp_path):
     [case, *_] = blind_worlds.cases
-    contents = Contents.of(case.experiment, blind_worlds.file.salt)
+    contents = WorldData.of(case.experiment, blind_worlds.file.salt)
     keys = [task.key for task in contents.data]
     hidden = [salted(key, contents.salt) for key in keys]
     sets = tuple(

@@ -25,8 +25,8 @@ from calstudy.instrument.telescope import make_template
 from calstudy.products import corruption
 from calstudy.products.graph import Graph
 from calstudy.products.score import score
-from calstudy.studies.export import CARRIER, Contents
-from calstudy.studies.kinds.comparison import load_worlds
+from calstudy.studies.export import CARRIER
+from calstudy.studies.kinds.comparison import WorldData, load_worlds
 from calstudy.studies.load import load_study
 from calstudy.studies.scores import Row, Scores, leaderboard, read_scores, scoring_of
 from calstudy.studies.study import Budget, run_study
@@ -383,7 +383,7 @@ def test_gains_of_a_world_are_not_taken_for_those_of_one_with_the_same_data_and_
     path.write_text(yaml.safe_dump(data, sort_keys=False))
     shutil.copytree(skycal, tmp_path / "back" / "world-1")
     first, second = load_study(path).cases
-    of_both = [{task.key for task in Contents.of(case.experiment).data} for case in (first, second)]
+    of_both = [{task.key for task in WorldData.of(case.experiment).data} for case in (first, second)]
     assert of_both[0] == of_both[1]
     assert first.refusal == ""
     assert "of a world with another sky model" in second.refusal
@@ -391,7 +391,7 @@ def test_gains_of_a_world_are_not_taken_for_those_of_one_with_the_same_data_and_
     own = tmp_path / "back" / "world-2"
     change_gains(skycal, own, larger)
     manifest = json.loads((own / MANIFEST).read_text())
-    manifest["sky_model_digest"] = Contents.of(second.experiment).sky_model.key
+    manifest["sky_model_digest"] = WorldData.of(second.experiment).sky_model.key
     (own / MANIFEST).write_text(json.dumps(manifest))
     first, second = load_study(path).cases
     assert (first.refusal, second.refusal) == ("", "")
@@ -477,7 +477,7 @@ def test_the_leaderboard_has_all_scores_and_these_are_of_the_challenge():
     folder = ROOT / "docs" / "challenge"
     page = leaderboard(folder)
     worlds = load_worlds(ROOT / "experiments" / "challenge.yaml", None, (), CARRIER)
-    digests = {case.world: (Contents.of(case.experiment).digest, scoring_of(case.experiment)) for case in worlds.cases}
+    digests = {case.world: (WorldData.of(case.experiment).digest, scoring_of(case.experiment)) for case in worlds.cases}
     for path in folder.glob("*.json"):
         for item in read_scores(path).rows:
             assert (item.digest, item.scoring) == digests[item.world], f"{path.name}: {item.world}"

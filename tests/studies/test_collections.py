@@ -14,18 +14,17 @@ from tiny import of_the_paper
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.files import sha256
-from calstudy.claims.folders import evaluate_folder
+from calstudy.claims.evaluation import evaluate_folder
 from calstudy.cli import main as cli
 from calstudy.experiment.files import override
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.products import corruption, simulation
 from calstudy.products.spectra import power
-from calstudy.regression.reference import accept
+from calstudy.regression.comparison import accept
 from calstudy.run.execution import schedule
 from calstudy.run.store import Store
-from calstudy.studies.finished import with_finished
-from calstudy.studies.kinds.collection import Collection
+from calstudy.studies.kinds.collection import Collection, with_finished
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.show import describe_plan

@@ -12,7 +12,7 @@ from rich.console import Console
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.claims.folders import evaluate_folder
+from calstudy.claims.evaluation import evaluate_folder
 from calstudy.experiment.files import dump, load, override, validate
 from calstudy.experiment.realizations import expand_realizations, members
 from calstudy.power.spectra import SphericalSpectrum

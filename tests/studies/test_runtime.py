@@ -13,9 +13,9 @@ import pytest
 from rich.console import Console
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.claims.folders import evaluate_folder
+from calstudy.claims.evaluation import evaluate_folder
 from calstudy.claims.run_times import machine_in_words
-from calstudy.products.step_times import Descent, StepTimes
+from calstudy.products.run_times import Descent, StepTimes
 from calstudy.studies.kinds import runtime
 from calstudy.studies.kinds.runtime import RuntimeStudy
 from calstudy.studies.load import load_study
@@ -46,8 +46,8 @@ def pretend_to_descend(array, max_steps):
 
 @pytest.fixture
 def study(tmp_path, monkeypatch) -> RuntimeStudy:
-    monkeypatch.setattr("calstudy.products.step_times.time_steps_apart", pretend_to_time)
-    monkeypatch.setattr("calstudy.products.step_times.descend_apart", pretend_to_descend)
+    monkeypatch.setattr("calstudy.products.run_times.time_steps_apart", pretend_to_time)
+    monkeypatch.setattr("calstudy.products.run_times.descend_apart", pretend_to_descend)
     places = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
     monkeypatch.setattr(sys.modules[__name__], "PLACES", places)
     return reload()

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from calstudy.base.table import Table, number
 from calstudy.verdicts.criterion import AtLeast, AtMost, Criterion, Equal, Finding, Within
-from calstudy.verdicts.sentences import outcomes_of_sentences, tally_of_sentences
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
 from calstudy.verdicts.tables import (
     BY_SOLVER_JSON,
@@ -22,7 +21,9 @@ from calstudy.verdicts.tables import (
     CLAIMS_MARKDOWN,
     from_json,
     measured,
+    outcomes_of_sentences,
     show_verdicts,
+    tally_of_sentences,
     to_json,
     to_markdown,
     write_claims,

@@ -21,7 +21,7 @@ from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.units import Frequency
 from calstudy.calibrate.calibrators.other_packages import Measured, OtherPackage
 from calstudy.calibrate.interface import Solve
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
     from pyuvdata import UVData

@@ -23,7 +23,7 @@ from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import FOLDER, UNKEYED, Section, fault
 from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress, Solve
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal

@@ -12,7 +12,7 @@ from calstudy.calibrate.cost import LEAST_MODELS, Dimensions, solve_cost, solve_
 from calstudy.calibrate.interface import Assumed, Calibration, Progress, SolvePlan
 from calstudy.calibrate.problem import fitted_baselines, make_structure, repeat_structure
 from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, GainFit, GaussNewtonSettings, ScalePrior, Solver
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Size
 
 CROWDED = 0.9
 """Number of unknowns per sample from which a fit can absorb any data."""

@@ -16,7 +16,7 @@ from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Assumed, Calibration, Progress, Solve
 from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
 from calstudy.calibrate.settings import RUNAWAY, GainWeights, WeightedFit, unsettled_message
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Size
 
 # hera_cal wants a name for the polarization; each is calibrated by itself.
 POL, FEED = "nn", "Jnn"

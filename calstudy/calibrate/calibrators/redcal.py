@@ -18,7 +18,7 @@ from calstudy.calibrate.interface import Solve
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.settings import FlagWeights, GainWeights
 from calstudy.instrument.layouts import RedundantGroups, redundant_groups
-from calstudy.instrument.size import Size
+from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
     from hera_cal.datacontainer import DataContainer

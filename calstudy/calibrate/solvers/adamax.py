@@ -303,21 +303,16 @@ class Adamax:
 
     Parameters
     ----------
-    learning_rate
-        Size of the first step, for visibilities in units of their rms.
-    max_steps
-        Number of the last step.
-    tolerance
-        In units of the data's mean square. With zero, the number of steps is fixed.
-    precision
-        Float32 or float64 throughout.
+    learning_rate : size of the first step, for visibilities in units of their rms
+    max_steps : number of the last step
+    tolerance : in units of the data's mean square. With zero, the number of steps is fixed.
+    precision : Float32 or float64 throughout
     stop
         ``best-loss``: when the best loss falls by less than the tolerance over `STEPS_PER_CALL` steps. ``published``:
         the rule of the paper's authors, one step after a loss that differs from the loss before it by less than the
         tolerance. In single precision with a tolerance of 1e-14 that is when two consecutive losses are equal, which
         happens by chance once the loss falls slowly.
-    keep
-        Return the ``best`` parameters, or the ``last``, as the authors do.
+    keep : return the ``best`` parameters, or the ``last``, as the authors do
     """
 
     learning_rate: float = 0.01

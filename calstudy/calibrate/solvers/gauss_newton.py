@@ -77,27 +77,20 @@ class GaussNewtonState:
 
     Attributes
     ----------
-    scale
-        Unit of the visibilities, their weighted rms.
-    data
-        Visibilities, weights whose sum is one, and the model if it is frozen.
+    scale : unit of the visibilities, their weighted rms
+    data : visibilities, weights whose sum is one, and the model if it is frozen
     channel_steps
         Number of accepted steps until the antenna blocks are made: zero near a minimum, as at a warm start or a check
         of convergence.
-    boost
-        Factor on the damping; grows whenever a step did not lower the loss.
-    relief
-        Another factor, of one or of `CHECK_DAMPING`.
-    checked
-        Whether the prediction comes from a check of convergence.
-    preconditioner
-        The antenna blocks, once they are in use.
+    boost : factor on the damping; grows whenever a step did not lower the loss
+    relief : another factor, of one or of `CHECK_DAMPING`
+    checked : whether the prediction comes from a check of convergence
+    preconditioner : the antenna blocks, once they are in use
     gained
         Decrease of the loss by the last step that lowered it; infinite before the first. Where the damping stays
         raised, multiplied by its factor: the decrease along slow directions is about inversely proportional to the
         damping.
-    predicted
-        Decrease of the loss that is predicted for the next step; infinite while unknown.
+    predicted : decrease of the loss that is predicted for the next step; infinite while unknown
     """
 
     kernels: ReducedKernels
@@ -152,8 +145,7 @@ class GaussNewton:
         Converged when the next step is predicted to lower the loss by less than this fraction, and either the last
         step did not lower it more, or all further steps together will not, if they shrink at the same rate. A fit with
         a long sequence of smaller decreases counts as converged.
-    max_steps
-        Maximum number of Gauss-Newton steps.
+    max_steps : maximum number of Gauss-Newton steps
     precision
         Precision of the inner products. Where single precision does not resolve the damping for the loss, ``double``
         continues, and ``single`` is stalled if a larger decrease is possible.

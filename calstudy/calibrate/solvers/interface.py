@@ -30,12 +30,9 @@ class Solution(NamedTuple):
 
     Attributes
     ----------
-    gains
-        Shape (Nants, Nfreqs), complex128, dimensionless.
-    model
-        Intrinsic visibilities F, shape (Nbls, Nfreqs), complex128, in the unit of the data.
-    record
-        Its loss is in the unit of the data squared.
+    gains : shape (Nants, Nfreqs), complex128, dimensionless
+    model : intrinsic visibilities F, shape (Nbls, Nfreqs), complex128, in the unit of the data
+    record : its loss is in the unit of the data squared
     """
 
     gains: np.ndarray
@@ -48,10 +45,8 @@ class WarmStart(NamedTuple):
 
     Attributes
     ----------
-    gains
-        The solution's gains, shape (Nants, Nfreqs).
-    memory
-        Anything that the solver can reuse; None if nothing.
+    gains : the solution's gains, shape (Nants, Nfreqs)
+    memory : anything that the solver can reuse; None if nothing
     """
 
     gains: np.ndarray

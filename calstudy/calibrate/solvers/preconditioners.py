@@ -93,14 +93,10 @@ class AntennaBlocks(NamedTuple):
 
     Attributes
     ----------
-    degrees
-        K, (Nants, Nfreqs).
-    common
-        Q, (Nfreqs, rank); None, like all that follows, if there are no foregrounds.
-    gram
-        Q^T K Q, (Nants, rank, rank).
-    absorbed
-        Q^T C Q, real and imaginary part, (2, Nants, rank, rank).
+    degrees : K, (Nants, Nfreqs)
+    common : Q, (Nfreqs, rank); None, like all that follows, if there are no foregrounds
+    gram : Q^T K Q, (Nants, rank, rank)
+    absorbed : Q^T C Q, real and imaginary part, (2, Nants, rank, rank)
     """
 
     degrees: tf.Tensor
@@ -185,16 +181,11 @@ class CoupledBlocks(NamedTuple):
 
     Attributes
     ----------
-    degrees
-        K, (Nants, Nfreqs).
-    common
-        Q, (Nfreqs, rank).
-    gram
-        Q^T K Q, (Nants, rank, rank).
-    alike
-        Symmetric part of Q^T (D |F|^2 - C) Q of each baseline, (Nbls, rank, rank).
-    crossed
-        Antisymmetric part of Q^T C Q, of the same shape.
+    degrees : K, (Nants, Nfreqs)
+    common : Q, (Nfreqs, rank)
+    gram : Q^T K Q, (Nants, rank, rank)
+    alike : symmetric part of Q^T (D |F|^2 - C) Q of each baseline, (Nbls, rank, rank)
+    crossed : antisymmetric part of Q^T C Q, of the same shape
     """
 
     degrees: tf.Tensor

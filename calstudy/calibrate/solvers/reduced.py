@@ -88,14 +88,10 @@ class Dampings(NamedTuple):
 
     Attributes
     ----------
-    per_loss
-        Damping over the loss relative to the data; the damping is `MOST_DAMPING` at most.
-    least
-        Smallest damping that products in a precision can resolve.
-    preconditioner
-        Smallest damping with which blocks in a precision can be inverted.
-    remembered
-        Whether the damping stays raised for the next steps.
+    per_loss : damping over the loss relative to the data; the damping is `MOST_DAMPING` at most
+    least : smallest damping that products in a precision can resolve
+    preconditioner : smallest damping with which blocks in a precision can be inverted
+    remembered : whether the damping stays raised for the next steps
     """
 
     per_loss: float
@@ -116,14 +112,11 @@ class ReducedData(NamedTuple):
 
     Attributes
     ----------
-    gains
-        Gains to start from, (2, Nants, Nfreqs), float64.
+    gains : gains to start from, (2, Nants, Nfreqs), float64
     data
         Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) whose sum is one, and the model if it is frozen; float64.
-    scale
-        Unit of the visibilities, their weighted rms.
-    loss_unit
-        Unit of the loss, in the unit of the data squared.
+    scale : unit of the visibilities, their weighted rms
+    loss_unit : unit of the loss, in the unit of the data squared
     """
 
     gains: tf.Tensor
@@ -173,8 +166,7 @@ class ReducedKernels:
         Whether the antenna blocks of each channel are the preconditioner throughout: couplings between antennas remain
         the strong ones where baselines share models or coefficients without a finite prior, and are the only ones where
         the foregrounds are frozen.
-    dampings
-        Dampings of the fit in its precision.
+    dampings : dampings of the fit in its precision
     coupled
         Whether the preconditioner has the couplings between smooth gains of all antennas, besides the blocks of each
         antenna: for thorough kernels, if the array is not too large and each baseline has only its own model and

@@ -16,7 +16,7 @@ from calstudy.corrupt.noise import Autocorrelations
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
-    from calstudy.instrument.size import Size
+    from calstudy.instrument.settings import Size
 
 
 class Crosstalk(Effect):

@@ -13,7 +13,7 @@ from calstudy.corrupt.interface import Effect, Truth
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
-    from calstudy.instrument.size import Size
+    from calstudy.instrument.settings import Size
 
 
 class ChannelFlags(Effect):

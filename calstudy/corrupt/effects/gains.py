@@ -27,7 +27,7 @@ from calstudy.corrupt.interface import GainEffect
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
-    from calstudy.instrument.size import Size
+    from calstudy.instrument.settings import Size
 
 
 class PerChannelGains(GainEffect):

@@ -71,19 +71,10 @@ class Calamity2022(Paper):
 
     def statements(self) -> Sequence[Statement]:
         """Return the statements, in the order of the paper's sections."""
-        from calstudy.papers.calamity2022 import (
-            calibration,
-            caveats,
-            computation,
-            low_snr,
-            method,
-            positive_bias,
-            redundant,
-            window,
-        )
+        from calstudy.papers.calamity2022 import calibration, computation, method, redundant, window
         from calstudy.verdicts.statement import Statement
 
-        modules = (method, calibration, window, positive_bias, redundant, low_snr, computation, caveats)
+        modules = (method, calibration, window, redundant, computation)
         return [item for module in modules for item in vars(module).values() if isinstance(item, Statement)]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:

@@ -111,8 +111,8 @@ def call(
     from astropy.coordinates import ICRS
     from astropy.time import Time
 
+    from calstudy.base.visibilities import use_bundled_earth_orientation
     from calstudy.instrument.antenna_beams import split_beams
-    from calstudy.instrument.telescope import use_bundled_earth_orientation
     from calstudy.simulate.sources import sky_coordinates
 
     require_rectangular(template)
@@ -267,7 +267,7 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
     from pyuvsim import BeamList
     from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
 
-    from calstudy.instrument.telescope import use_bundled_earth_orientation
+    from calstudy.base.visibilities import use_bundled_earth_orientation
 
     use_bundled_earth_orientation()
     listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])

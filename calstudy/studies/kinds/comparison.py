@@ -18,14 +18,16 @@ from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
+from calstudy.calibrate.calibrators.given_gains import salted
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import StudyFile, apply_scale, checked, dump, override, parse_override, validate
-from calstudy.experiment.model import FIGURES, Experiment, Figures, StudyName
+from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment, Figures, StudyName
 from calstudy.experiment.yaml_files import read_mapping
 from calstudy.figures import StudyFigure, figures_for
-from calstudy.products import tolerances
+from calstudy.products import corruption, sky_model, tolerances
 from calstudy.products.comparison import case_name, comparison
+from calstudy.products.corruption import PARITIES
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import MeasureScore, score
 from calstudy.run.execution import Budget
@@ -172,21 +174,16 @@ class Comparison(Family):
     def load(cls, file: StudyFile, calibrators: Mapping[str, Any] | None = None) -> Comparison:
         """Return the comparison of a file.
 
+        Raises InputError if a file cannot be read, or a scale or override cannot be applied, and ExperimentError if
+        fields are unknown, missing, or have values that are not allowed.
+
         Parameters
         ----------
         file
             Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
             `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others are
             applied to the experiment of every case.
-        calibrators
-            In place of those of the file.
-
-        Raises
-        ------
-        InputError
-            If a file cannot be read, or a scale or override cannot be applied.
-        ExperimentError
-            If fields are unknown, missing, or have values that are not allowed.
+        calibrators : in place of those of the file
         """
         own = file.scale if file.scale in (file.content.get("scales") or {}) else None
         data = apply_scale(file.content, own)
@@ -298,6 +295,50 @@ class Comparison(Family):
         return {"cases": files, "refusals": self._labels["refusals"]}
 
 
+@dataclass(frozen=True)
+class WorldData:
+    """The tasks of the exported products of one experiment, which calibrates data with the EoR and without.
+
+    Data sets are in the order of their digests, which does not reveal their content. The sky model is None if the
+    calibrator has none, and so are the levels without noise; the salt of a blind challenge may be empty.
+    """
+
+    experiment: Experiment
+    data: tuple[Task, ...]
+    sky_model: Task | None
+    levels: Task | None
+    salt: str = ""
+
+    @classmethod
+    def of(cls, experiment: Experiment, salt: str = "") -> WorldData:
+        """Return the exported products of an experiment."""
+        graph = Graph(experiment)
+        variants = [experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS[:2]]
+        data = {
+            task.key: task
+            for task in (corruption.data(graph, variant, parity) for variant in variants for parity in PARITIES)
+        }
+        noisy = any("noise" in variant.components for variant in variants)
+        return cls(
+            experiment,
+            tuple(data[key] for key in sorted(data, key=lambda key: salted(key, salt))),
+            sky_model.sky_model(graph),
+            corruption.levels(graph) if noisy else None,
+            salt,
+        )
+
+    @property
+    def digest(self) -> str:
+        """Digest of all data sets and the sky model."""
+        whole = digest_json([*sorted(task.key for task in self.data), self.sky_model and self.sky_model.key])
+        return salted(whole, self.salt)
+
+    @property
+    def tasks(self) -> list[Task]:
+        """All tasks."""
+        return [*self.data, *(task for task in (self.sky_model, self.levels) if task is not None)]
+
+
 def _what_is_made(experiment: Experiment) -> Experiment:
     """Return an experiment without the settings of products that only its own run makes."""
     outputs = experiment.outputs.with_defaults("store", "runs", "figures", "tables")
@@ -309,16 +350,13 @@ def load_worlds(
 ) -> Comparison:
     """Return calibrators in the worlds of a comparison, or in the one of an experiment.
 
+    Raises InputError if the file is neither, or cannot be used.
+
     Parameters
     ----------
     calibrators
         Blocks `calibration` by label, in place of those of the file, with the assumptions of the experiment. None
         for the file's own; that of an experiment has its own name as label.
-
-    Raises
-    ------
-    InputError
-        If the file is neither, or cannot be used.
     """
     file = StudyFile.open(path, scale, overrides)
     kind = kind_of(file.content, file.folder)

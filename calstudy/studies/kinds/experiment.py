@@ -11,15 +11,15 @@ from typing import Any, Self
 from calstudy.base.errors import InputError
 from calstudy.base.identity import identity
 from calstudy.base.table import Table
+from calstudy.claims.evaluation import Evaluated, claims
 from calstudy.claims.paper import stand_ins, unique_notes
-from calstudy.claims.product import claims
 from calstudy.corrupt.noise import NoiseRelativeToEor, NoiseRelativeToForegrounds, NoNoise, RadiometerNoise
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.figures import StudyFigure, figure_task, figures_for
 from calstudy.instrument.as_built import COLUMNS, as_built_rows
 from calstudy.instrument.layouts import make_layout
-from calstudy.products import sky_model
+from calstudy.products import agreement, score, signal_loss, sky_model, spectra
 from calstudy.products.graph import Graph
 from calstudy.products.table import tables_of
 from calstudy.run.execution import Budget
@@ -104,7 +104,19 @@ class ExperimentStudy(Study):
     @cached_property
     def claims(self) -> Task | None:
         """The statements of the papers that the experiment names, or None."""
-        return claims(self.graph, self.stand_ins)
+        return claims(self.evaluated, self.stand_ins)
+
+    @property
+    def evaluated(self) -> Evaluated:
+        """The experiment with the products on which statements of papers are evaluated."""
+        tables = {
+            "spectra": spectra.spectra(self.graph),
+            "agreement": agreement.agreement(self.graph),
+            "transfer": signal_loss.transfer(self.graph),
+            "score": score.score(self.graph),
+            "sky_model": sky_model.error(self.graph),
+        }
+        return Evaluated(self.experiment, {name: task for name, task in tables.items() if task is not None})
 
     @property
     def texts(self) -> dict[str, str]:
@@ -145,10 +157,8 @@ class Family(Study):
 
     Attributes
     ----------
-    file
-        Content of the file.
-    members
-        The experiments by label, all with the same store and folder of runs.
+    file : content of the file
+    members : the experiments by label, all with the same store and folder of runs
     """
 
     file: Any

@@ -11,11 +11,10 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
 from calstudy.base.plugins import guarded
 from calstudy.experiment.files import StudyFile
-from calstudy.experiment.model import FIGURES
+from calstudy.experiment.model import FIGURES, Scales
 from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.power.settings import PowerSettings
-from calstudy.products.graph import MeasuredGraph
 from calstudy.products.table import tables_of
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
@@ -33,9 +32,7 @@ class ObservedFile(DataFile):
     observed: ObservedSettings
     power: PowerSettings = PowerSettings()
     injection: InjectionSettings | None = Field(None, description="Measure what the calibration loses; null: do not.")
-    scales: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
-    )
+    scales: Scales = Field(default_factory=dict)
 
 
 class ObservedStudy(DataStudy):
@@ -48,10 +45,6 @@ class ObservedStudy(DataStudy):
         "A file with the key `observed` is about measured data ([measured-data.md](measured-data.md)): these are "
         "calibrated, have power spectra, and are calibrated again with an injected EoR."
     )
-
-    def __init__(self, file: ObservedFile, data: Parts) -> None:
-        super().__init__(file, data)
-        self.graph = MeasuredGraph(file, data)
 
     @classmethod
     def load(cls, file: StudyFile) -> ObservedStudy:

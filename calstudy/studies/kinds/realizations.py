@@ -6,11 +6,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from calstudy.claims.evaluation import REALIZATIONS, Evaluated
 from calstudy.experiment.files import dump
 from calstudy.experiment.model import FIGURES, Experiment
 from calstudy.experiment.realizations import expand_realizations
 from calstudy.figures import figure_task
-from calstudy.products.pooled_realizations import pooled
+from calstudy.products.realizations import pooled
 from calstudy.run.provenance import seeds
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
@@ -21,12 +22,8 @@ class Realizations(ExperimentStudy):
     """An experiment whose EoR, gains or noise are drawn several times.
 
     Products that several realizations need have one key, and are made once. The first realization is the experiment
-    itself, and shares its products with the experiment's own run.
-
-    Raises
-    ------
-    ExperimentError
-        With one sentence per fault of the realizations.
+    itself, and shares its products with the experiment's own run. Raises ExperimentError with one sentence per fault of
+    the realizations.
     """
 
     key = "realizations"
@@ -46,6 +43,11 @@ class Realizations(ExperimentStudy):
     def tables(self) -> list[Task]:
         """The tables and verdicts of all realizations."""
         return [pooled(self.graph)]
+
+    @property
+    def evaluated(self) -> Evaluated:
+        """The experiment with the figure of all realizations, which has the measurements on them."""
+        return Evaluated(self.experiment, {REALIZATIONS: self.figures[0]})
 
     @property
     def texts(self) -> dict[str, str]:

@@ -15,10 +15,10 @@ from calstudy.base.resources import free_memory, parse_memory
 from calstudy.base.schema import Section, fault
 from calstudy.base.units import Length
 from calstudy.calibrate.settings import BasisSettings
+from calstudy.claims.evaluation import run_time_claims
 from calstudy.claims.paper import distinct_papers
-from calstudy.claims.product import run_time_claims
 from calstudy.experiment.files import StudyFile
-from calstudy.experiment.model import FIGURES, Folders, Papers, StudyName
+from calstudy.experiment.model import FIGURES, Folders, Papers, Scales, StudyName
 from calstudy.figures import draw_task
 from calstudy.instrument.array_layouts.geometric import LinearLayout, RectangularLayout
 from calstudy.instrument.settings import Channels
@@ -129,9 +129,7 @@ class RuntimeFile(Section):
     papers: Papers = Field(
         (), description="Published papers whose statements on run times are evaluated, such as [calamity2022]."
     )
-    scales: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="Named sets of overrides (dotted path: value), chosen with --scale."
-    )
+    scales: Scales = Field(default_factory=dict)
 
 
 PANELS = ("rows", "line")

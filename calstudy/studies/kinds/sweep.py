@@ -113,11 +113,8 @@ class Sweep(Family):
 def expand(experiment: Experiment) -> Sweep:
     """Return the family of an experiment with a `sweep`.
 
-    Raises
-    ------
-    ExperimentError
-        With one sentence per fault: a field that cannot be varied, is unknown, or does not take a value, or a point
-        whose fields do not go together.
+    Raises ExperimentError with one sentence per fault: a field that cannot be varied, is unknown, or does not take a
+    value, or a point whose fields do not go together.
     """
     if not experiment.sweep:
         raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")

@@ -18,13 +18,11 @@ from pydantic import Field
 from pyradiosky import SkyModel
 from scipy.constants import speed_of_light
 
-from calstudy.base.visibilities import baseline_vectors
+from calstudy.base.visibilities import baseline_vectors, subset_template
 from calstudy.corrupt.levels import rms
-from calstudy.instrument.array_layouts.observatories import MwaLayout
-from calstudy.instrument.beam_models.formulas import GaussianBeam
 from calstudy.instrument.beams import make_beam
-from calstudy.instrument.settings import InstrumentSettings
-from calstudy.instrument.telescope import make_template, subset_template
+from calstudy.instrument.settings import BEAMS, DEFAULT_LAYOUT, LAYOUTS, InstrumentSettings
+from calstudy.instrument.telescope import make_template
 from calstudy.simulate.interface import Engine
 from calstudy.simulate.nodes import integration_times
 from calstudy.sky.foregrounds import make_foregrounds
@@ -46,7 +44,7 @@ CANDIDATES = (
 )
 """Engines and precisions that are compared. matvis in single precision rounds its phases to 1e-4 and is left out."""
 FLUX = 3.0
-BEAM = GaussianBeam(kind="gaussian")
+BEAM = BEAMS.make("gaussian")
 OFFSETS = ((0.0, 0.0), (6.0, 20.0), (15.0, 200.0), (40.0, 310.0))
 """Directions of the single source: degrees from the zenith, azimuth in degrees (north through east)."""
 
@@ -101,7 +99,7 @@ class Engines(Step):
 
     def errors(self, compared: Sequence[tuple[str, str]]) -> dict[tuple[str, str], float]:
         """Return the largest difference from pyuvsim over the rms of the visibilities, by engine and precision."""
-        instrument = InstrumentSettings(layout=MwaLayout(count=self.antennas))
+        instrument = InstrumentSettings(layout=LAYOUTS.make({"kind": DEFAULT_LAYOUT, "count": self.antennas}))
         whole = make_template(instrument)
         times, channels = _spread(whole.Ntimes, self.times), _spread(whole.Nfreqs, self.channels)
         template = subset_template(whole, integration_times(whole)[times], whole.freq_array[channels])
