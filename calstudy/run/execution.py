@@ -91,11 +91,21 @@ def found_of(tasks: Iterable[Task], store: Store) -> dict[str, Product]:
     return {key: product for key, product in products.items() if product is not None}
 
 
+def without_record(targets: Sequence[Task], store: Store) -> list[Task]:
+    """Return the targets, and what they are made from and is kept, of which there are folders without intact records.
+
+    A run shows the warnings of all of these products, and would lose theirs.
+    """
+    kept = [task for task in unique(targets) if not task.temporary]
+    found = found_of(kept, store)
+    return [task for task in kept if task.key not in found and store.exists(task.stage.name, task.key)]
+
+
 def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False) -> Schedule:
     """Find the tasks to make: the targets and all that they need, unless the store has them intact.
 
-    Products with keys in `given` are not made. With `strict`, products of other code or other versions of packages are
-    made again.
+    A kept product without an intact record is made again even if nothing else has to be made from it. Products with
+    keys in `given` are not made. With `strict`, products of other code or other versions of packages are made again.
     """
     other: Container[str] = ()
     if strict:
@@ -121,7 +131,7 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
             visit(needed)
         todo[task.key] = task
 
-    for task in targets:
+    for task in (*targets, *without_record(targets, store)):
         visit(task)
     return Schedule(tuple(todo.values()), ready, tuple(damaged), frozenset(again))
 

@@ -117,6 +117,23 @@ def chain(*, temporary: bool) -> tuple[Task, Task, Task, Task]:
     return data, halves[0], halves[1], Number("total", number=0, needed={"a": halves[0], "b": halves[1]})
 
 
+def test_a_kept_product_without_an_intact_record_is_made_again_for_its_warnings(store):
+    """Of four products, the total is what a run is for, and the first half is damaged."""
+    data, half, _, total = chain(temporary=False)
+    run(total, store)
+    assert schedule([total], store).todo == ()
+    path = store.folder("number", half.key) / "product.json"
+    path.write_text(path.read_text().replace('"number": 3', '"number": 4'))
+    plan = schedule([total], store)
+    assert plan.todo == plan.damaged == (half,)
+    run(total, store)
+    assert schedule([total], store).todo == ()
+    assert store.verify("number", half.key).record["notes"] == {"number": 3}
+    # What is not there at all was removed by somebody, who had finished with it.
+    store.discard("number", data.key)
+    assert schedule([total], store).todo == ()
+
+
 def test_a_temporary_product_is_dropped_after_the_last_task_that_needs_it_and_not_before(store):
     *_, total = chain(temporary=True)
     todo = schedule([total], store).todo
