@@ -186,6 +186,8 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     }
     with (
         dask.config.set(settings),
+        # The thread that works here may be at another product when the run ends, and closes last.
+        _errors_written_to(log) if workers == 1 else nullcontext(),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -199,8 +201,7 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     ):
         if workers > 1:
             client.run(_set_up_worker, log)
-        with _errors_written_to(log) if workers == 1 else nullcontext():
-            yield client
+        yield client
 
 
 @contextmanager

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import shutil
 import socket
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,10 +23,16 @@ from calstudy.run.task import Task
 
 logger = logging.getLogger(__name__)
 
+SPARE = 10e6
+"""Bytes that must be free beside the estimated size of a product before it is made."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class WorkOrder:
-    """A task without the tasks behind it, as sent to a worker, and what the one who sends it would make it with."""
+    """A task without the tasks behind it, as sent to a worker, and what the one who sends it would make it with.
+
+    `disk` is the estimated size of the product in bytes.
+    """
 
     task: Task
     key: str
@@ -31,6 +40,7 @@ class WorkOrder:
     store: Path
     again: bool
     made_with: Mapping[str, Any]
+    disk: float
 
     @classmethod
     def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
@@ -38,7 +48,9 @@ class WorkOrder:
         own = made_with(task)
         inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
         bare = task.given({name: name for name in inputs})
-        return cls(task=bare, key=task.key, inputs=inputs, store=store.root, again=again, made_with=own)
+        return cls(
+            task=bare, key=task.key, inputs=inputs, store=store.root, again=again, made_with=own, disk=task.cost.disk
+        )
 
     @property
     def name(self) -> str:
@@ -76,10 +88,23 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
         reason = _unwritable(error, store.root)
         if reason is None:
             raise
-        raise DiskError(
-            f"outputs.store = {str(store.root)!r}: {order.name} could not be written ({reason}); "
-            "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
-        ) from None
+        raise _disk_error(order, reason) from None
+
+
+def _disk_error(order: WorkOrder, reason: str) -> DiskError:
+    return DiskError(
+        f"outputs.store = {str(order.store)!r}: {order.name} could not be written ({reason}); "
+        "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
+    )
+
+
+def _require_room(order: WorkOrder) -> None:
+    """Raise DiskError if a product has no room on the disk.
+
+    HDF5 crashes where the disk is full when it closes a file of which it could not write the head.
+    """
+    if shutil.disk_usage(order.store).free < order.disk + SPARE:
+        raise _disk_error(order, os.strerror(errno.ENOSPC))
 
 
 def _other(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
@@ -114,6 +139,7 @@ def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Product]:
 
 
 def _make(order: WorkOrder, store: Store) -> Product:
+    _require_room(order)
     task, inputs = order.task, _verified_inputs(order, store)
     started = datetime.now(UTC)
     logging.captureWarnings(True)

@@ -7,13 +7,15 @@ import sys
 import traceback
 from dataclasses import field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.errors import DiskError, ExperimentError, InputError
 from calstudy.base.plugins import UserCodeError
 from calstudy.base.resources import Cost
 from calstudy.run import execution
+from calstudy.run import perform as performing
 from calstudy.run.execution import Lifetimes, Workers, execute, largest_disk, schedule
 from calstudy.run.leases import Lease
 from calstudy.run.perform import WorkOrder, perform
@@ -297,6 +299,7 @@ DYING = """
 import os, signal, time
 from pathlib import Path
 from calstudy.run import execution
+from calstudy.run import perform as performing
 from calstudy.run.execution import Lifetimes, Workers, execute, schedule
 from calstudy.run.leases import Lease
 from calstudy.run.store import Store
@@ -407,6 +410,21 @@ def test_a_product_that_cannot_be_written_is_told_in_a_sentence(tmp_path, make):
     assert result.stdout.startswith(f"outputs.store = '{tmp_path / 'store'}': stage (label) could not be written (")
     assert "make room or choose another folder" in result.stdout
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(("spare", "made"), [(101, True), (99, False)])
+def test_a_product_is_made_only_where_its_disk_has_room(spare, made, store, monkeypatch):
+    """HDF5 crashes at some of the places where a write can fail, before anybody can say why."""
+    task = Sized("sized", number=1)
+    free = SimpleNamespace(free=performing.SPARE + spare)
+    monkeypatch.setattr(performing.shutil, "disk_usage", lambda path: free)
+    order = WorkOrder.of(task, store)
+    if made:
+        perform(order)
+    else:
+        with pytest.raises(DiskError, match=r"number \(sized\) could not be written \(No space left on device\); make"):
+            perform(order)
+    assert (store.verify("number", task.key) is not None) is made
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
