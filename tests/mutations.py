@@ -200,7 +200,7 @@ MUTATIONS = (
         "errors by the wrong antennas",
         "share_sample=np.repeat(baselines, 2)",
         "share_sample=np.tile(baselines, 2)",
-        SCORES,
+        ("tests/power/test_clusters.py",),
     ),
     Mutation(
         "an average without counts",

@@ -75,6 +75,14 @@ def test_the_scatter_of_baselines_alone_understates_what_antennas_share():
     assert quoted_over_true(draws) < 0.6
 
 
+def test_one_number_per_baseline_has_the_error_of_a_spectrum_of_one_delay():
+    rng = np.random.default_rng(2)
+    found = of_baselines(rng.normal(size=(ANTENNAS, 1))[PAIRS].sum(axis=1) + rng.normal(size=(len(PAIRS), 1)))
+    clusters = Clusters.of_baselines(PAIRS)
+    value, error = clusters.powers(found).ratio(clusters.counts)
+    assert (value[0], error[0]) == pytest.approx(mean_and_error(found), rel=1e-12)
+
+
 @pytest.mark.parametrize("shared", [0.0, 3.0])
 def test_errors_of_redundant_groups_hold_what_the_sky_and_what_antennas_do(shared):
     """Groups of baselines on a ring of antennas; every group has a sky of its own."""
