@@ -21,6 +21,7 @@ from calstudy.results.folder import find_runs
 from calstudy.run.store import Store, leftovers, products
 
 MEMBERS, TOGETHER = 20, 4
+UNDISTURBED = (0, MEMBERS - 1)
 KILLED = 0.5
 """Part of the jobs that are killed."""
 
@@ -35,8 +36,11 @@ def start(member: int, folder: Path, log: Path) -> subprocess.Popen:
     seeds = f"corruption.noise.seeds=[{1000 + member}, {2000 + member}]"
     command = [sys.executable, "-m", "calstudy", "run", "tiny.yaml", "--workers", "1"]
     changes = ["--set", seeds, "--set", f"name=member-{member}"]
-    # A session of its own: the kill reaches its processes as well.
-    return subprocess.Popen([*command, *changes], cwd=folder, stdout=log.open("a"), stderr=2, start_new_session=True)
+    with log.open("a") as told:
+        # A session of its own: the kill reaches its processes as well.
+        return subprocess.Popen(
+            [*command, *changes], cwd=folder, stdout=told, stderr=subprocess.STDOUT, start_new_session=True
+        )
 
 
 def arrays_of(folder: Path) -> dict[str, dict[str, dict[str, np.ndarray]]]:
@@ -66,10 +70,10 @@ def test_killed_members_of_an_array_end_with_the_products_of_undisturbed_runs(tm
         folder.mkdir()
         (folder / "tiny.yaml").write_text(yaml.safe_dump(experiment(folder)))
     began = time.monotonic()
-    for member in (0, MEMBERS - 1):
+    for member in UNDISTURBED:
         assert start(member, folders["alone"], tmp_path / "alone.log").wait() == 0
-    # A member takes longer than alone, and much of it is made by others: kills come at any stage.
-    longest = time.monotonic() - began
+    # Among others a member takes longer than alone, but has less to make: kills come at any stage.
+    longest = (time.monotonic() - began) / len(UNDISTURBED)
     with ThreadPoolExecutor(TOGETHER) as pool:
         jobs = [pool.submit(run_to_its_end, n, folders["array"], random.Random(n), longest) for n in range(MEMBERS)]
         kills = sum(job.result() for job in jobs)
