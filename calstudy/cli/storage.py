@@ -104,7 +104,7 @@ def _delete(chosen: list[Product], store: Store, console: Console) -> None:
             stage, key = str(product.record["stage"]), str(product.record["key"])
             if key not in needed:
                 with store.lock(stage, key):
-                    store.discard(stage, key)
+                    store.remove(stage, key)
             done = "kept, for a run needs it" if key in needed else "deleted"
             console.print(f"{done}: {stage} ({product.record['label']}), {_size(product.size)}, {key}", markup=False)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import logging
 import os
+import shutil
 import socket
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
@@ -29,10 +31,16 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+SPARE = 10e6
+"""Bytes that must be free beside the estimated size of a product before it is made."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class WorkOrder:
-    """A task without the tasks behind it, as sent to a worker, and what the one who sends it would make it with."""
+    """A task without the tasks behind it, as sent to a worker, and what the one who sends it would make it with.
+
+    `disk` is the estimated size of the product in bytes.
+    """
 
     task: Task
     key: str
@@ -40,6 +48,7 @@ class WorkOrder:
     store: Path
     again: bool
     made_with: Mapping[str, Any]
+    disk: float
 
     @classmethod
     def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
@@ -47,7 +56,9 @@ class WorkOrder:
         own = made_with(task)
         inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
         bare = task.given({name: name for name in inputs})
-        return cls(task=bare, key=task.key, inputs=inputs, store=store.root, again=again, made_with=own)
+        return cls(
+            task=bare, key=task.key, inputs=inputs, store=store.root, again=again, made_with=own, disk=task.cost.disk
+        )
 
     @property
     def name(self) -> str:
@@ -85,10 +96,23 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
         reason = _unwritable(error, store.root)
         if reason is None:
             raise
-        raise DiskError(
-            f"outputs.store = {str(store.root)!r}: {order.name} could not be written ({reason}); "
-            "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
-        ) from None
+        raise _disk_error(order, reason) from None
+
+
+def _disk_error(order: WorkOrder, reason: str) -> DiskError:
+    return DiskError(
+        f"outputs.store = {str(order.store)!r}: {order.name} could not be written ({reason}); "
+        "make room or choose another folder with --set outputs.store=DIR, and run again: finished products are kept"
+    )
+
+
+def _require_room(order: WorkOrder) -> None:
+    """Raise DiskError if a product has no room on the disk.
+
+    HDF5 crashes where the disk is full when it closes a file of which it could not write the head.
+    """
+    if shutil.disk_usage(order.store).free < order.disk + SPARE:
+        raise _disk_error(order, os.strerror(errno.ENOSPC))
 
 
 def _other(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
@@ -123,6 +147,7 @@ def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Product]:
 
 
 def _make(order: WorkOrder, store: Store) -> Product:
+    _require_room(order)
     task, inputs = order.task, _verified_inputs(order, store)
     started = datetime.now(UTC)
     logging.captureWarnings(True)
@@ -211,11 +236,21 @@ def found_of(tasks: Iterable[Task], store: Store) -> dict[str, Product]:
     return {key: product for key, product in products.items() if product is not None}
 
 
+def without_record(targets: Sequence[Task], store: Store) -> list[Task]:
+    """Return the targets, and what they are made from and is kept, of which there are folders without intact records.
+
+    A run shows the warnings of all of these products, and would lose theirs.
+    """
+    kept = [task for task in unique(targets) if not task.temporary]
+    found = found_of(kept, store)
+    return [task for task in kept if task.key not in found and store.exists(task.stage.name, task.key)]
+
+
 def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False) -> Schedule:
     """Find the tasks to make: the targets and all that they need, unless the store has them intact.
 
-    Products with keys in `given` are not made. With `strict`, products of other code or other versions of packages are
-    made again.
+    A kept product without an intact record is made again even if nothing else has to be made from it. Products with
+    keys in `given` are not made. With `strict`, products of other code or other versions of packages are made again.
     """
     other: Container[str] = ()
     if strict:
@@ -241,7 +276,7 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
             visit(needed)
         todo[task.key] = task
 
-    for task in targets:
+    for task in (*targets, *without_record(targets, store)):
         visit(task)
     return Schedule(tuple(todo.values()), ready, tuple(damaged), frozenset(again))
 
@@ -296,6 +331,8 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     }
     with (
         dask.config.set(settings),
+        # The thread that works here may be at another product when the run ends, and closes last.
+        _errors_written_to(log) if workers == 1 else nullcontext(),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -309,8 +346,7 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     ):
         if workers > 1:
             client.run(_set_up_worker, log)
-        with _errors_written_to(log) if workers == 1 else nullcontext():
-            yield client
+        yield client
 
 
 @contextmanager

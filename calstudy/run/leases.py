@@ -66,7 +66,7 @@ class Lease:
             needed = needed_by_runs(self._store, self._path)
             for key, product in temporary.items():
                 if key not in needed:
-                    self._store.discard(product.record["stage"], key)
+                    self._store.remove(product.record["stage"], key)
 
     def _write(self) -> None:
         new = self._path.with_suffix(".new")

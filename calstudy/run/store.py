@@ -151,6 +151,14 @@ class Store:
             folder.rename(grave)
             shutil.rmtree(grave, ignore_errors=True)
 
+    def remove(self, stage: str, key: str) -> None:
+        """Remove a product that no run needs (`calstudy.run.leases`), and the file of its lock."""
+        self.discard(stage, key)
+        self._lock_file(stage, key).unlink(missing_ok=True)
+
+    def _lock_file(self, stage: str, key: str) -> Path:
+        return self.root / ".locks" / f"{stage}-{key}.lock"
+
     @contextmanager
     def lock(self, stage: str, key: str, told: Callable[[str], None] = lambda text: None) -> Iterator[None]:
         """Hold the right to make this product; another run that needs it waits, and then finds it made.
@@ -158,9 +166,9 @@ class Store:
         After a wait of `SILENT_WAIT`, `told` is called with a sentence that names the holder. Raises InputError if
         another process holds the lock for `LONGEST_WAIT`, or if the file system has no locks.
         """
-        locks = self.root / ".locks"
-        locks.mkdir(exist_ok=True)
-        path, holder = locks / f"{stage}-{key}.lock", locks / f"{stage}-{key}.holder"
+        path = self._lock_file(stage, key)
+        holder = path.with_suffix(".holder")
+        path.parent.mkdir(exist_ok=True)
         # Without flock, runs would wait forever for the marker of a process that died on another host.
         lock = FileLock(path, fallback_to_soft=False)
         try:

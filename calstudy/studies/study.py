@@ -22,7 +22,7 @@ from calstudy.experiment.files import StudyFile, dump
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
 from calstudy.results.reader import SHOWN
-from calstudy.run.execution import Budget, Lifetimes, Schedule, Workers, execute, found_of, schedule
+from calstudy.run.execution import Budget, Lifetimes, Schedule, Workers, execute, found_of, schedule, without_record
 from calstudy.run.leases import Lease
 from calstudy.run.progress import report
 from calstudy.run.provenance import of_other_code, other_code
@@ -300,9 +300,10 @@ def make(
     """
     lease = Lease(store)
     is_complete = len(found_of(targets, store)) == len({task.key for task in targets})
+    is_complete = is_complete and not without_record(targets, store)
     if not is_complete and not strict:
         store.prepare()
-    # A complete store is only read, unless a product turns out to be damaged, which no other run removes.
+    # A complete store is only read, unless a file turns out to be damaged; no other run removes its product.
     with nullcontext() if is_complete and not strict else lease.holding(task.key for task in unique(targets)):
         return _make_missing(schedule(targets, store, strict=strict), targets, lease, store, workers, console)
 

@@ -25,13 +25,13 @@ def spectra(power: np.ndarray, **shares: np.ndarray) -> DelaySpectra:
     )  # fmt: skip
 
 
-def of_baselines(power: np.ndarray) -> DelaySpectra:
+def of_baselines(power: np.ndarray, pairs: np.ndarray = PAIRS) -> DelaySpectra:
     """Spectra of each baseline crossed with itself."""
-    units = np.repeat(np.arange(len(PAIRS)), 2)
+    units = np.repeat(np.arange(len(pairs)), 2)
     return spectra(
         power,
         share_unit=units,
-        share_antenna=PAIRS.ravel(),
+        share_antenna=pairs.ravel(),
         share_pairs=np.ones(units.size, int),
         share_power=power[units].astype(complex),
     )
@@ -73,6 +73,16 @@ def test_the_scatter_of_baselines_alone_understates_what_antennas_share():
         antenna = rng.normal(size=(ANTENNAS, 1))
         draws.append(mean_and_error(spectra(antenna[PAIRS].sum(axis=1) + rng.normal(size=(len(PAIRS), 3)))))
     assert quoted_over_true(draws) < 0.6
+
+
+def test_one_number_per_baseline_has_the_error_of_a_spectrum_of_one_delay():
+    """Four antennas have baselines to all, the others to these alone: without one of the four more is missing."""
+    pairs = PAIRS[PAIRS[:, 0] < 4]
+    rng = np.random.default_rng(2)
+    found = of_baselines(rng.normal(size=(ANTENNAS, 1))[pairs].sum(axis=1) + rng.normal(size=(len(pairs), 1)), pairs)
+    clusters = Clusters.of_baselines(pairs)
+    value, error = clusters.powers(found).ratio(clusters.counts)
+    assert (value[0], error[0]) == pytest.approx(mean_and_error(found), rel=1e-12)
 
 
 @pytest.mark.parametrize("shared", [0.0, 3.0])

@@ -135,12 +135,27 @@ def test_other_units_are_caught(reference, figure, name):
     assert compare_array(figure, name, arrays, arrays[name] / little_h).status == "beyond"
 
 
+def drawn_spectrum(rng):
+    """Return the arrays of a spectrum of 400 bins of 10 % error."""
+    power = 1 + 0.1 * rng.standard_normal(400) + 0j
+    series = {"power": power, "noise_error": np.full(400, 0.0), "sample_error": np.full(400, 0.1)}
+    return {f"excised.residual.{key}": value for key, value in {**series, "noise_modes": np.ones(400)}.items()}
+
+
+def test_one_bin_far_off_shows_though_rms_and_mean_do_not():
+    arrays = drawn_spectrum(np.random.default_rng(1))
+    power = arrays["excised.residual.power"].copy()
+    power[7] += 8 * np.sqrt(2) * 0.1
+    off = compare_array("spherical", "excised.residual.power", arrays, power)
+    assert (off.largest, off.rms, off.shift) == pytest.approx((8, 8 / 20, 8 / 20))
+    assert off.status == "beyond"
+
+
 def test_a_small_loss_at_all_scales_shows_in_the_mean():
     """A tenth less power in each of 400 bins of 10 % error is within every error bar, and 14 standard errors in all."""
     rng = np.random.default_rng(1)
-    power = 1 + 0.1 * rng.standard_normal(400) + 0j
-    series = {"power": power, "noise_error": np.full(400, 0.0), "sample_error": np.full(400, 0.1)}
-    arrays = {f"excised.residual.{key}": value for key, value in {**series, "noise_modes": np.ones(400)}.items()}
+    arrays = drawn_spectrum(rng)
+    power = arrays["excised.residual.power"]
     redrawn = compare_array("spherical", "excised.residual.power", arrays, 1 + 0.1 * rng.standard_normal(400) + 0j)
     assert redrawn.status == "moved"
     assert redrawn.rms == pytest.approx(1, abs=0.15)

@@ -91,6 +91,9 @@ def test_a_run_alone_removes_what_it_needs_no_more(store):
     with lease.holding(keys(total(10))):
         run(total(10), store, lease)
         assert store.find("number", DATA.key) is None
+        # The file of its lock goes with it, and that of what is kept stays.
+        locks = {path.name for path in (store.root / ".locks").iterdir()}
+        assert locks == {f"number-{total(10).key}.lock", "-".join(LOCK) + ".lock"}
 
 
 def test_a_run_that_was_killed_does_not_count(store):

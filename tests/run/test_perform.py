@@ -7,10 +7,11 @@ import sys
 import traceback
 from dataclasses import field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.errors import DiskError, ExperimentError, InputError
 from calstudy.base.plugins import UserCodeError
 from calstudy.base.resources import Cost
 from calstudy.run import execution
@@ -114,6 +115,23 @@ def chain(*, temporary: bool) -> tuple[Task, Task, Task, Task]:
     data = Number("data", number=1, temporary=temporary)
     halves = [Number(f"half {value}", number=value, needed={"data": data}, temporary=temporary) for value in (2, 3)]
     return data, halves[0], halves[1], Number("total", number=0, needed={"a": halves[0], "b": halves[1]})
+
+
+def test_a_kept_product_without_an_intact_record_is_made_again_for_its_warnings(store):
+    """Of four products, the total is what a run is for, and the first half is damaged."""
+    data, half, _, total = chain(temporary=False)
+    run(total, store)
+    assert schedule([total], store).todo == ()
+    path = store.folder("number", half.key) / "product.json"
+    path.write_text(path.read_text().replace('"number": 3', '"number": 4'))
+    plan = schedule([total], store)
+    assert plan.todo == plan.damaged == (half,)
+    run(total, store)
+    assert schedule([total], store).todo == ()
+    assert store.verify("number", half.key).record["notes"] == {"number": 3}
+    # What is not there at all was removed by somebody, who had finished with it.
+    store.discard("number", data.key)
+    assert schedule([total], store).todo == ()
 
 
 def test_a_temporary_product_is_dropped_after_the_last_task_that_needs_it_and_not_before(store):
@@ -389,6 +407,21 @@ def test_a_product_that_cannot_be_written_is_told_in_a_sentence(tmp_path, make):
     assert result.stdout.startswith(f"outputs.store = '{tmp_path / 'store'}': stage (label) could not be written (")
     assert "make room or choose another folder" in result.stdout
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(("spare", "made"), [(101, True), (99, False)])
+def test_a_product_is_made_only_where_its_disk_has_room(spare, made, store, monkeypatch):
+    """HDF5 crashes at some of the places where a write can fail, before anybody can say why."""
+    task = Sized("sized", number=1)
+    free = SimpleNamespace(free=execution.SPARE + spare)
+    monkeypatch.setattr(execution.shutil, "disk_usage", lambda path: free)
+    order = WorkOrder.of(task, store)
+    if made:
+        perform(order)
+    else:
+        with pytest.raises(DiskError, match=r"number \(sized\) could not be written \(No space left on device\); make"):
+            perform(order)
+    assert (store.verify("number", task.key) is not None) is made
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
