@@ -21,6 +21,7 @@ from calstudy.run.task import Inputs, Job, Task
 from calstudy.verdicts.tolerances import Drawn, Rules, spread_of_scale
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
 
     from calstudy.products.comparison import Case
@@ -162,6 +163,10 @@ class StudyFigure(Plugin):
         """
 
 
+def _error_of_transfer(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    return arrays[name.replace("cross_transfer", "transfer_error")]
+
+
 class CasesFigure(StudyFigure):
     """A figure of the scores of a comparison: calibrators in worlds.
 
@@ -173,7 +178,10 @@ class CasesFigure(StudyFigure):
 
     of = ("comparison",)
     scores: ClassVar[Literal["bands", "bins"]] = "bands"
-    tolerances = ((r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),)
+    tolerances = (
+        (r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),
+        (r".*\.cross_transfer", Drawn(_error_of_transfer, "the error of T, of which C has no other")),
+    )
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the scores of one case."""
