@@ -245,7 +245,7 @@ def _definition(address: Address) -> _Definition:
     files = {
         PackageFile(*ast.literal_eval(ast.Tuple(node.args)))
         for statement in statements
-        if PackageFile.__name__ in module.imports
+        if PackageFile.__name__ in {*module.imports, *module.statements}
         for node in ast.walk(statement)
         if _calls(node, PackageFile)
     }
